@@ -1,0 +1,29 @@
+# make help lists the targets. VENV: where the environment stands; ARGS: more arguments for the command;
+# PYTHON: the interpreter to build on; JOBS: processes that run the tests.
+VENV ?= .venv
+JOBS ?= 2
+python := $(VENV)/bin/python
+
+.PHONY: help setup train test lint clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+
+setup:  ## the environment: pinned packages and, where it is missing, OpenGL
+	@scripts/setup.sh "$(VENV)"
+	@scripts/opengl.sh "$(VENV)"
+
+train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
+	@$(python) -m experiments.train tiny $(ARGS)
+
+test: setup  ## the tests
+	@$(python) -m pytest -n $(JOBS) $(ARGS)
+
+lint: setup  ## ruff and mypy
+	@$(python) -m ruff check
+	@$(python) -m ruff format --check
+	@$(python) -m mypy
+
+clean:  ## removes the environment and the caches; data and runs stay
+	@rm -rf "$(VENV)" build rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@find rsjax experiments tests -name __pycache__ -prune -exec rm -rf {} +

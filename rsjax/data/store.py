@@ -1,0 +1,248 @@
+"""The store: ArrayRecord shards per split and a ``manifest.json``, in one directory that appears whole or not at all.
+
+A record is a dict of arrays and JSON-ready values; a :class:`rsjax.clip.Clip` is one kind of record. Its payload is a
+checksum and msgpack with the arrays' raw bytes, never pickle.
+"""
+
+import dataclasses
+import errno
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+from array_record.python.array_record_data_source import ArrayRecordDataSource
+from array_record.python.array_record_module import ArrayRecordWriter
+
+from rsjax.clip import Clip
+from rsjax.errors import UserError
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
+SHARD_BYTES = 256 * 2**20
+
+Record = dict[str, Any]
+
+
+class StoreError(UserError):
+    """A store that cannot be read or written. The message names the file and the cure."""
+
+
+def encode(record: Record) -> bytes:
+    """A record's payload: CRC-32, then msgpack of its arrays (dtype, shape, bytes) and of its other values."""
+    arrays = {
+        name: (value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes())
+        for name, value in record.items()
+        if isinstance(value, np.ndarray)
+    }
+    values = {name: value for name, value in record.items() if name not in arrays}
+    body = msgpack.packb((arrays, values))
+    return zlib.crc32(body).to_bytes(4, "little") + body
+
+
+def decode(payload: bytes) -> Record:
+    """The inverse of :func:`encode`.
+
+    Raises:
+        ValueError: if the payload is damaged.
+    """
+    if len(payload) < 4 or zlib.crc32(payload[4:]) != int.from_bytes(payload[:4], "little"):
+        raise ValueError("its checksum is wrong")
+    arrays, values = msgpack.unpackb(payload[4:], strict_map_key=False)
+    return values | {
+        name: np.frombuffer(raw, np.dtype(dtype)).reshape(shape).copy() for name, (dtype, shape, raw) in arrays.items()
+    }
+
+
+def encode_clip(clip: Clip) -> Record:
+    """A clip as a record."""
+    return {field.name: getattr(clip, field.name) for field in dataclasses.fields(Clip)}
+
+
+def decode_clip(record: Record) -> Clip:
+    """The inverse of :func:`encode_clip`."""
+    return Clip(**record)
+
+
+class Source:
+    """Random access to one split's records: ``len(source)``, ``source[i]``. Can be sent to other processes.
+
+    Raises:
+        StoreError: on reading a record that is damaged; it names the file and the record.
+    """
+
+    def __init__(self, paths: list[Path], counts: list[int]) -> None:
+        self._paths, self._starts = paths, np.cumsum([0, *counts])
+        self._reader: Any = None
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_reader": None}
+
+    def __getitem__(self, index: int) -> Record:
+        if not 0 <= index < len(self):
+            raise IndexError(f"record {index} of a split with {len(self)} records")
+        try:
+            if self._reader is None:
+                self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
+            return decode(self._reader[index])
+        except Exception as error:  # array_record reports damage as several types
+            shard = int(np.searchsorted(self._starts, index, side="right")) - 1
+            raise StoreError(
+                f"{self._paths[shard]}: record {index - self._starts[shard]} (number {index} of the split) cannot be "
+                f"read: {error}; delete {self._paths[shard].parent} and make it again"
+            ) from error
+
+
+@dataclasses.dataclass(frozen=True)
+class Store:
+    """An opened store.
+
+    Attributes:
+        path: its directory.
+        manifest: what :func:`write_store` wrote: ``format``, ``kind``, ``splits`` (name → ``files`` and ``counts``)
+            and everything in its ``meta``.
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        return tuple(self.manifest["splits"])
+
+    def source(self, split: str) -> Source:
+        """The records of one split."""
+        if split not in self.manifest["splits"]:
+            raise StoreError(f"{self.path}: no split {split!r}; it has {', '.join(self.splits)}")
+        entry = self.manifest["splits"][split]
+        return Source([self.path / file["name"] for file in entry["files"]], [f["count"] for f in entry["files"]])
+
+
+def open_store(path: Path | str) -> Store:
+    """Open a store and check that its files are all there and whole.
+
+    Raises:
+        StoreError: if the manifest or a shard is missing, truncated or of another format.
+    """
+    path = Path(path)
+    cure = f"delete {path} and make it again"
+    try:
+        manifest = json.loads((path / MANIFEST).read_text())
+    except FileNotFoundError as error:
+        raise StoreError(f"{path / MANIFEST}: missing, so {path} is not a (whole) store; {cure}") from error
+    except ValueError as error:
+        raise StoreError(f"{path / MANIFEST}: not JSON ({error}); {cure}") from error
+    if manifest.get("format") != FORMAT:
+        raise StoreError(f"{path / MANIFEST}: format {manifest.get('format')}, this code reads format {FORMAT}; {cure}")
+    for entry in manifest["splits"].values():
+        for file in entry["files"]:
+            shard = path / file["name"]
+            if not shard.exists():
+                raise StoreError(f"{shard}: missing; {cure}")
+            if shard.stat().st_size != file["bytes"]:
+                raise StoreError(f"{shard}: {shard.stat().st_size} bytes, should be {file['bytes']}; {cure}")
+    return Store(path, manifest)
+
+
+def complete_key(path: Path | str) -> str | None:
+    """The content key of a whole store, ``None`` where there is no such thing."""
+    try:
+        return open_store(path).manifest.get("key")
+    except StoreError:
+        return None
+
+
+def write_store(path: Path | str, kind: str, splits: Mapping[str, Iterable[Record]], meta: dict[str, Any]) -> None:
+    """Write a store; it replaces an older one at the same place only when it is complete.
+
+    Args:
+        path: the store's directory.
+        kind: what the records are, e.g. ``"clips"``.
+        splits: each split's records, consumed once and in order.
+        meta: more of the manifest, JSON-ready; ``key`` is the content key that :func:`complete_key` returns.
+
+    Raises:
+        StoreError: on a full disk, or where ``path`` holds something that is not a store.
+    """
+    path = Path(path)
+    if path.exists() and not (path / MANIFEST).exists():
+        raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
+    building = path.with_name(f"{path.name}.building")
+    with disk_guard(path):
+        shutil.rmtree(building, ignore_errors=True)
+        building.mkdir(parents=True)
+        try:
+            manifest: dict[str, Any] = {"format": FORMAT, "kind": kind, "splits": {}} | meta
+            for split, records in splits.items():
+                manifest["splits"][split] = {"files": _write_split(building, split, records)}
+                manifest["splits"][split]["count"] = sum(f["count"] for f in manifest["splits"][split]["files"])
+            (building / MANIFEST).write_text(json.dumps(manifest, indent=1))
+            replace_directory(building, path)
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+
+
+def _write_split(folder: Path, split: str, records: Iterable[Record]) -> list[dict[str, Any]]:
+    """Write one split's shards; returns each one's name, count and size in bytes."""
+    files: list[dict[str, Any]] = []
+    payloads: Iterator[bytes] = map(encode, records)
+    payload = next(payloads, None)
+    while payload is not None:
+        name, count, size = f"{split}-{len(files):05d}.array_record", 0, 0
+        writer = ArrayRecordWriter(str(folder / name), WRITER_OPTIONS)
+        while payload is not None and size < SHARD_BYTES:
+            writer.write(payload)
+            count, size = count + 1, size + len(payload)
+            payload = next(payloads, None)
+        writer.close()
+        files.append({"name": name, "count": count, "bytes": (folder / name).stat().st_size})
+    return files
+
+
+def replace_directory(new: Path, path: Path) -> None:
+    """Move a finished directory to its place; an older one there is gone only after that."""
+    old = path.with_name(f"{path.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        os.replace(path, old)
+    os.replace(new, path)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def write_atomically(path: Path, payload: bytes) -> None:
+    """Write a file that a reader sees whole or not at all."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        temporary.write_bytes(payload)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def disk_guard(path: Path) -> Iterator[None]:
+    """Turn the operating system's full disk or refused write into a :class:`StoreError` that names the place."""
+    try:
+        yield
+    except OSError as error:
+        raise _explain(path, error) from error
+    except (RuntimeError, ValueError) as error:  # how ArrayRecord reports them
+        if "No space left" in str(error):
+            raise _explain(path, OSError(errno.ENOSPC, "")) from error
+        raise
+
+
+def _explain(path: Path, error: OSError) -> StoreError:
+    if error.errno == errno.ENOSPC:
+        return StoreError(f"{path}: the disk is full; free some space there and run again")
+    return StoreError(f"{path}: cannot write ({error}); check the place and its permissions")

@@ -1,0 +1,26 @@
+"""Errors that a user can cure, each one clear line. Commands print them without a traceback."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """Something that the user can put right. The message is one line that names the thing and the cure.
+
+    Not a :class:`ValueError`, so that libraries which catch those (the command-line parser does) pass it on untouched.
+    """
+
+
+def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
+    """``"; did you mean 'tiny'?"`` for the nearest of ``choices``, or nothing where none is near.
+
+    A choice whose last dotted part is ``word`` counts as nearest: ``steps`` finds ``train.steps``.
+
+    Args:
+        word: what was written.
+        choices: what there is.
+        prefix: put before each suggestion, such as the dashes of a flag.
+    """
+    choices = list(choices)
+    near = [c for c in choices if c.rpartition(".")[2] == word] or difflib.get_close_matches(word, choices, n=1)
+    return f"; did you mean {' or '.join(repr(prefix + c) for c in near)}?" if near else ""

@@ -1,0 +1,1 @@
+"""Scores of generated clips: pixels, depth, controllability, and the intervals around their means."""

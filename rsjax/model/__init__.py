@@ -1,0 +1,1 @@
+"""The world model: spatial-temporal blocks in two branches, joined depth → RGB (paper §2.3)."""

@@ -1,0 +1,64 @@
+"""Spatial-temporal blocks, one per branch, and the pair of them with the depth → RGB projection (paper Eq. 3).
+
+Axes: B clips, T frames, S cells, C width.
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rsjax.config import ModelConfig
+from rsjax.model.attention import Attention, KeyValues, dense
+
+Features = Float[Array, "B T S C"]
+
+
+class STBlock(nn.Module):
+    """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
+
+    There is no norm before temporal attention unless ``config.temporal_norm``; GELU is the exact one.
+    """
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
+        cfg = self.config
+        dtype = jnp.dtype(cfg.compute_dtype)
+        x = x + Attention(cfg.width, cfg.heads, dtype, name="spatial_attn").spatial(layer_norm("norm1")(x))
+        before_time = layer_norm("norm_temporal")(x) if cfg.temporal_norm else x
+        out, cache = Attention(cfg.width, cfg.heads, dtype, name="temporal_attn").temporal(before_time, start, cache)
+        x = x + out
+        h = dense(cfg.mlp_ratio * cfg.width, "fc1", dtype)(layer_norm("norm2")(x))
+        return x + dense(cfg.width, "fc2", dtype)(nn.gelu(h, approximate=False)), cache
+
+
+def layer_norm(name: str) -> nn.LayerNorm:
+    """LayerNorm with torch's epsilon, in float32."""
+    return nn.LayerNorm(epsilon=1e-5, name=name)
+
+
+class DualBlock(nn.Module):
+    """One block of each branch, then h_RGB += W(h_depth) (Eq. 3). Without depth: the RGB block alone.
+
+    Inputs and outputs are dicts by branch, so that an absent branch is an absent key. Shaped for ``nn.scan``.
+    """
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(
+        self, x: dict[str, Features], cache: dict[str, KeyValues] | None, start: Any
+    ) -> tuple[dict[str, Features], dict[str, KeyValues] | None]:
+        cfg = self.config
+        out, kept = {}, {}
+        for branch, features in x.items():
+            held = None if cache is None else cache[branch]
+            out[branch], kept[branch] = STBlock(cfg, name=branch)(features, start, held)
+        if "depth" in out:
+            # Zero at the start: the RGB branch begins as if it were alone, and pre-trained RGB weights keep their logits.
+            project = nn.Dense(cfg.width, name="depth_to_rgb", kernel_init=nn.initializers.zeros)
+            out["rgb"] = out["rgb"] + project(out["depth"])
+        return out, None if cache is None else kept

@@ -1,0 +1,35 @@
+"""All terms of the world model's objective for one batch (paper Eq. 8)."""
+
+import jax
+from jaxtyping import Array
+
+from rsjax.clip import Batch
+from rsjax.config import LossConfig, MaskConfig, ModelConfig
+from rsjax.model.world_model import WorldModel, branches
+from rsjax.objective import keypoints as kp
+from rsjax.objective import losses, masking
+
+
+def world_model_terms(
+    model: ModelConfig, mask: MaskConfig, loss: LossConfig, params: dict, batch: Batch, key: Array
+) -> dict[str, losses.Term]:
+    """Masks the batch, runs the model, and returns each term's (weighted sum, weight).
+
+    Args:
+        key: the step's key; the same on all devices.
+    """
+    clean = {branch: getattr(batch, branch) for branch in branches(model)}
+    given = masking.corrupt(mask, model.code_bits, model.vocabularies, key, clean, batch.index)
+    logits, _ = WorldModel(model).apply({"params": params}, given.tokens, given.mask, batch.actions)
+    entropy = {b: losses.token_cross_entropy(logits[b], clean[b], model.code_bits) for b in clean}
+
+    terms = {"rgb": losses.rgb_term(entropy["rgb"], given.mask, batch.weight)}
+    if model.depth:
+        terms["depth"] = losses.depth_term(entropy["depth"], given.mask, batch.weight)
+    if loss.keypoints:
+        points = kp.select(batch.tracks, batch.visible, loss.num_keypoints, model.grid)
+        attention = kp.attention_map(points, model.grid, loss.gamma)
+        terms["attention"] = losses.attention_term(entropy["rgb"], given.mask, batch.weight, attention)
+        predicted = losses.expected_codes(logits["rgb"], model.code_bits)
+        terms["keypoint"] = losses.keypoint_term(predicted, points, batch.weight)
+    return jax.tree.map(lambda x: x.astype("float32"), terms)

@@ -1,0 +1,1 @@
+"""Generation: first frame and actions in, the video that follows out."""

@@ -1,0 +1,65 @@
+"""MaskGIT decoding of one frame: all cells masked, then a cosine schedule of which stay so.
+
+Axes: B clips, S cells, n vocabularies of V codes.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from rsjax.config import SampleConfig
+from rsjax.tokenizer import lfq
+
+
+@struct.dataclass
+class Frame:
+    """One frame under decoding, by branch: tokens, and the cells still masked."""
+
+    tokens: dict[str, Int[Array, "B S"]]
+    mask: Bool[Array, "B S"]
+
+
+def masked_after(step: Array | int, steps: int, cells: int) -> Array:
+    """Cells that stay masked after step ``step`` of ``steps``: ceil(cos((step + 1)/steps · π/2) · S); 0 at the end."""
+    # float32's cos(π/2) is not quite 0, and its ceil would leave a cell masked for ever.
+    share = jnp.where(jnp.asarray(step) + 1 >= steps, 0.0, jnp.cos((step + 1) / steps * jnp.pi / 2))
+    return jnp.ceil(share * cells).astype(jnp.int32)
+
+
+def sample_tokens(
+    key: Array, logits: Float[Array, "B S n V"], temperature: float, code_bits: int
+) -> tuple[Int[Array, "B S"], Float[Array, "B S"]]:
+    """A token per cell and its log-probability (the sum over vocabularies, in nats, at temperature 1).
+
+    Args:
+        temperature: logits are divided by it; 0 takes each vocabulary's most probable code.
+    """
+    log_p = jax.nn.log_softmax(logits, axis=-1)
+    codes = jnp.argmax(logits, -1) if temperature == 0 else jax.random.categorical(key, logits / temperature, axis=-1)
+    confidence = jnp.take_along_axis(log_p, codes[..., None], axis=-1)[..., 0].sum(-1)
+    return lfq.merge_tokens(codes.astype(jnp.int32), code_bits), confidence
+
+
+def unmask_step(
+    config: SampleConfig, code_bits: int, key: Array, step: Array | int, frame: Frame, logits: dict[str, Array]
+) -> Frame:
+    """One decoding step: fill the masked cells, then mask again those that the schedule leaves open.
+
+    Both branches share their mask. Which cells stay open is drawn at random, or, for "greedy", it is those in which the
+    branches together are least sure.
+
+    Args:
+        logits: of this frame, by branch, (B, S, n, V).
+    """
+    keys = jax.random.split(key, len(logits) + 1)
+    tokens, confidence = {}, jnp.zeros(frame.mask.shape)
+    for branch_key, (branch, branch_logits) in zip(keys[1:], logits.items(), strict=True):
+        drawn, log_p = sample_tokens(branch_key, branch_logits, config.temperature, code_bits)
+        tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
+        confidence += log_p
+    if config.unmask == "random":
+        confidence = jax.random.uniform(keys[0], frame.mask.shape)
+    # Cells that are already decided stay so: they rank as surest.
+    rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf), axis=-1), axis=-1)
+    return Frame(tokens, rank < masked_after(step, config.steps, frame.mask.shape[-1]))

@@ -1,0 +1,266 @@
+"""Collect Lift episodes in parallel processes into a store of clips.
+
+Each finished episode is a file in ``<out>.partial``, so that an interrupted collection goes on where it stopped; at
+the end they are packed into one store. An episode that the simulator fails at is left out and named in the manifest.
+"""
+
+import importlib.metadata
+import multiprocessing
+import os
+import shutil
+import signal
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.util import Finalize
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.clip import Clip
+from rsjax.config import SimConfig, content_key, to_dict
+from rsjax.data.store import (
+    Record,
+    complete_key,
+    decode,
+    disk_guard,
+    encode,
+    encode_clip,
+    write_atomically,
+    write_store,
+)
+from rsjax.errors import UserError
+from rsjax.sim.expert import MODES, Expert, draw_manner
+from rsjax.sim.gl import GLError, choose_gl
+from rsjax.sim.labels import Snapshot, pick_pixels, track
+from rsjax.sim.lift import TASK, LiftSim
+
+SOURCE = "robosuite/Lift/Panda"
+RECIPE = 1  # raise it when the same configuration gives other episodes
+MAX_FAILURES = 0.1  # share of the episodes; more than a bad seed or two is a broken installation
+
+
+class CollectError(UserError):
+    """The collection cannot be completed. The message says why and what to do."""
+
+
+def collection_key(config: SimConfig) -> str:
+    """The content key of the store that :func:`collect` makes."""
+    return content_key("lift", RECIPE, MODES, config)
+
+
+def run_episode(sim: LiftSim, config: SimConfig, episode: int) -> Clip:
+    """Simulate one episode; it depends on nothing but the configuration's seed and the episode's number.
+
+    Frame 0 is the start; ``config.control_steps`` control steps of 50 ms lead to each later frame.
+    """
+    rng = np.random.default_rng([config.seed, episode])
+    sim.reset(int(rng.integers(2**32)))
+    manner = draw_manner(rng)
+    expert = Expert(manner, rng)
+    views, shots, success = [], [], []
+    actions = np.zeros((config.frames, config.control_steps, 7), np.float32)
+    for frame in range(config.frames):
+        for step in range(config.control_steps if frame else 0):
+            actions[frame, step] = expert.act(sim.state)
+            sim.step(actions[frame, step])
+        views.append(sim.render())
+        shots.append(Snapshot(sim.camera, *sim.body_poses(), views[-1].fine_depth))
+        success.append(sim.success)
+        if frame == 0:
+            bodies = sim.segment()
+            pixels = pick_pixels(bodies, sim.movable, sim.cube_body, config.tracks, rng)
+    tracks, visible = track(pixels, views[0].depth, bodies, shots)
+    return Clip(
+        rgb=np.stack([view.rgb for view in views]),
+        depth=np.stack([view.depth for view in views]),
+        actions=actions.reshape(config.frames, -1),
+        tracks=tracks,
+        visible=visible,
+        success=np.array(success),
+        task=TASK,
+        provenance={
+            "source": SOURCE,
+            "seed": config.seed,
+            "episode": episode,
+            "camera": config.camera,
+            "control_hz": 20,
+            "expert": to_dict(manner),
+            "versions": _versions(),
+        },
+    )
+
+
+def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) -> None:
+    """Collect ``config.episodes`` episodes into a store at ``out``; its test split is the last ``test_episodes``.
+
+    Returns at once if the store is there and was made by the same configuration.
+
+    Args:
+        report: called with (episodes done, episodes in all) as they finish.
+
+    Raises:
+        GLError: without a usable OpenGL library.
+        StoreError: if ``out`` cannot be written, e.g. on a full disk.
+        CollectError: if worker processes die, or more than ``MAX_FAILURES`` of the episodes fail.
+    """
+    if complete_key(out) == collection_key(config):
+        report(config.episodes, config.episodes)
+        return
+    choose_gl()
+    partial = out.with_name(f"{out.name}.partial")
+    with disk_guard(partial):
+        _prepare(partial, collection_key(config))
+    todo = [
+        i for i in range(config.episodes) if not (_clip_file(partial, i).exists() or _error_file(partial, i).exists())
+    ]
+    report(config.episodes - len(todo), config.episodes)
+    if todo:
+        with disk_guard(partial):
+            _simulate(config, partial, todo, report)
+    _pack(config, partial, out)
+    shutil.rmtree(partial)
+
+
+def _prepare(partial: Path, key: str) -> None:
+    """Make the directory of finished episodes; those of another configuration are thrown away."""
+    marker = partial / "key"
+    if not marker.exists() or marker.read_text() != key:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        write_atomically(marker, key.encode())
+
+
+def _simulate(config: SimConfig, partial: Path, todo: list[int], report: Callable[[int, int], None]) -> None:
+    workers = min(config.workers or _cores(), len(todo))
+    done = config.episodes - len(todo)
+    context = multiprocessing.get_context("spawn")  # a forked OpenGL or JAX does not work
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(workers,)) as pool:
+        futures = [pool.submit(_work, config, partial, episode) for episode in todo]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                done += 1
+                report(done, config.episodes)
+        except BrokenProcessPool as error:
+            raise CollectError(
+                f"a simulator process died after {done} of {config.episodes} episodes, most likely for lack of memory; "
+                f"run again with fewer sim.workers (now {workers}), finished episodes are kept"
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+_sim: dict[tuple[str, int], LiftSim] = {}  # this worker's simulator, by camera and image size
+
+
+def _start_worker(workers: int) -> None:
+    """The parent handles Ctrl-C. One core each: threads of Mesa's software renderer would get in each other's way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("LP_NUM_THREADS", str(max(1, _cores() // workers)))
+
+
+def _worker_sim(config: SimConfig) -> LiftSim:
+    key = (config.camera, config.image_size)
+    if key not in _sim:
+        _sim[key] = LiftSim(*key)
+        Finalize(None, _sim[key].close, exitpriority=1)
+    return _sim[key]
+
+
+def _work(config: SimConfig, partial: Path, episode: int) -> None:
+    """Simulate one episode in a worker process and leave its clip, or why there is none, in ``partial``."""
+    sim = _worker_sim(config)
+    try:
+        payload = encode(encode_clip(run_episode(sim, config, episode)))
+    except (GLError, OSError, MemoryError):
+        raise
+    except Exception as error:  # whatever the simulator throws costs this episode only
+        write_atomically(_error_file(partial, episode), f"{type(error).__name__}: {error}".encode())
+    else:
+        write_atomically(_clip_file(partial, episode), payload)
+
+
+def _clip_file(partial: Path, episode: int) -> Path:
+    return partial / f"{episode:06d}.clip"
+
+
+def _error_file(partial: Path, episode: int) -> Path:
+    return partial / f"{episode:06d}.error"
+
+
+def _pack(config: SimConfig, partial: Path, out: Path) -> None:
+    """Write the finished episodes as one store."""
+    failures = {path.stem: path.read_text() for path in sorted(partial.glob("*.error"))}
+    if len(failures) > MAX_FAILURES * config.episodes:
+        shutil.rmtree(partial)
+        raise CollectError(
+            f"{len(failures)} of {config.episodes} episodes failed in the simulator, the first one with: "
+            f"{next(iter(failures.values()))}; nothing was stored, check the installation with `make test`"
+        )
+    cut = config.episodes - config.test_episodes
+    files = {
+        "train": [path for i in range(cut) if (path := _clip_file(partial, i)).exists()],
+        "test": [path for i in range(cut, config.episodes) if (path := _clip_file(partial, i)).exists()],
+    }
+    statistics = _train_statistics(files["train"])
+    summary = _summary(files["train"] + files["test"])
+    meta = {
+        "key": collection_key(config),
+        "source": SOURCE,
+        "config": to_dict(config),
+        "quarantine": failures,
+        **statistics,
+        **summary,
+    }
+    stamp = {"depth_range": statistics["depth_range"]}
+    write_store(out, "clips", {split: _stamped(paths, stamp) for split, paths in files.items()}, meta)
+
+
+def _stamped(paths: list[Path], stamp: dict[str, Any]) -> Iterator[Record]:
+    """The clips in these files, with more provenance."""
+    for path in paths:
+        record = decode(path.read_bytes())
+        yield record | {"provenance": record["provenance"] | stamp}
+
+
+def _train_statistics(paths: list[Path]) -> dict[str, Any]:
+    """Depth range in metres, and the actions' mean and standard deviation (frame 0 has none), over the train split."""
+    actions, near, far = [], np.inf, 0.0
+    for path in paths:
+        record = decode(path.read_bytes())
+        near, far = min(near, float(record["depth"].min())), max(far, float(record["depth"].max()))
+        actions.append(record["actions"][1:])
+    flat = np.concatenate(actions).astype(np.float64)
+    return {
+        "depth_range": [near, far],
+        "action_mean": flat.mean(0).tolist(),
+        "action_std": flat.std(0).tolist(),
+    }
+
+
+def _summary(paths: list[Path]) -> dict[str, Any]:
+    """Tasks, expert modes, and the share of clips that end in success (and that ever succeed)."""
+    tasks, modes, final, ever = set(), Counter[str](), [], []
+    for path in paths:
+        record = decode(path.read_bytes())
+        tasks.add(record["task"])
+        modes[record["provenance"]["expert"]["mode"]] += 1
+        final.append(bool(record["success"][-1]))
+        ever.append(bool(record["success"].any()))
+    return {
+        "tasks": sorted(tasks),
+        "modes": dict(modes),
+        "success_share": float(np.mean(final)),
+        "success_ever_share": float(np.mean(ever)),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("robosuite", "mujoco")}

@@ -1,0 +1,47 @@
+"""Which OpenGL library MuJoCo renders with. Call :func:`choose_gl` before anything imports mujoco or robosuite."""
+
+import ctypes
+import ctypes.util
+import os
+
+from rsjax.errors import UserError
+
+LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference
+
+CURE = "install one with `make setup` or `apt-get install libegl1 libosmesa6`"
+
+
+class GLError(UserError):
+    """No OpenGL library can be used. The message says how to get one."""
+
+
+def _loads(library: str) -> bool:
+    """Whether the shared library can be found and loaded."""
+    name = ctypes.util.find_library(library)
+    if name is None:
+        return False
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
+
+
+def choose_gl() -> str:
+    """Set ``MUJOCO_GL`` to an OpenGL library that this machine has; a value that the user set is respected.
+
+    Returns:
+        the value of ``MUJOCO_GL``.
+
+    Raises:
+        GLError: if the machine has none, or lacks the one that the user asked for.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    if wanted in LIBRARIES and not _loads(LIBRARIES[wanted]):
+        raise GLError(f"MUJOCO_GL is {wanted!r} but lib{LIBRARIES[wanted]} is not on this machine: {CURE}, or unset it")
+    if not wanted:
+        found = [name for name, library in LIBRARIES.items() if _loads(library)]
+        if not found:
+            raise GLError(f"no OpenGL library (libEGL or libOSMesa) on this machine: {CURE}")
+        wanted = os.environ["MUJOCO_GL"] = found[0]
+    return wanted

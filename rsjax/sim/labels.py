@@ -1,0 +1,106 @@
+"""Exact keypoint tracks from the simulator: pixels of frame 0, carried by the bodies that they lie on.
+
+A pixel of frame 0 is unprojected with its depth, tied to the body that the segmentation names, moved with that body's
+pose, and projected again; it is visible where the depth buffer holds nothing nearer.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32
+
+from rsjax.sim.render import Camera
+
+TOLERANCE = 0.005  # metres that the depth buffer may be nearer than a visible point
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What tracking needs of one frame."""
+
+    camera: Camera
+    positions: Float[np.ndarray, "bodies 3"]
+    rotations: Float[np.ndarray, "bodies 3 3"]
+    fine_depth: Float32[np.ndarray, "R R"]
+
+
+def pick_pixels(
+    bodies: Int32[np.ndarray, "S S"],
+    movable: Bool[np.ndarray, " bodies"],
+    cube: int,
+    count: int,
+    rng: np.random.Generator,
+) -> Int[np.ndarray, "count 2"]:
+    """N₀ pixels of frame 0 to track, all different as long as the image has as many.
+
+    Up to half lie on a regular grid over the image. The others favour what moves: half of them on the cube and half on
+    moving links of the arm, as far as these cover pixels; the rest anywhere.
+
+    Returns:
+        (row, column) of each.
+    """
+    size = bodies.shape[0]
+    side = min(int(np.sqrt(count / 2)), size)
+    ticks = ((np.arange(side) + 0.5) * size / side).astype(int)
+    chosen = (ticks[:, None] * size + ticks[None, :]).ravel()
+    flat = bodies.ravel()
+    free = np.setdiff1d(np.arange(flat.size), chosen)
+    wanted = (
+        (free[flat[free] == cube], (count - chosen.size) // 2),
+        (free[movable[flat[free]] & (flat[free] != cube)], count - chosen.size),
+        (free, count),
+    )
+    for pool, most in wanted:
+        pool = np.setdiff1d(pool, chosen)
+        take = min(most, count - chosen.size, pool.size)
+        chosen = np.concatenate([chosen, rng.choice(pool, take, replace=False)])
+    if chosen.size < count:  # more tracks than pixels
+        chosen = np.concatenate([chosen, rng.choice(flat.size, count - chosen.size)])
+    return np.stack(np.divmod(chosen, size), -1)
+
+
+def track(
+    pixels: Int[np.ndarray, "N 2"],
+    depth: Float32[np.ndarray, "S S"],
+    bodies: Int32[np.ndarray, "S S"],
+    snapshots: Sequence[Snapshot],
+) -> tuple[Float32[np.ndarray, "N T 2"], Bool[np.ndarray, "N T"]]:
+    """Carry pixels of frame 0 through a clip.
+
+    Args:
+        pixels: (row, column) in frame 0.
+        depth: metres, of frame 0.
+        bodies: body id at each pixel of frame 0.
+        snapshots: one per frame, frame 0 first.
+
+    Returns:
+        tracks and visibility as :class:`rsjax.clip.Clip` defines them.
+    """
+    rows, columns = pixels.T
+    xy = (pixels[:, ::-1] + 0.5) / depth.shape[0]
+    first, body = snapshots[0], bodies[rows, columns]
+    world = first.camera.unproject(xy, depth[rows, columns].astype(np.float64))
+    local = np.einsum("nij,ni->nj", first.rotations[body], world - first.positions[body])
+    tracks, visible = [], []
+    for shot in snapshots:
+        world = shot.positions[body] + np.einsum("nij,nj->ni", shot.rotations[body], local)
+        xy, z = shot.camera.project(world)
+        tracks.append(xy)
+        visible.append(unoccluded(xy, z, shot.fine_depth))
+    return np.stack(tracks, 1).astype(np.float32), np.stack(visible, 1)
+
+
+def unoccluded(
+    xy: Float[np.ndarray, "N 2"], z: Float[np.ndarray, " N"], fine_depth: Float32[np.ndarray, "R R"]
+) -> Bool[np.ndarray, " N"]:
+    """Whether each point is inside the image with nothing more than ``TOLERANCE`` before it.
+
+    The buffer's farthest value in the 3×3 around the point counts, so that steep surfaces don't hide themselves.
+    """
+    size = fine_depth.shape[0]
+    inside = (z > 0) & ((xy >= 0) & (xy < 1)).all(-1)
+    column, row = (np.where(inside[:, None], xy, 0) * size).astype(int).T
+    padded = np.pad(fine_depth, 1, mode="edge")
+    around = np.stack([padded[row + i, column + j] for i in range(3) for j in range(3)])
+    return inside & (z <= around.max(0) + TOLERANCE)

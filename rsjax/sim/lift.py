@@ -1,0 +1,179 @@
+"""robosuite's Lift with the Panda arm: what it does, and exactly where everything is."""
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32
+
+from rsjax.config import ConfigError
+from rsjax.sim.gl import choose_gl
+from rsjax.sim.render import Camera, Renderer, View
+
+TASK = "lift the red cube"
+CUBE_BODY = "cube_main"
+
+
+@dataclass(frozen=True)
+class State:
+    """What the expert sees: positions in metres in the world, yaws in radians about the vertical."""
+
+    gripper: Float[np.ndarray, " 3"]
+    gripper_yaw: float
+    cube: Float[np.ndarray, " 3"]
+    cube_yaw: float
+
+
+def _load_robosuite() -> Any:
+    """robosuite, without its advice about private macro files."""
+    choose_gl()
+    logging.disable(logging.WARNING)
+    try:
+        import robosuite
+    finally:
+        logging.disable(logging.NOTSET)
+    return robosuite
+
+
+def _yaw(rotation: Float[np.ndarray, "3 3"]) -> float:
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+class LiftSim:
+    """The Lift environment: 20 Hz, 7-D actions in [-1, 1] (OSC_POSE: 6-D pose delta, gripper; +1 closes).
+
+    An episode depends on nothing but the seed given to :meth:`reset`. Use as a context manager, or call
+    :meth:`close`: a renderer left to the interpreter's exit prints errors.
+
+    Args:
+        camera: one of robosuite's cameras.
+        image_size: S, pixels along each side; 0 builds no renderer.
+
+    Raises:
+        GLError: if no OpenGL context can be made.
+        ConfigError: if there is no such camera.
+    """
+
+    def __init__(self, camera: str = "agentview", image_size: int = 64) -> None:
+        robosuite = _load_robosuite()
+        # robosuite draws the cube's size when it builds the scene: fix it, or episodes would depend on the process.
+        with _global_seed(0):
+            self._env = robosuite.make(
+                "Lift",
+                robots="Panda",
+                controller_configs=robosuite.load_controller_config(default_controller="OSC_POSE"),
+                has_renderer=False,
+                has_offscreen_renderer=False,
+                use_camera_obs=False,
+                use_object_obs=False,
+                control_freq=20,
+                ignore_done=True,
+                hard_reset=False,
+            )
+        self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
+        names = [self._model.camera(i).name for i in range(self._model.ncam)]
+        if camera not in names:
+            raise ConfigError(f"sim.camera is {camera!r}; this scene has {', '.join(names)}")
+        self._camera_id = names.index(camera)
+        self._cube_id = self._model.body(CUBE_BODY).id
+        self._renderer = Renderer(self._model, self._camera_id, image_size) if image_size else None
+
+    def __enter__(self) -> "LiftSim":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the renderer and the simulation."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self._env.close()
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode: the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
+        with _global_seed(seed):
+            self._env.reset()
+
+    def step(self, action: Float[np.ndarray, " 7"]) -> None:
+        """One control step of 50 ms.
+
+        Raises:
+            ArithmeticError: if the simulation diverges.
+        """
+        self._env.step(action)
+        if not np.isfinite(self._data.qpos).all():
+            raise ArithmeticError("the simulation diverged: a joint position is not finite")
+
+    @property
+    def state(self) -> State:
+        robot = self._env.robots[0]
+        grip = self._data.site_xmat[robot.eef_site_id].reshape(3, 3)
+        return State(
+            gripper=self._data.site_xpos[robot.eef_site_id].copy(),
+            gripper_yaw=_yaw(grip),
+            cube=self._data.xpos[self._cube_id].copy(),
+            cube_yaw=_yaw(self._data.xmat[self._cube_id].reshape(3, 3)),
+        )
+
+    @property
+    def success(self) -> bool:
+        """robosuite's own predicate: the cube is more than 4 cm above the table."""
+        return bool(self._env._check_success())
+
+    @property
+    def camera(self) -> Camera:
+        return Camera(
+            self._data.cam_xpos[self._camera_id].copy(),
+            self._data.cam_xmat[self._camera_id].reshape(3, 3).copy(),
+            float(self._model.cam_fovy[self._camera_id]),
+        )
+
+    @property
+    def cube_body(self) -> int:
+        """The cube's body id in :meth:`segment` and :meth:`body_poses`."""
+        return self._cube_id
+
+    @property
+    def cube_half_size(self) -> Float[np.ndarray, " 3"]:
+        """Half the cube's edges, in metres."""
+        geom = int(self._model.body_geomadr[self._cube_id])
+        return self._model.geom_size[geom].copy()
+
+    @property
+    def movable(self) -> Bool[np.ndarray, " bodies"]:
+        """Whether each body can move at all (is not welded to the world)."""
+        return self._model.body_weldid != 0
+
+    def body_poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3 3"]]:
+        """Each body's position in metres and rotation in the world."""
+        return self._data.xpos.copy(), self._data.xmat.reshape(-1, 3, 3).copy()
+
+    def render(self) -> View:
+        """The current frame."""
+        return self._need_renderer().render(self._data)
+
+    def segment(self) -> Int32[np.ndarray, "S S"]:
+        """The body id at each pixel's centre; 0 (the world) where there is nothing."""
+        return self._need_renderer().segment(self._data)
+
+    def _need_renderer(self) -> Renderer:
+        if self._renderer is None:
+            raise ValueError("this LiftSim was made with image_size=0 or is closed; it cannot render")
+        return self._renderer
+
+
+class _global_seed:
+    """robosuite draws from numpy's global generator: seed it, and put it back as it was."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def __enter__(self) -> None:
+        self._state = np.random.get_state()
+        np.random.seed(self._seed)
+
+    def __exit__(self, *_: object) -> None:
+        np.random.set_state(self._state)

@@ -1,0 +1,40 @@
+"""A reversible colour map for depth, so that the RGB tokenizer can read it.
+
+The paper tokenizes depth maps with MAGVIT-2 but does not publish its colour map. Ours walks
+black → red → yellow → white: each third of the range raises one channel, so the position along the walk *is* the mean
+of the three channels. Inverting is linear, a blurred edge decodes to a depth between its two sides (a rainbow map
+would give one from elsewhere), and 8-bit colours keep 766 levels.
+"""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scale = Literal["linear", "inverse"]
+
+
+def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale: Scale) -> Float[Array, "*batch 3"]:
+    """Depth in metres to colours 0–255 (float32, whole numbers); depth outside [near, far] is clipped to it.
+
+    Args:
+        depth: metres, > 0.
+        near: depth that becomes white.
+        far: depth that becomes black.
+        scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.
+    """
+    near_value, far_value = _scaled(near, scale), _scaled(far, scale)
+    position = jnp.clip((_scaled(depth, scale) - far_value) / (near_value - far_value), 0.0, 1.0)
+    level = jnp.round(position * 765.0)
+    return jnp.clip(level[..., None] - jnp.array([0.0, 255.0, 510.0]), 0.0, 255.0)
+
+
+def color_to_depth(color: Float[Array, "*batch 3"], near: float, far: float, scale: Scale) -> Float[Array, "*batch"]:
+    """The inverse of :func:`depth_to_color`, for any colours 0–255: metres in [near, far]."""
+    position = jnp.mean(jnp.asarray(color, jnp.float32), axis=-1) / 255.0
+    near_value, far_value = _scaled(near, scale), _scaled(far, scale)
+    return _scaled(far_value + position * (near_value - far_value), scale)
+
+
+def _scaled(depth, scale: Scale):
+    return depth if scale == "linear" else 1.0 / depth  # its own inverse

@@ -1,0 +1,80 @@
+"""Lookup-free quantisation (LFQ, MAGVIT-2): a code is the signs of D channels, a token the number they spell.
+
+Tokens are little-endian, ``token = Σ_c bit_c·2^c``, as in the published token files and Genie weights.
+A vocabulary of 2^D is factorised into n vocabularies of 2^(D/n): sub-token k holds bits k·D/n … (k+1)·D/n - 1.
+
+Axes: … any leading axes, D code bits, n vocabularies, V = 2^(D/n) codes each, N tokens.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+Scalar = Float[Array, ""]
+
+
+def quantize(latents: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+    """Signs of the latents (+1 where > 0, else -1), with the straight-through gradient."""
+    signs = jnp.where(latents > 0, 1.0, -1.0).astype(latents.dtype)
+    return latents + jax.lax.stop_gradient(signs - latents)
+
+
+def codes_to_tokens(codes: Float[Array, "*batch D"]) -> Int[Array, "*batch"]:
+    """Codes in {-1, +1} to int32 tokens, 0 … 2^D - 1."""
+    powers = 2 ** jnp.arange(codes.shape[-1], dtype=jnp.int32)
+    return jnp.sum((codes > 0) * powers, axis=-1, dtype=jnp.int32)
+
+
+def tokens_to_codes(tokens: Int[Array, "*batch"], code_bits: int) -> Float[Array, "*batch D"]:
+    """Tokens to float32 codes in {-1, +1}."""
+    bits = (tokens[..., None] >> jnp.arange(code_bits, dtype=tokens.dtype)) & 1
+    return bits.astype(jnp.float32) * 2 - 1
+
+
+def split_tokens(tokens: Int[Array, "*batch"], code_bits: int, vocabularies: int) -> Int[Array, "*batch n"]:
+    """Tokens to their sub-tokens, one per factorised vocabulary; vocabulary 0 holds the lowest bits."""
+    width = code_bits // vocabularies
+    shifts = jnp.arange(vocabularies, dtype=tokens.dtype) * width
+    return (tokens[..., None] >> shifts) & (2**width - 1)
+
+
+def merge_tokens(sub_tokens: Int[Array, "*batch n"], code_bits: int) -> Int[Array, "*batch"]:
+    """The inverse of :func:`split_tokens`."""
+    vocabularies = sub_tokens.shape[-1]
+    shifts = jnp.arange(vocabularies, dtype=sub_tokens.dtype) * (code_bits // vocabularies)
+    return jnp.sum(sub_tokens << shifts, axis=-1, dtype=sub_tokens.dtype)
+
+
+def vocabulary_codes(code_bits: int, vocabularies: int) -> Float[Array, "V d"]:
+    """The code bits in {-1, +1} of every entry of one factorised vocabulary, d = D/n."""
+    width = code_bits // vocabularies
+    return tokens_to_codes(jnp.arange(2**width, dtype=jnp.int32), width)
+
+
+def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
+    """mean((x - sg(q))²), float32: keeps the latents near their codes."""
+    latents = latents.astype(jnp.float32)
+    return jnp.mean(jnp.square(latents - jax.lax.stop_gradient(quantize(latents))))
+
+
+def entropy_loss(latents: Float[Array, "*batch D"], temperature: float) -> Scalar:
+    """Mean entropy of a token's code less the entropy of the batch's average code, over all 2^D codes, in nats.
+
+    Code c has probability ∝ exp(2·x·c/τ), so its bits are independent: p_d = σ(4·x_d/τ). Hence the first term is a
+    sum of binary entropies, and the average over the batch is a product of two half-code tables of 2^(D/2) entries:
+    no array of N × 2^D is made. float32.
+    """
+    logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
+    log_one, log_zero = jax.nn.log_sigmoid(logits), jax.nn.log_sigmoid(-logits)
+    per_token = -jnp.sum(jnp.exp(log_one) * log_one + jnp.exp(log_zero) * log_zero, axis=-1)
+
+    half = logits.shape[-1] // 2
+    low, high = (_code_probabilities(log_one[:, s], log_zero[:, s]) for s in (slice(half), slice(half, None)))
+    average = high.T @ low / logits.shape[0]  # (2^(D-half), 2^half)
+    of_average = -jnp.sum(average * jnp.log(jnp.maximum(average, 1e-20)))
+    return jnp.mean(per_token) - of_average
+
+
+def _code_probabilities(log_one: Float[Array, "N d"], log_zero: Float[Array, "N d"]) -> Float[Array, "N V"]:
+    ones = (vocabulary_codes(log_one.shape[-1], 1) + 1) / 2  # (V, d) in {0, 1}
+    return jnp.exp(log_one @ ones.T + log_zero @ (1 - ones).T)

@@ -1,0 +1,52 @@
+"""The training state and its optimizer."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Int32
+
+from rsjax.config import LoopConfig
+from rsjax.train.objectives import Objective
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that a step reads and writes; what a checkpoint holds, with the place in the data."""
+
+    step: Int32[Array, ""]
+    params: Any
+    opt_state: Any
+    ema: Any  # averaged parameters, or None
+
+    @property
+    def weights(self) -> Any:
+        """The parameters that later stages use: the averaged ones where they are kept."""
+        return self.params if self.ema is None else self.ema
+
+
+def learning_rate(loop: LoopConfig) -> optax.Schedule:
+    """Linear warm-up, then a cosine to ``final_share`` of the peak at the last step."""
+    opt = loop.optimizer
+    warmup = min(opt.warmup_steps, max(loop.steps - 1, 1))
+    return optax.warmup_cosine_decay_schedule(
+        0.0, opt.learning_rate, warmup, max(loop.steps, warmup + 1), opt.learning_rate * opt.final_share
+    )
+
+
+def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
+    """Clipping by the global norm, then AdamW."""
+    opt = loop.optimizer
+    return optax.chain(
+        optax.clip_by_global_norm(opt.grad_clip),
+        optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay),
+    )
+
+
+def create_state(objective: Objective, loop: LoopConfig) -> TrainState:
+    """The state before the first step; a function of the configuration alone."""
+    params = objective.init(jax.random.key(loop.seed))
+    ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
+    return TrainState(jnp.int32(0), params, make_optimizer(loop).init(params), ema)

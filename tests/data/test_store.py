@@ -1,0 +1,169 @@
+import errno
+import json
+import os
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from rsjax.clip import Clip
+from rsjax.data import store as store_module
+from rsjax.data.store import (
+    MANIFEST,
+    Record,
+    StoreError,
+    complete_key,
+    decode,
+    decode_clip,
+    encode,
+    encode_clip,
+    open_store,
+    write_store,
+)
+
+ARRAYS = hnp.arrays(
+    st.sampled_from([np.uint8, np.int32, np.float32, np.float64, np.bool_]), hnp.array_shapes(min_dims=0, min_side=0)
+)
+VALUES = st.text() | st.integers(-(2**60), 2**60) | st.dictionaries(st.text(), st.lists(st.floats(allow_nan=False)))
+
+
+def assert_same(left: Record, right: Record) -> None:
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        if isinstance(value, np.ndarray):
+            assert right[name].dtype == value.dtype
+            assert right[name].shape == value.shape
+            np.testing.assert_array_equal(right[name], value)
+        else:
+            assert right[name] == value
+
+
+@given(st.dictionaries(st.text(), ARRAYS | VALUES))
+def test_record_round_trip(record: Record) -> None:
+    assert_same(record, decode(encode(record)))
+
+
+@given(st.data())
+def test_any_changed_byte_is_noticed(data: st.DataObject) -> None:
+    payload = bytearray(encode({"x": np.arange(5), "name": "word"}))
+    payload[data.draw(st.integers(0, len(payload) - 1))] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(ValueError, match=r"checksum"):
+        decode(bytes(payload))
+
+
+def numbered(count: int, start: int = 0) -> Iterator[Record]:
+    rng = np.random.default_rng(0)
+    for i in range(start, start + count):
+        yield {"i": np.array(i), "noise": rng.integers(0, 255, 5000, np.uint8), "name": f"record {i}"}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_store(tmp_path / "set", "numbers", {"train": numbered(7), "test": numbered(2, 100)}, {"key": "abc", "x": 1})
+    return tmp_path / "set"
+
+
+def test_store_round_trip(path: Path) -> None:
+    store = open_store(path)
+    assert store.manifest["kind"] == "numbers"
+    assert store.manifest["x"] == 1
+    assert complete_key(path) == "abc"
+    assert store.splits == ("train", "test")
+    assert [int(store.source("train")[i]["i"]) for i in (6, 0, 3)] == [6, 0, 3]
+    test = pickle.loads(pickle.dumps(store.source("test")))
+    assert len(test) == 2
+    assert test[1]["name"] == "record 101"
+    with pytest.raises(IndexError):
+        test[2]
+    with pytest.raises(StoreError, match=r"'val'.*train, test"):
+        store.source("val")
+
+
+@settings(max_examples=5)
+@given(st.integers(1, 30_000))
+def test_shards_change_nothing(tmp_path_factory: pytest.TempPathFactory, shard_bytes: int) -> None:
+    path = tmp_path_factory.mktemp("shards") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_module, "SHARD_BYTES", shard_bytes)
+        write_store(path, "numbers", {"train": numbered(6)}, {})
+    source = open_store(path).source("train")
+    assert len(source) == 6
+    for i, record in enumerate(numbered(6)):
+        assert_same(record, source[i])
+
+
+def test_clip_round_trip() -> None:
+    rng = np.random.default_rng(0)
+    clip = Clip(
+        rgb=rng.integers(0, 255, (3, 4, 4, 3), np.uint8),
+        depth=rng.random((3, 4, 4), np.float32),
+        actions=rng.random((3, 7), np.float32),
+        tracks=rng.random((5, 3, 2), np.float32),
+        visible=rng.random((5, 3)) < 0.5,
+        success=np.array([False, False, True]),
+        task="lift",
+        provenance={"seed": 0, "expert": {"mode": "lift"}},
+    )
+    assert_same(encode_clip(clip), encode_clip(decode_clip(decode(encode(encode_clip(clip))))))
+
+
+def test_truncated_shard_is_named_on_opening(path: Path) -> None:
+    shard = path / "train-00000.array_record"
+    os.truncate(shard, shard.stat().st_size - 100)
+    with pytest.raises(StoreError, match=f"{shard}.*should be.*make it again"):
+        open_store(path)
+    assert complete_key(path) is None
+
+
+def test_damaged_record_is_named_on_reading(path: Path) -> None:
+    shard = path / "train-00000.array_record"
+    damaged = bytearray(shard.read_bytes())
+    needle = next(r["noise"].tobytes()[100:140] for r in list(numbered(7))[3:])
+    place = damaged.find(needle)
+    assert place > 0
+    damaged[place] ^= 255
+    shard.write_bytes(bytes(damaged))
+    source = open_store(path).source("train")
+    assert source[2]["name"] == "record 2"
+    assert source[4]["name"] == "record 4"
+    with pytest.raises(StoreError, match=f"{shard}: record 3 .*make it again"):
+        source[3]
+
+
+def test_missing_parts_are_named(path: Path, tmp_path: Path) -> None:
+    (path / "test-00000.array_record").unlink()
+    with pytest.raises(StoreError, match=r"test-00000.array_record: missing"):
+        open_store(path)
+    with pytest.raises(StoreError, match=r"manifest.json: missing"):
+        open_store(tmp_path / "nothing")
+    (path / MANIFEST).write_text("{")
+    with pytest.raises(StoreError, match=r"not JSON"):
+        open_store(path)
+    (path / MANIFEST).write_text(json.dumps({"format": 99}))
+    with pytest.raises(StoreError, match=r"format 99"):
+        open_store(path)
+
+
+def test_full_disk_leaves_the_old_store(path: Path) -> None:
+    def records() -> Iterator[Record]:
+        yield from numbered(2)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(StoreError, match=r"disk is full"):
+        write_store(path, "numbers", {"train": records()}, {"key": "new"})
+    assert complete_key(path) == "abc"
+    assert [p.name for p in path.parent.iterdir()] == ["set"]
+
+
+def test_replaces_a_store_but_nothing_else(path: Path, tmp_path: Path) -> None:
+    write_store(path, "numbers", {"train": numbered(1)}, {"key": "new"})
+    assert complete_key(path) == "new"
+    assert not (path / "test-00000.array_record").exists()
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(StoreError, match=r"not a store"):
+        write_store(tmp_path / "mine", "numbers", {"train": numbered(1)}, {})

@@ -1,0 +1,150 @@
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from rsjax.report.curves import curves_svg
+from rsjax.report.page import Report, write_report
+from rsjax.report.targets import judge
+
+_METRICS = {
+    "psnr": 26.314,
+    "psnr_low": 25.4,
+    "psnr_high": 27.2,
+    "psnr_repeat_first": 19.8,
+    "psnr_tokenizer": 28.7,
+    "ssim": 0.8714,
+    "delta_psnr": 2.75,
+    "delta_psnr_uniform_t4": 4.125,
+    "depth_absrel": 0.0213,
+    "depth_absrel_repeat_first": 0.0555,
+    "seconds_total": 1633.0,
+    "success_share": 0.4567,
+}
+_LOG = [{"step": s, "loss": 5.0 / (s + 1), "accuracy": s / 10, "note": "text"} for s in range(5)]
+_VOID = {"meta", "img", "link", "br", "hr", "input"}
+
+
+class _Page(HTMLParser):
+    """Checks that tags nest, and gathers text, table rows and whatever an element would load."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.open, self.loads, self.images, self.cells, self.text = [], [], [], [], ""
+        self.tags = set()
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        if tag not in _VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.cells.append([])
+        for name, value in attrs:
+            if name == "src" and tag == "img":
+                self.images.append(value)
+            elif name in ("src", "href", "xlink:href", "srcset", "data", "action", "poster"):
+                self.loads.append(value)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in _VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if "tr" in self.open and data.strip():
+            self.cells[-1].append(data.strip())
+
+
+def _full(make_clip):
+    return Report(
+        preset="tiny",
+        metrics=_METRICS,
+        clips=[make_clip(title=f"episode <{i}>") for i in range(3)],
+        logs={"tokenizer": _LOG, "world model": _LOG},
+        config={"name": "tiny", "train": {"learning_rate": 0.0001}},
+        versions={"jax": "0.10.2"},
+        seconds={"collect": 75.0, "train": 3725.0},
+        command="python -m experiments.train tiny",
+    )
+
+
+def test_a_full_page_stands_alone(tmp_path, make_clip):
+    path = tmp_path / "report.html"
+    write_report(path, _full(make_clip))
+    page = _Page(path)
+    assert len(page.images) == 3 * 3  # animation, filmstrip and keypoints of each clip
+    assert all(uri.startswith("data:image/") for uri in page.images)
+    assert all(uri.startswith("#") for uri in page.loads)
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    assert not re.search(r"(@import|url\()\s*['\"]?http", path.read_text())
+    assert path.read_text().index("<img") < path.read_text().index("<table")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_numbers_stand_in_their_rows(tmp_path, make_clip):
+    write_report(tmp_path / "r.html", _full(make_clip))
+    page = _Page(tmp_path / "r.html")
+    assert ["held-out clips", "PSNR, dB ↑", "SSIM ↑", "depth AbsRel ↓"] in page.cells
+    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "0.0213"] in page.cells
+    assert ["first frame repeated", "19.80", "0.0555"] in page.cells
+    assert ["tokenizer's reconstruction", "28.70"] in page.cells
+    assert ["another clip's actions", "2.75"] in page.cells
+    assert ["uniform random actions", "4.12"] in page.cells
+    assert ["ΔPSNR, another clip's actions", "≥ 3 dB", "2.75 dB", "missed by 0.25"] in page.cells
+    assert ["train", "1 h 02 min"] in page.cells
+    assert ["collect", "1 min 15 s"] in page.cells
+    assert ["learning_rate", "0.0001"] in page.cells
+    assert ["success_share", "0.4567"] in page.cells
+    assert "python -m experiments.train tiny" in page.text
+    assert "episode <0>" in page.text
+
+
+def test_missing_parts_vanish(tmp_path, make_clip):
+    write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
+    page = _Page(tmp_path / "bare.html")
+    assert ["held-out clips", "PSNR, dB ↑"] in page.cells
+    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "To make it again"):
+        assert absent not in page.text
+    clip = make_clip(true_depth=None, predicted_depth=None, tracks=None, visible=None, selected=None)
+    write_report(tmp_path / "rgb.html", Report(preset="debug", metrics={}, clips=[clip]))
+    page = _Page(tmp_path / "rgb.html")
+    assert len(page.images) == 2
+    for absent in ("Depth", "Keypoints", "Scores", "Details"):
+        assert absent not in page.text
+
+
+def test_a_failed_page_leaves_the_old_one(tmp_path, make_clip):
+    path = tmp_path / "r.html"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="log of tokenizer has no scalar"):
+        write_report(path, Report(preset="tiny", metrics={}, logs={"tokenizer": [{"step": 1}]}))
+    assert path.read_text() == "old"
+
+
+def test_targets_are_judged_where_they_were_measured():
+    verdicts = {v.target.name: v for v in judge(_METRICS)}
+    assert len(verdicts) == 6
+    assert [v.met for v in verdicts.values()] == [True, True, False, False, True, True]
+    assert verdicts["prediction below the tokenizer's reconstruction"].margin == pytest.approx(2 - (28.7 - 26.314))
+    assert verdicts["whole run"].measured == pytest.approx(1633 / 60)
+    assert [v.target.name for v in judge({"delta_psnr": 3.0})] == ["ΔPSNR, another clip's actions"]
+    assert judge({"delta_psnr": 3.0})[0].met
+
+
+def test_curves_draw_each_scalar_once_in_the_pages_colour():
+    svg = curves_svg([*_LOG, {"step": 5, "loss": float("nan")}], "a & b")
+    assert svg.startswith("<svg viewBox=")
+    assert "a &amp; b curves" in svg
+    assert "currentColor" in svg
+    assert "#010203" not in svg
+    assert svg.count(">loss: nan<") == 1
+    assert svg.count(">accuracy: 0.4<") == 1
+    assert "note" not in svg
+    assert "step:" not in svg

@@ -1,0 +1,181 @@
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsjax.clip import Clip
+from rsjax.config import ConfigError, SimConfig
+from rsjax.data.store import StoreError, complete_key, decode_clip, encode, encode_clip, open_store
+from rsjax.sim import collect as collect_module
+from rsjax.sim.collect import CollectError, collect, collection_key, run_episode
+from rsjax.sim.lift import LiftSim
+
+CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, workers=2)
+
+
+def assert_same(left: Clip, right: Clip) -> None:
+    for name, value in encode_clip(left).items():
+        if name == "provenance":
+            assert value | {"depth_range": 0} == getattr(right, name) | {"depth_range": 0}
+        else:
+            np.testing.assert_array_equal(value, getattr(right, name), err_msg=name)
+
+
+def test_an_episode_depends_only_on_seed_and_number(sim: LiftSim) -> None:
+    clips = [run_episode(sim, CONFIG, episode) for episode in range(4)]
+    assert_same(run_episode(sim, CONFIG, 3), clips[3])
+    with LiftSim(image_size=64) as fresh:
+        assert_same(run_episode(fresh, CONFIG, 3), clips[3])
+    assert not np.array_equal(clips[3].rgb[0], clips[2].rgb[0])
+    other = run_episode(sim, SimConfig(**{**CONFIG.__dict__, "seed": 6}), 3)
+    assert not np.array_equal(other.actions, clips[3].actions)
+
+
+def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
+    """Replaying the stored actions from the same start gives the same pictures."""
+    clip = run_episode(sim, CONFIG, 1)
+    assert clip.actions.shape == (4, CONFIG.action_dim)
+    assert not clip.actions[0].any()
+    sim.reset(int(np.random.default_rng([CONFIG.seed, 1]).integers(2**32)))
+    for t in range(CONFIG.frames):
+        for action in clip.actions[t].reshape(-1, 7) if t else ():
+            sim.step(action)
+        view = sim.render()
+        np.testing.assert_array_equal(view.rgb, clip.rgb[t])
+        np.testing.assert_array_equal(view.depth, clip.depth[t])
+
+
+class Interrupt(Exception):
+    pass
+
+
+def test_collect_resumes_and_packs(sim: LiftSim, tmp_path: Path) -> None:
+    out, partial = tmp_path / "lift", tmp_path / "lift.partial"
+
+    def stop_after_one(done: int, total: int) -> None:
+        assert total == 4
+        if done >= 1:
+            raise Interrupt
+
+    with pytest.raises(Interrupt):
+        collect(CONFIG, out, stop_after_one)
+    kept = {path: path.stat().st_mtime_ns for path in partial.glob("*.clip")}
+    assert kept
+    assert not out.exists()
+    # an episode that is there is not simulated again: this one says so
+    mark = next(iter(kept))
+    episode = int(mark.stem)
+    clip = run_episode(sim, CONFIG, episode)
+    mark.write_bytes(encode(encode_clip(clip) | {"task": "marked"}))
+
+    seen: list[int] = []
+    collect(CONFIG, out, lambda done, total: seen.append(done))
+    assert seen[0] >= 1
+    assert seen[-1] == 4
+    assert not partial.exists()
+    assert complete_key(out) == collection_key(CONFIG)
+
+    store = open_store(out)
+    train, test = store.source("train"), store.source("test")
+    assert (len(train), len(test)) == (3, 1)
+    clips = [decode_clip(r) for r in [*(train[i] for i in range(3)), test[0]]]
+    assert [c.provenance["episode"] for c in clips] == [0, 1, 2, 3]
+    assert [c.task == "marked" for c in clips] == [i == episode for i in range(4)]
+    untouched = next(i for i in range(4) if i != episode)
+    assert_same(run_episode(sim, CONFIG, untouched), clips[untouched])
+
+    actions = np.concatenate([c.actions[1:] for c in clips[:3]])
+    np.testing.assert_allclose(store.manifest["action_mean"], actions.mean(0), atol=1e-6)
+    np.testing.assert_allclose(store.manifest["action_std"], actions.std(0), atol=1e-6)
+    near, far = store.manifest["depth_range"]
+    assert near == min(c.depth.min() for c in clips[:3])
+    assert far == max(c.depth.max() for c in clips[:3])
+    assert clips[3].provenance["depth_range"] == [near, far]
+
+    collect(CONFIG, out, lambda done, total: seen.append(-done))
+    assert seen[-1] == -4, "already there: nothing to do"
+
+
+def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:
+    """A collection of which all episodes are done, some of them failed in the simulator."""
+    out, partial = tmp_path / "lift", tmp_path / "lift.partial"
+    collect_module._prepare(partial, collection_key(config))
+    for i in range(config.episodes):
+        clip = Clip(
+            rgb=np.zeros((2, 4, 4, 3), np.uint8),
+            depth=np.ones((2, 4, 4), np.float32),
+            actions=np.full((2, 28), i, np.float32),
+            tracks=np.zeros((1, 2, 2), np.float32),
+            visible=np.ones((1, 2), bool),
+            success=np.array([False, i % 2 == 0]),
+            task="lift",
+            provenance={"episode": i, "expert": {"mode": "lift"}},
+        )
+        if i in failed:
+            collect_module._error_file(partial, i).write_text("ArithmeticError: it diverged")
+        else:
+            collect_module._clip_file(partial, i).write_bytes(encode(encode_clip(clip)))
+    return out
+
+
+def test_failed_episodes_are_left_out_and_named(gl: str, tmp_path: Path) -> None:
+    config = SimConfig(episodes=20, test_episodes=5)
+    out = prepared(tmp_path, config, range(3, 5))
+    collect(config, out, lambda done, total: None)
+    store = open_store(out)
+    assert len(store.source("train")) == 13
+    assert len(store.source("test")) == 5
+    assert store.manifest["quarantine"] == {f"00000{i}": "ArithmeticError: it diverged" for i in (3, 4)}
+    assert store.manifest["success_share"] == pytest.approx(9 / 18)
+
+
+def test_many_failed_episodes_are_an_error(gl: str, tmp_path: Path) -> None:
+    config = SimConfig(episodes=20, test_episodes=5)
+    out = prepared(tmp_path, config, range(3))
+    with pytest.raises(CollectError, match=r"3 of 20 episodes failed.*it diverged"):
+        collect(config, out, lambda done, total: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_episodes_of_another_configuration_are_not_reused(tmp_path: Path) -> None:
+    prepared(tmp_path, CONFIG, range(0))
+    partial = tmp_path / "lift.partial"
+    collect_module._prepare(partial, collection_key(CONFIG))
+    assert len(list(partial.glob("*.clip"))) == 4
+    collect_module._prepare(partial, collection_key(SimConfig(**{**CONFIG.__dict__, "seed": 7})))
+    assert not list(partial.glob("*.clip"))
+
+
+def test_a_simulator_failure_costs_one_episode_but_a_full_disk_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collect_module, "_worker_sim", lambda config: None)
+
+    def raising(error: Exception) -> None:
+        def run(*_: object) -> None:
+            raise error
+
+        monkeypatch.setattr(collect_module, "run_episode", run)
+
+    raising(ArithmeticError("it diverged"))
+    collect_module._work(CONFIG, tmp_path, 2)
+    assert (tmp_path / "000002.error").read_text() == "ArithmeticError: it diverged"
+    raising(OSError(errno.ENOSPC, "No space left on device"))
+    with pytest.raises(OSError, match=r"No space"):
+        collect_module._work(CONFIG, tmp_path, 3)
+    assert not (tmp_path / "000003.error").exists()
+
+
+def test_full_disk_is_one_clear_line(gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(collect_module, "_simulate", full)
+    with pytest.raises(StoreError, match=r"lift.partial: the disk is full; free some space"):
+        collect(CONFIG, tmp_path / "lift", lambda done, total: None)
+
+
+def test_unknown_camera_is_named(gl: str) -> None:
+    with pytest.raises(ConfigError, match=r"'agent'.*agentview"):
+        LiftSim(camera="agent")

@@ -1,0 +1,168 @@
+"""Commands: presets, overrides, options, and one clear line for what cannot run."""
+
+import dataclasses
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.cli import main_errors, parse, parse_options
+from rsjax import presets
+from rsjax.config import Config, ConfigError
+from rsjax.errors import UserError, did_you_mean
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    run_dir: Path | None = None
+    """where the run goes"""
+    resume: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class NeedsRun:
+    run_dir: tyro.conf.Positional[Path]
+    clips: int = 4
+
+
+def read(*argv: str) -> tuple[Config, Options]:
+    return parse(argv, "python -m experiments.train", "Trains.", Options())
+
+
+def message(*argv: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        read(*argv)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def numbers(part: Any, prefix: str = "--") -> list[tuple[str, str]]:
+    """(flag, value) of each number and truth value within ``part``."""
+    found: list[tuple[str, str]] = []
+    for field in dataclasses.fields(part):
+        value, flag = getattr(part, field.name), prefix + field.name
+        if dataclasses.is_dataclass(value):
+            found += numbers(value, f"{flag}.")
+        elif isinstance(value, (int, float)):
+            found.append((flag, str(value)))
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_a_preset_alone_is_that_preset(name: str) -> None:
+    assert read(name) == (presets.get(name), Options())
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.sampled_from(numbers(presets.get("debug"))), unique=True))
+def test_flags_that_repeat_the_preset_change_nothing(flags: list[tuple[str, str]]) -> None:
+    argv = [word for pair in flags for word in pair]
+    assert read("debug", *argv) == (presets.get("debug"), Options())
+
+
+def test_overrides_reach_their_field_and_no_other() -> None:
+    config, options = read(
+        "debug",
+        *("--train.steps", "7", "--loss.keypoints", "False", "--sim.test-episodes=3", "--run-dir", "there"),
+        *("--tokenizer.channel_multipliers", "2", "4", "--no-resume"),
+    )
+    base = presets.get("debug")
+    assert config == dataclasses.replace(
+        base,
+        train=dataclasses.replace(base.train, steps=7),
+        loss=dataclasses.replace(base.loss, keypoints=False),
+        sim=dataclasses.replace(base.sim, test_episodes=3),
+        tokenizer=dataclasses.replace(base.tokenizer, channel_multipliers=(2, 4)),
+    )
+    assert options == Options(run_dir=Path("there"), resume=False)
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["tny"], "unknown preset 'tny'; did you mean 'tiny'? (presets: debug, "),
+        ([], "name a preset first"),
+        (["--train.steps", "3"], "name a preset first"),
+        (["tiny", "--train.stps", "3"], "did you mean '--train.steps'?"),
+        (["tiny", "--log-every", "3"], "did you mean '--tokenizer-train.log-every' or '--train.log-every'?"),
+        (["tiny", "--rundir", "x"], "did you mean '--run-dir'?"),
+        (["tiny", "extra"], "unknown argument 'extra'"),
+        (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),
+        (["tiny", "--train.steps"], "Missing value for argument '--train.steps'"),
+        (["tiny", "--sample.unmask", "worst"], "Expected one of ('random', 'greedy')"),
+        (["tiny", "--sim.frames", "99"], f"model.frames holds positions for {presets.get('tiny').model.frames}"),
+        (["tiny", "--sim.control-steps", "2"], "is 14 but model.action_dim is 28"),
+    ],
+)
+def test_each_mistake_gets_one_line_that_names_it(argv: list[str], expected: str) -> None:
+    assert expected in message(*argv)
+
+
+def test_options_without_a_preset() -> None:
+    assert parse_options(["a/run", "--clips", "2"], "generate", "", NeedsRun(tyro.MISSING)) == NeedsRun(
+        Path("a/run"), 2
+    )
+    with pytest.raises(ConfigError, match="did you mean '--clips'"):
+        parse_options(["a/run", "--clip", "2"], "generate", "", NeedsRun(tyro.MISSING))
+    with pytest.raises(ConfigError, match="Missing from generate: PATH run-dir"):
+        parse_options([], "generate", "", NeedsRun(tyro.MISSING))
+
+
+@pytest.mark.parametrize("argv", [["--help"], ["debug", "--help"]])
+def test_help_names_what_there_is(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        read(*argv)
+    shown = capsys.readouterr().out
+    assert caught.value.code == 0
+    assert "Trains." in shown
+    assert (
+        (", ".join(presets.PRESETS) in shown)
+        if argv == ["--help"]
+        else ("--loss.keypoints" in shown and "--run-dir" in shown)
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (ConfigError("sim.frames is 1;\n a clip needs 2"), 2, "error: sim.frames is 1; a clip needs 2"),
+        (UserError("no OpenGL"), 2, "error: no OpenGL"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "clips.tmp"), 2, "error: disk full at clips.tmp; free"),
+        (ValueError("RESOURCE_EXHAUSTED: write failed: No space left on device"), 2, "error: disk full; free"),
+        (PermissionError(errno.EACCES, "Permission denied", "/root/x"), 2, "error: no permission to write or read at"),
+        (KeyboardInterrupt(), 130, "interrupted; the same command resumes"),
+    ],
+)
+def test_curable_errors_are_one_line_and_a_status(
+    error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @main_errors()
+    def main() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as caught:
+        main()
+    shown = capsys.readouterr().err
+    assert caught.value.code == status
+    assert shown.startswith(line)
+    assert shown.count("\n") == 1
+
+
+@pytest.mark.parametrize("bug", [ValueError("a bug"), FileNotFoundError("a bug")])
+def test_bugs_keep_their_traceback(bug: Exception) -> None:
+    with pytest.raises(type(bug), match="a bug"), main_errors():
+        raise bug
+
+
+def test_two_presets_of_one_name_are_refused() -> None:
+    with pytest.raises(ConfigError, match="two presets are named 'debug'"):
+        presets.collect(presets.debug, presets.tiny, presets.debug)
+
+
+def test_nothing_near_suggests_nothing() -> None:
+    assert did_you_mean("zzzz", ["train.steps", "tiny"]) == ""

@@ -1,0 +1,106 @@
+"""Progress: how often lines appear, and that their rates and times left are true."""
+
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from rsjax.progress import PLAIN_SECONDS, RATE_WINDOW_SECONDS, Progress, duration, stage
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Counted:
+    """A scalar that counts how often it is turned into a number."""
+
+    reads = 0
+
+    def __float__(self) -> float:
+        self.reads += 1
+        return 0.5
+
+
+def run(steps: list[tuple[float, int]], total: int, start: int = 0, terminal: bool = False) -> list[str]:
+    """The lines shown when (seconds, done) updates come in turn."""
+    shown, clock = io.StringIO(), Clock()
+    console = Console(file=shown, force_terminal=terminal, width=200)
+    with Progress("train", total, "steps", start, console, clock) as progress:
+        for seconds, done in steps:
+            clock.now += seconds
+            progress.update(done, loss=0.25)
+    return shown.getvalue().splitlines()
+
+
+def test_a_line_gives_done_rate_time_left_and_scalars() -> None:
+    assert run([(20.0, 40), (20.0, 80)], total=400) == [
+        "  train: 40/400 steps, 2 steps/s, 3 min 00 s left, loss=0.25",
+        "  train: 80/400 steps, 2 steps/s, 2 min 40 s left, loss=0.25",
+        "  train: 80 steps in 40 s (2 steps/s)",
+    ]
+
+
+def test_the_rate_counts_only_what_this_run_did() -> None:
+    assert run([(10.0, 320)], total=400, start=300)[0] == "  train: 320/400 steps, 2 steps/s, 40 s left, loss=0.25"
+
+
+def test_the_rate_forgets_a_slow_first_step() -> None:
+    steady = [(1.0, done) for done in range(2, 2 + int(RATE_WINDOW_SECONDS) + 1)]
+    lines = run([(300.0, 1), *steady], total=100)
+    assert ", 1 steps/s, " in lines[-2]
+
+
+@given(st.lists(st.floats(0.01, 15), min_size=1, max_size=60))
+def test_plain_lines_are_at_least_ten_seconds_apart(waits: list[float]) -> None:
+    lines = run([(wait, i + 1) for i, wait in enumerate(waits)], total=len(waits))
+    due, last, now = 0, 0.0, 0.0
+    for wait in waits:
+        now += wait
+        if now - last >= PLAIN_SECONDS:
+            due, last = due + 1, now
+    # Sums of floats around the limit may fall either way.
+    assert abs(len(lines) - 1 - due) <= 1
+    assert len(lines) - 1 <= now / PLAIN_SECONDS + 1e-6
+
+
+def test_scalars_are_read_only_when_they_are_shown() -> None:
+    clock, value = Clock(), Counted()
+    with Progress("train", 100, "steps", console=Console(file=io.StringIO()), clock=clock) as progress:
+        for done in range(1, 41):
+            clock.now += 1.0
+            progress.update(done, loss=value)
+    assert value.reads == 40 // PLAIN_SECONDS
+
+
+def test_a_terminal_shows_a_bar_and_ends_with_the_same_summary() -> None:
+    lines = run([(20.0, 40)], total=400, terminal=True)
+    assert any("40/400 steps, 2 steps/s, 3 min 00 s left, loss=0.25" in line for line in lines)
+    assert lines[-1].endswith("  train: 40 steps in 20 s (2 steps/s)")
+
+
+def test_an_error_passes_and_is_not_called_finished() -> None:
+    shown = io.StringIO()
+    with pytest.raises(RuntimeError, match="boom"), Progress("train", 4, "steps", console=Console(file=shown)):
+        raise RuntimeError("boom")
+    assert shown.getvalue() == ""
+
+
+def test_headlines_are_printed_as_they_are() -> None:
+    shown = io.StringIO()
+    stage(2, 6, "tokenizer", "up to date, skipped", Console(file=shown))
+    assert shown.getvalue() == "[2/6] tokenizer: up to date, skipped\n"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.2, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (3599.6, "1 h 00 min"), (7625, "2 h 07 min")],
+)
+def test_duration(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
