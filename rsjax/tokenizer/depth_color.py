@@ -6,12 +6,13 @@ of the three channels. Inverting is linear, a blurred edge decodes to a depth be
 would give one from elsewhere), and 8-bit colours keep 766 levels.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 Scale = Literal["linear", "inverse"]
+Array = Any  # numpy in, numpy out; JAX in, JAX out
 
 
 def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale: Scale) -> Float[Array, "*batch 3"]:
@@ -24,17 +25,17 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
         scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.
     """
     near_value, far_value = _scaled(near, scale), _scaled(far, scale)
-    position = jnp.clip((_scaled(depth, scale) - far_value) / (near_value - far_value), 0.0, 1.0)
-    level = jnp.round(position * 765.0)
-    return jnp.clip(level[..., None] - jnp.array([0.0, 255.0, 510.0]), 0.0, 255.0)
+    position = ((_scaled(depth, scale) - far_value) / (near_value - far_value)).clip(0.0, 1.0)
+    level = (position * 765.0).round()
+    return (level[..., None] - np.array([0.0, 255.0, 510.0], np.float32)).clip(0.0, 255.0)
 
 
 def color_to_depth(color: Float[Array, "*batch 3"], near: float, far: float, scale: Scale) -> Float[Array, "*batch"]:
     """The inverse of :func:`depth_to_color`, for any colours 0–255: metres in [near, far]."""
-    position = jnp.mean(jnp.asarray(color, jnp.float32), axis=-1) / 255.0
+    position = color.astype(np.float32).mean(-1) / 255.0
     near_value, far_value = _scaled(near, scale), _scaled(far, scale)
     return _scaled(far_value + position * (near_value - far_value), scale)
 
 
-def _scaled(depth, scale: Scale):
+def _scaled(depth: Any, scale: Scale) -> Any:
     return depth if scale == "linear" else 1.0 / depth  # its own inverse

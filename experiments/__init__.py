@@ -1,0 +1,1 @@
+"""Commands: ``python -m experiments.<name>``. Each parses its arguments and calls the library."""

@@ -1,0 +1,44 @@
+"""The main job: episodes in, a trained world model and a report out. ``python -m experiments.train tiny``"""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.cli import main_errors, parse
+from rsjax.runtime import prefer_huge_pages
+
+PROG = "python -m experiments.train"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of this command."""
+
+    run_dir: Path | None = None
+    """Where the run is kept; runs/PRESET if not given."""
+    data_dir: Path = Path("data")
+    """Where data sets are kept, to be shared by runs."""
+    resume: bool = True
+    """Go on from the checkpoints of an interrupted stage; --no-resume starts that stage over."""
+    overwrite: bool = False
+    """Train again the stages that the run directory holds under another configuration."""
+
+
+@main_errors()
+def main() -> None:
+    """Runs all stages that are not finished."""
+    prefer_huge_pages()
+    config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
+    # JAX is loaded only now, after arguments are known to be good.
+    from rsjax.pipeline.run import Run
+    from rsjax.pipeline.stages import run_all
+
+    run = Run(config, options.run_dir or Path("runs") / config.name, options.data_dir)
+    run.prepare(options.overwrite)
+    run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
+    print(f"report: {(run.directory / 'report.html').absolute()}")
+
+
+if __name__ == "__main__":
+    main()

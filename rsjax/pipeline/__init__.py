@@ -1,0 +1,1 @@
+"""The main job: six stages from an empty directory to a report."""

@@ -1,0 +1,185 @@
+"""Generation from held-out first frames, its scores, and the arrays that the report shows.
+
+Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+
+from rsjax.data.store import Store, decode, encode, write_atomically
+from rsjax.metrics import control, pixels
+from rsjax.metrics.depth import depth_scores, result_key
+from rsjax.metrics.statistics import bootstrap, over_predicted_frames
+from rsjax.progress import Progress
+from rsjax.sample.generator import Generated, Generator
+from rsjax.sample.rollout import Tokens
+
+FILE = "result.msgpack"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Flat scores, and arrays of the clips that the report shows (each with a leading axis over them)."""
+
+    metrics: dict[str, float]
+    shown: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out clips, stacked: the fields of :class:`rsjax.clip.Clip` with a leading axis, and what codes keep of them."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    actions: np.ndarray
+    tracks: np.ndarray
+    visible: np.ndarray
+    success: np.ndarray
+    tokens: Tokens
+    reconstruction: np.ndarray
+    depth_reconstruction: np.ndarray
+
+    @classmethod
+    def load(cls, generator: Generator, clips: Store) -> "HeldOut":
+        """The first ``eval.clips`` of the test split."""
+        source = clips.source("test")
+        records = [source[i] for i in range(min(generator.config.eval.clips, len(source)))]
+        names = ("rgb", "depth", "actions", "tracks", "visible", "success")
+        fields = {name: np.stack([record[name] for record in records]) for name in names}
+        codec = generator.codec
+        tokens = {"rgb": codec.encode_rgb(fields["rgb"]), "depth": codec.encode_depth(fields["depth"])}
+        return cls(
+            **fields,
+            tokens=tokens,
+            reconstruction=codec.decode_rgb(tokens["rgb"]),
+            depth_reconstruction=codec.decode_depth(tokens["depth"]),
+        )
+
+    def prompt(self, frames: int) -> Tokens:
+        """The first frames' tokens."""
+        return {name: grid[:, :frames] for name, grid in self.tokens.items()}
+
+
+def evaluate(generator: Generator, clips: Store) -> Evaluation:
+    """Scores the generator on the test split, beside repeat-the-first-frame and the tokenizer's reconstruction.
+
+    Args:
+        clips: the store that the generator was trained on; its test split is scored, its train split gives the range of
+            uniform random actions.
+    """
+    held = HeldOut.load(generator, clips)
+    given = generator.config.mask.prompt_frames
+    plans = _plans(generator, held.actions, clips)
+    results: dict[str, list[Generated]] = {}
+    rollouts = sum(len(draws) for draws in plans.values())
+    with Progress("evaluation", rollouts * len(held.rgb), "rollouts") as progress:
+        done = 0
+        for kind, draws in plans.items():
+            for actions in draws:
+                results.setdefault(kind, []).append(_generate(generator, held, actions, depth=kind == "own"))
+                progress.update(done := done + len(held.rgb))
+    own = results["own"][0]
+
+    metrics = _pixel_metrics(held, own.rgb, given)
+    for kind, suffix in (("other", ""), ("uniform", "_uniform")):
+        delta = np.stack([control.delta_psnr(held.rgb, own.rgb, drawn.rgb) for drawn in results[kind]])
+        for name, per_clip in control.clip_means(delta, given).items():
+            metrics |= bootstrap(per_clip).flat(f"delta_psnr{suffix}" + ("" if name == "mean" else f"_{name}"))
+        metrics[f"delta_psnr{suffix}_repeat_first"] = 0.0  # it does not look at the actions
+    if own.depth is not None:
+        metrics |= _depth_metrics(held, own.depth, given)
+    metrics |= {"success_share": float(clips.manifest["success_share"]), "clips": float(len(held.rgb))}
+    return Evaluation(metrics, _shown(generator, held, own, results["other"][0]))
+
+
+def _plans(generator: Generator, actions: Float[np.ndarray, "B T A"], clips: Store) -> dict[str, np.ndarray]:
+    """The actions to generate under, by kind, each (R, B, T, A)."""
+    draws = generator.config.eval.action_draws
+    train = clips.source("train")
+    low, high = control.action_range(np.stack([train[i]["actions"] for i in range(len(train))]))
+    return {
+        "own": actions[None],
+        "other": actions[control.other_clips(len(actions), draws, seed=0)],
+        "uniform": control.uniform_actions(actions, low, high, draws, seed=0),
+    }
+
+
+def _generate(generator: Generator, held: HeldOut, actions: np.ndarray, depth: bool) -> Generated:
+    """All clips, in batches of one shape (so that one program is compiled)."""
+    cfg, parts = generator.config, []
+    prompt = held.prompt(cfg.mask.prompt_frames)
+    for start in range(0, len(actions), cfg.eval.batch_size):
+        rows = np.minimum(np.arange(start, start + cfg.eval.batch_size), len(actions) - 1)
+        part = {name: grid[rows] for name, grid in prompt.items()}
+        parts.append(generator.generate(part, actions[rows], cfg.sample, depth))
+    join = lambda arrays: np.concatenate([np.asarray(a) for a in arrays])[: len(actions)]  # noqa: E731
+    return Generated(
+        {name: join(p.tokens[name] for p in parts) for name in parts[0].tokens},
+        join(p.rgb for p in parts),
+        join(p.depth for p in parts) if depth and parts[0].depth is not None else None,
+    )
+
+
+def _repeat_first(frames: Num[np.ndarray, "B T *rest"], given: int) -> Num[np.ndarray, "B T *rest"]:
+    """The last given frame in place of all that follow: the baseline that nothing moves."""
+    return np.repeat(frames[:, given - 1 : given], frames.shape[1], axis=1)
+
+
+def _pixel_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
+    metrics: dict[str, float] = {}
+    candidates = {"": predicted, "_repeat_first": _repeat_first(held.rgb, given), "_tokenizer": held.reconstruction}
+    for name, score in (("psnr", pixels.psnr), ("ssim", pixels.ssim)):
+        for suffix, frames in candidates.items():
+            per_clip = over_predicted_frames(np.asarray(score(held.rgb, frames)), given)
+            metrics |= bootstrap(per_clip).flat(name + suffix)
+    return metrics
+
+
+def _depth_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
+    metrics: dict[str, float] = {}
+    candidates = {
+        "": predicted,
+        "_repeat_first": _repeat_first(held.depth, given),
+        "_tokenizer": held.depth_reconstruction,
+    }
+    for suffix, depth in candidates.items():
+        scores = depth_scores(held.depth[:, given:], depth[:, given:], alignment="none")
+        metrics |= bootstrap(scores.abs_rel).flat(result_key("absrel") + suffix)
+        mean = scores.mean()
+        metrics |= {result_key(name) + suffix: mean[name] for name in ("delta1", "delta2")}
+    return metrics
+
+
+def _shown(generator: Generator, held: HeldOut, own: Generated, other: Generated) -> dict[str, np.ndarray]:
+    """Arrays of the clips in the report: successes and failures by turns, in the split's order."""
+    ends = held.success[:, -1]
+    good, bad = (list(np.flatnonzero(ends == outcome)) for outcome in (True, False))
+    turns = [queue.pop(0) for _ in ends for queue in (good, bad) if queue]
+    rows = np.array(turns[: generator.config.eval.report_clips])
+    arrays: dict[str, Any] = {
+        "clip": rows,
+        "truth": held.rgb[rows],
+        "reconstruction": held.reconstruction[rows],
+        "prediction": own.rgb[rows],
+        "other_actions": other.rgb[rows],
+        "true_depth": held.depth[rows],
+        "tracks": held.tracks[rows],
+        "visible": held.visible[rows],
+        "success": ends[rows],
+    }
+    return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
+
+
+def save(folder: Path, result: Evaluation) -> None:
+    """Writes a result; it appears whole or not at all."""
+    write_atomically(folder / FILE, encode({"metrics": result.metrics} | result.shown))
+
+
+def load(folder: Path) -> Evaluation:
+    """Reads what :func:`save` wrote."""
+    record = decode((folder / FILE).read_bytes())
+    return Evaluation(record.pop("metrics"), record)

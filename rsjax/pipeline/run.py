@@ -1,0 +1,132 @@
+"""A run directory: which stages it holds, by which configuration, and how long they took.
+
+Every stage has a content key of all that its output depends on; a stage whose mark has this key and says "finished" is
+skipped. A mark under another key means another configuration.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsjax.config import Config, content_key, to_dict
+from rsjax.data.store import disk_guard, write_atomically
+from rsjax.errors import UserError
+from rsjax.sim.collect import collection_key
+
+STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
+TRAINED = ("tokenizer", "world_model")  # never replaced unasked
+RECIPE = 1  # raise it when the same configuration gives other results
+
+
+class RunError(UserError):
+    """A run directory that cannot be used as asked."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: a configuration, its directory, and where data sets are kept."""
+
+    config: Config
+    directory: Path
+    data_directory: Path
+
+    @property
+    def clips(self) -> Path:
+        """The store of clips; shared by all runs that use the same episodes."""
+        return self.data_directory / f"lift-{self.keys()['collect']}"
+
+    def keys(self) -> dict[str, str]:
+        """Each stage's content key: its own settings and the key of the stage before."""
+        cfg, key = self.config, collection_key(self.config.sim)
+        keys = {"collect": key}
+        settings: dict[str, tuple[Any, ...]] = {
+            "tokenizer": (cfg.tokenizer, cfg.tokenizer_train),
+            "tokens": (),
+            "world_model": (cfg.model, cfg.mask, cfg.loss, cfg.train),
+            "evaluation": (cfg.sample, cfg.eval),
+            "report": (),
+        }
+        for stage, parts in settings.items():
+            key = keys[stage] = content_key(RECIPE, stage, key, *parts)
+        return keys
+
+    def prepare(self, overwrite: bool) -> None:
+        """Makes the directory, or checks that it belongs to this configuration, and writes ``config.json``.
+
+        Args:
+            overwrite: throw trained stages of another configuration away instead of refusing.
+
+        Raises:
+            RunError: it holds a trained stage of another configuration; the message names the differing fields.
+        """
+        for stage in TRAINED:
+            if self.mark(stage).get("key", self.keys()[stage]) != self.keys()[stage]:
+                if not overwrite:
+                    raise RunError(
+                        f"{self.directory} holds a {stage.replace('_', ' ')} of another configuration "
+                        f"({self._differences()}); choose another --run-dir, or train it again with --overwrite"
+                    )
+                shutil.rmtree(self.directory / stage)
+        with disk_guard(self.directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.directory / "config.json", json.dumps(to_dict(self.config), indent=1).encode())
+
+    def _differences(self) -> str:
+        try:
+            saved = _flat(json.loads((self.directory / "config.json").read_text()))
+        except (OSError, ValueError):
+            return "its config.json is missing or damaged"
+        here = _flat(to_dict(self.config))
+        names = [name for name in here | saved if here.get(name) != saved.get(name)]
+        return "; ".join(f"{name} is {saved.get(name)} there, {here.get(name)} here" for name in names) or "older code"
+
+    def finished(self, stage: str) -> bool:
+        """Whether the stage's output is there and was made by this configuration."""
+        mark = self.mark(stage)
+        return mark.get("key") == self.keys()[stage] and mark.get("finished", False)
+
+    def mark(self, stage: str) -> dict[str, Any]:
+        """What the directory knows of a stage: key, finished, seconds. Empty where it was not begun."""
+        try:
+            return json.loads(self._mark_path(stage).read_text())
+        except (OSError, ValueError):
+            return {}
+
+    def _mark_path(self, stage: str) -> Path:
+        return self.directory / stage / "stage.json"
+
+    @contextmanager
+    def stage(self, stage: str) -> Iterator[Path]:
+        """Around a stage's work: gives its directory, and marks it as begun, then finished, with the seconds it took.
+
+        Seconds add up over interruptions (but a killed process takes its own along).
+        """
+        folder, began = self.directory / stage, time.monotonic()
+        mark = self.mark(stage)
+        before = mark.get("seconds", 0.0) if mark.get("key") == self.keys()[stage] else 0.0
+        finished = False
+        self._write_mark(stage, before, finished)
+        try:
+            yield folder
+            finished = True
+        finally:
+            self._write_mark(stage, before + time.monotonic() - began, finished)
+
+    def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
+        path = self._mark_path(stage)
+        content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
+        with disk_guard(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, json.dumps(content).encode())
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return out

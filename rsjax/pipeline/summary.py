@@ -1,0 +1,78 @@
+"""The last stage: ``report.html`` to look at, and ``metrics.json`` beside it."""
+
+import importlib.metadata
+import json
+import os
+import platform
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import LossConfig, to_dict
+from rsjax.data.store import disk_guard, write_atomically
+from rsjax.objective.keypoints import motion_magnitude
+from rsjax.pipeline import evaluation
+from rsjax.pipeline.run import STAGES, Run
+from rsjax.report.figures import ClipFigure
+from rsjax.report.page import Report, write_report
+from rsjax.train.log import read_log
+
+LIBRARIES = ("rsjax", "jax", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "robosuite", "mujoco")
+
+
+def write_summary(run: Run, command: str) -> None:
+    """Writes both from what the stages before left.
+
+    Args:
+        command: how to repeat the run.
+    """
+    result = evaluation.load(run.directory / "evaluation")
+    seconds = {stage: run.mark(stage)["seconds"] for stage in STAGES[:-1] if run.mark(stage)}
+    metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
+    cfg = run.config
+    report = Report(
+        preset=cfg.name,
+        metrics=metrics,
+        clips=[_figure(result.shown, i, cfg.mask.prompt_frames, cfg.loss) for i in range(len(result.shown["clip"]))],
+        logs={"tokenizer": read_log(run.directory / "tokenizer"), "world model": read_log(run.directory / "world_model")},
+        config=to_dict(cfg),
+        versions=_versions(),
+        seconds=seconds,
+        command=command,
+        show_targets=cfg.name == "tiny",
+    )
+    with disk_guard(run.directory):
+        write_report(run.directory / "report.html", report)
+        write_atomically(run.directory / "metrics.json", json.dumps(metrics, indent=1).encode())
+
+
+def _figure(shown: dict[str, np.ndarray], row: int, given: int, loss: LossConfig) -> ClipFigure:
+    arrays: dict[str, Any] = {
+        name: shown[name][row]
+        for name in ("truth", "prediction", "reconstruction", "other_actions", "true_depth", "predicted_depth")
+        if name in shown
+    }
+    if loss.keypoints:
+        tracks, visible = shown["tracks"][row], shown["visible"][row]
+        motion = np.asarray(motion_magnitude(tracks, visible))
+        chosen = np.argsort(-motion)[: loss.num_keypoints]
+        arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
+    outcome = "the cube is lifted" if shown["success"][row] else "the cube is not lifted"
+    return ClipFigure(title=f"held-out clip {int(shown['clip'][row])}: {outcome}", prompt_frames=given, **arrays)
+
+
+def _versions() -> dict[str, str]:
+    device = jax.local_devices()[0]
+    machine = {
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "device": f"{jax.local_device_count()} × {device.device_kind}, {os.cpu_count()} CPU cores",
+    }
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # the simulator is not needed where the clips are there already
+    return found | machine

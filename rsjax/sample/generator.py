@@ -1,0 +1,164 @@
+"""Pixels in, pixels out: the tokenizer, the world model and the units of the data around a rollout."""
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, Int, UInt8
+
+from rsjax.config import Config, SampleConfig, from_dict
+from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
+from rsjax.model.world_model import WorldModel, branches
+from rsjax.sample.rollout import Tokens, rollout
+from rsjax.tokenizer.depth_color import color_to_depth, depth_to_color
+from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.train.checkpoint import load_weights
+
+CHUNK = 160  # images per pass of the tokenizer: bounded memory, one compiled shape
+
+
+@dataclass(frozen=True)
+class Units:
+    """What turns a data set's units into the model's, and back.
+
+    Attributes:
+        action_mean: of each action dimension over the training split, (A,).
+        action_std: likewise.
+        depth_range: near and far end of the depth colour map, metres.
+    """
+
+    action_mean: tuple[float, ...]
+    action_std: tuple[float, ...]
+    depth_range: tuple[float, float]
+
+    @classmethod
+    def create(cls, store: Store) -> "Units":
+        """The units in a store's manifest."""
+        return cls(*(tuple(store.manifest[name]) for name in ("action_mean", "action_std", "depth_range")))
+
+    def normalise(self, actions: Float[np.ndarray, "*B T A"]) -> Float32[np.ndarray, "*B T A"]:
+        """Actions to zero mean and unit variance; row 0, into the first frame, stays zero.
+
+        A dimension that hardly varies is not blown up: its deviation counts as at least 0.001.
+        """
+        scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
+        scaled[..., 0, :] = 0.0
+        return scaled.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Codec:
+    """The trained tokenizer on numpy images: RGB frames and depth maps to token grids and back."""
+
+    config: Config
+    params: Any
+    units: Units
+
+    def encode_rgb(self, frames: UInt8[np.ndarray, "*B H W 3"]) -> Int[np.ndarray, "*B h w"]:
+        """Frames 0–255 to tokens."""
+        return self._chunked(_encode, frames, 3)
+
+    def encode_depth(self, depth: Float[np.ndarray, "*B H W"]) -> Int[np.ndarray, "*B h w"]:
+        """Depth in metres to the tokens of its colour map."""
+        colors = depth_to_color(depth, *self.units.depth_range, self.config.tokenizer.depth_scale)
+        return self._chunked(_encode, colors.astype(np.uint8), 3)
+
+    def decode_rgb(self, tokens: Int[Array, "*B h w"]) -> UInt8[np.ndarray, "*B H W 3"]:
+        """Tokens to frames 0–255."""
+        return np.round(self._chunked(_decode, np.asarray(tokens), 2)).astype(np.uint8)
+
+    def decode_depth(self, tokens: Int[Array, "*B h w"]) -> Float32[np.ndarray, "*B H W"]:
+        """Tokens of a depth colour map to metres."""
+        colors = self._chunked(_decode, np.asarray(tokens), 2)
+        return color_to_depth(colors, *self.units.depth_range, self.config.tokenizer.depth_scale)
+
+    def _chunked(self, function: Any, images: np.ndarray, item_axes: int) -> np.ndarray:
+        lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
+        flat = images.reshape(-1, *item)
+        out = []
+        for start in range(0, len(flat), CHUNK):
+            chunk = flat[start : start + CHUNK]
+            padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
+            out.append(np.asarray(function(self.config.tokenizer, self.params, padded))[: len(chunk)])
+        joined = np.concatenate(out)
+        return joined.reshape(*lead, *joined.shape[1:])
+
+
+@partial(jax.jit, static_argnums=0)
+def _encode(config: Any, params: Any, images: Array) -> Array:
+    return Tokenizer(config).apply({"params": params}, images, method="encode")
+
+
+@partial(jax.jit, static_argnums=0)
+def _decode(config: Any, params: Any, tokens: Array) -> Array:
+    return Tokenizer(config).apply({"params": params}, tokens, method="decode")
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A generated batch; the prompt's frames are the tokenizer's reconstruction of what was given."""
+
+    tokens: Tokens
+    rgb: UInt8[np.ndarray, "B T H W 3"]
+    depth: Float32[np.ndarray, "B T H W"] | None  # metres; None without a depth branch or where not asked for
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A trained world model with its tokenizer."""
+
+    config: Config
+    codec: Codec
+    params: Any
+
+    @classmethod
+    def load(cls, run: Path) -> "Generator":
+        """The generator of a finished run directory.
+
+        Raises:
+            UserError: the run is missing, unfinished or damaged.
+        """
+        config, units = load_config(run), Units.create(open_store(run / "tokens" / "store"))
+        return cls(config, Codec(config, load_tokenizer(config, run), units), load_world_model(config, run))
+
+    def generate(
+        self, prompt: Tokens, actions: Float[np.ndarray, "B T A"], sample: SampleConfig, depth: bool = True
+    ) -> Generated:
+        """The video that follows the prompt under these actions.
+
+        Args:
+            prompt: tokens of the given frames by branch, (B, P, h, w).
+            actions: in the data's units; row t leads into frame t, row 0 is not used.
+            depth: decode depth too; it costs as much as the frames.
+        """
+        normalised = jnp.asarray(self.codec.units.normalise(actions))
+        given = {name: jnp.asarray(prompt[name]) for name in branches(self.config.model)}
+        tokens = rollout(self.config.model, sample, self.params, given, normalised, jax.random.key(sample.seed))
+        metres = self.codec.decode_depth(tokens["depth"]) if depth and "depth" in tokens else None
+        return Generated(tokens, self.codec.decode_rgb(tokens["rgb"]), metres)
+
+
+def load_config(run: Path) -> Config:
+    """The configuration that a run directory was made with."""
+    path = run / "config.json"
+    if not path.exists():
+        raise UserError(f"{path}: missing, so {run} is not a run directory; make one with python -m experiments.train")
+    return from_dict(Config, json.loads(path.read_text()))
+
+
+def load_tokenizer(config: Config, run: Path) -> Any:
+    """The trained tokenizer's parameters."""
+    like = jax.eval_shape(Tokenizer(config.tokenizer).init_params, jax.random.key(0))
+    return load_weights(run / "tokenizer" / "weights", like)
+
+
+def load_world_model(config: Config, run: Path) -> Any:
+    """The trained world model's parameters."""
+    like = jax.eval_shape(WorldModel(config.model).init_params, jax.random.key(0))
+    return load_weights(run / "world_model" / "weights", like)
