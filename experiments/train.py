@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.cli import main_errors, parse
-from rsjax.runtime import prefer_huge_pages
+from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.train"
 
@@ -28,7 +28,7 @@ class Options:
 @main_errors()
 def main() -> None:
     """Runs all stages that are not finished."""
-    prefer_huge_pages()
+    tune_process()
     config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.pipeline.run import Run

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
+
+Array = Any  # JAX or numpy: on a device, or still on the host
 
 
 @dataclass(frozen=True)

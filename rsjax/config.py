@@ -16,7 +16,6 @@ from typing import Any, Literal, TypeVar
 
 from rsjax.errors import UserError
 
-
 T = TypeVar("T")
 
 
@@ -132,7 +131,7 @@ class LoopConfig:
     seed: int = 0
     log_every: int = runtime(20)
     checkpoint_every: int = runtime(200)
-    # jit: one device. pmap: data parallel over the local ones. auto: pmap where there are several.
+    # jit: one device. pmap: data parallel over all local ones. auto: over as many of them as divide the batch.
     placement: Literal["auto", "jit", "pmap"] = runtime("auto")
 
     def __post_init__(self) -> None:

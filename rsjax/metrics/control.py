@@ -5,8 +5,9 @@ ones, several draws of them (three or more for a published number), and compare 
 """
 
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Float, Int, Num
 
+from rsjax.clip import Array
 from rsjax.metrics.pixels import psnr
 from rsjax.metrics.statistics import over_predicted_frames
 

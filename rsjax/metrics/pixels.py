@@ -7,7 +7,9 @@ Both give one number per frame. Average over a clip's predicted frames first
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Float, Num
+
+from rsjax.clip import Array
 
 PEAK = 255.0
 PSNR_CAP = 100.0  # dB; what identical frames score

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from rsjax.model.matmul import matmul_bf16
+
 # torch's default for linear layers, U(±1/√fan_in), which the public weights were trained from.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
@@ -23,13 +25,29 @@ class KeyValues:
     v: Float[Array, "*L B T S C"]
 
 
-def dense(features: int, name: str, dtype: Any, bias: bool = True) -> nn.Dense:
-    """A linear layer, computed in ``dtype`` from float32 parameters."""
-    return nn.Dense(features, use_bias=bias, name=name, dtype=dtype, kernel_init=TORCH_KERNEL)
+class Dense(nn.Module):
+    """A linear layer with float32 parameters; ``bf16`` multiplies in bf16 and accumulates in float32."""
+
+    features: int
+    bf16: bool = False
+    use_bias: bool = True
+    kernel_init: nn.initializers.Initializer = TORCH_KERNEL
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
+        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
+        if self.bf16:
+            out = matmul_bf16(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
+        else:
+            out = x @ kernel
+        return out + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else out
 
 
 def attend(
-    q: Float[Array, "*N q h e"], k: Float[Array, "*N k h e"], v: Float[Array, "*N k h e"], mask: Bool[Array, "q k"] | None
+    q: Float[Array, "*N q h e"],
+    k: Float[Array, "*N k h e"],
+    v: Float[Array, "*N k h e"],
+    mask: Bool[Array, "q k"] | None,
 ) -> Float[Array, "*N q h e"]:
     """softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax in float32."""
     scores = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
@@ -44,11 +62,11 @@ class Attention(nn.Module):
 
     width: int
     heads: int
-    dtype: Any = jnp.float32
+    bf16: bool = False
 
     def setup(self) -> None:
-        self.qkv = dense(3 * self.width, "qkv", self.dtype, bias=False)
-        self.proj = dense(self.width, "proj", self.dtype)
+        self.qkv = Dense(3 * self.width, self.bf16, use_bias=False)
+        self.proj = Dense(self.width, self.bf16)
 
     def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
         """Every cell attends to every cell of its own frame."""

@@ -6,11 +6,10 @@ Axes: B clips, T frames, S cells, C width.
 from typing import Any
 
 import flax.linen as nn
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import Attention, KeyValues, dense
+from rsjax.model.attention import Attention, Dense, KeyValues
 
 Features = Float[Array, "B T S C"]
 
@@ -26,13 +25,13 @@ class STBlock(nn.Module):
     @nn.compact
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
         cfg = self.config
-        dtype = jnp.dtype(cfg.compute_dtype)
-        x = x + Attention(cfg.width, cfg.heads, dtype, name="spatial_attn").spatial(layer_norm("norm1")(x))
+        bf16 = cfg.compute_dtype == "bfloat16"
+        x = x + Attention(cfg.width, cfg.heads, bf16, name="spatial_attn").spatial(layer_norm("norm1")(x))
         before_time = layer_norm("norm_temporal")(x) if cfg.temporal_norm else x
-        out, cache = Attention(cfg.width, cfg.heads, dtype, name="temporal_attn").temporal(before_time, start, cache)
+        out, cache = Attention(cfg.width, cfg.heads, bf16, name="temporal_attn").temporal(before_time, start, cache)
         x = x + out
-        h = dense(cfg.mlp_ratio * cfg.width, "fc1", dtype)(layer_norm("norm2")(x))
-        return x + dense(cfg.width, "fc2", dtype)(nn.gelu(h, approximate=False)), cache
+        h = Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(layer_norm("norm2")(x))
+        return x + Dense(cfg.width, bf16, name="fc2")(nn.gelu(h, approximate=False)), cache
 
 
 def layer_norm(name: str) -> nn.LayerNorm:
@@ -53,12 +52,14 @@ class DualBlock(nn.Module):
         self, x: dict[str, Features], cache: dict[str, KeyValues] | None, start: Any
     ) -> tuple[dict[str, Features], dict[str, KeyValues] | None]:
         cfg = self.config
-        out, kept = {}, {}
+        out: dict[str, Features] = {}
+        kept: dict[str, Any] = {}
         for branch, features in x.items():
             held = None if cache is None else cache[branch]
             out[branch], kept[branch] = STBlock(cfg, name=branch)(features, start, held)
         if "depth" in out:
-            # Zero at the start: the RGB branch begins as if it were alone, and pre-trained RGB weights keep their logits.
-            project = nn.Dense(cfg.width, name="depth_to_rgb", kernel_init=nn.initializers.zeros)
+            # Zero at the start: the RGB branch begins as if alone, and pre-trained RGB weights keep their logits.
+            bf16 = cfg.compute_dtype == "bfloat16"
+            project = Dense(cfg.width, bf16, kernel_init=nn.initializers.zeros, name="depth_to_rgb")
             out["rgb"] = out["rgb"] + project(out["depth"])
         return out, None if cache is None else kept

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import KeyValues, dense
+from rsjax.model.attention import Dense, KeyValues
 from rsjax.model.blocks import DualBlock, layer_norm
 from rsjax.tokenizer import lfq
 
@@ -32,7 +32,9 @@ class TokenEmbed(nn.Module):
         sub_tokens = lfq.split_tokens(tokens, cfg.code_bits, cfg.vocabularies)
         init = nn.initializers.normal(cfg.embed_std)
         embedded = sum(
-            nn.Embed(cfg.vocabulary_size, cfg.width, embedding_init=init, name=f"factored_embed_{k}")(sub_tokens[..., k])
+            nn.Embed(cfg.vocabulary_size, cfg.width, embedding_init=init, name=f"factored_embed_{k}")(
+                sub_tokens[..., k]
+            )
             for k in range(cfg.vocabularies)
         )
         mask_embed = self.param("mask_token_embed", nn.initializers.zeros, (cfg.width,))
@@ -70,13 +72,17 @@ class WorldModel(nn.Module):
         cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
         position = self.param("pos_embed", nn.initializers.zeros, (cfg.frames, cfg.grid**2, cfg.width))
         position = jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
-        action = dense(cfg.width, "action_encoder", jnp.float32)(actions)[:, :, None]
+        action = Dense(cfg.width, name="action_encoder")(actions)[:, :, None]
         x = {
             branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), cells(mask)) + action + position
             for branch in branches(cfg)
         }
         blocks = nn.scan(
-            DualBlock, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=(0, nn.broadcast), length=cfg.blocks
+            DualBlock,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+            in_axes=(0, nn.broadcast),
+            length=cfg.blocks,
         )
         x, cache = blocks(cfg, name="blocks")(x, cache, start)
         return {branch: self._head(branch, features) for branch, features in x.items()}, cache
@@ -85,15 +91,16 @@ class WorldModel(nn.Module):
         cfg = self.config
         if cfg.final_norm:
             x = layer_norm(f"{branch}_norm_out")(x)
-        logits = dense(cfg.vocabularies * cfg.vocabulary_size, f"{branch}_head", jnp.dtype(cfg.compute_dtype))(x)
-        return logits.reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size).astype(jnp.float32)
+        bf16 = cfg.compute_dtype == "bfloat16"
+        logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{branch}_head")(x)
+        return logits.reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
 
     def init_params(self, key: Array) -> Any:
         """Fresh parameters; blocks are stacked along a leading axis."""
         cfg = self.config
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_dim))
-        return self.init(key, {b: tokens for b in branches(cfg)}, tokens == 0, actions)["params"]
+        return self.init(key, dict.fromkeys(branches(cfg), tokens), tokens == 0, actions)["params"]
 
 
 def branches(config: ModelConfig) -> tuple[str, ...]:
@@ -104,5 +111,5 @@ def branches(config: ModelConfig) -> tuple[str, ...]:
 def empty_cache(config: ModelConfig, batch: int, frames: int) -> Cache:
     """A cache of ``frames`` positions for every block and branch: zeros, never read before they are written."""
     shape = (config.blocks, batch, frames, config.grid**2, config.width)
-    zeros = jnp.zeros(shape, jnp.dtype(config.compute_dtype))
+    zeros = jnp.zeros(shape)
     return {branch: KeyValues(zeros, zeros) for branch in branches(config)}

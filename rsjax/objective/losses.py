@@ -63,9 +63,7 @@ def expected_codes(logits: Float[Array, "*B n V"], code_bits: int) -> Float[Arra
     return expected.reshape(*expected.shape[:-2], code_bits)
 
 
-def keypoint_term(
-    predicted: Float[Array, "B T S D"], keypoints: Keypoints, clip_weight: Float[Array, " B"]
-) -> Term:
+def keypoint_term(predicted: Float[Array, "B T S D"], keypoints: Keypoints, clip_weight: Float[Array, " B"]) -> Term:
     """L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖², over the frames t ≥ 2 in which keypoint i is visible."""
     cells = keypoints.cells.swapaxes(1, 2)  # B T K
     at_points = jnp.take_along_axis(predicted, cells[..., None], axis=2)  # B T K D

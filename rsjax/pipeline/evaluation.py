@@ -15,8 +15,7 @@ from rsjax.metrics import control, pixels
 from rsjax.metrics.depth import depth_scores, result_key
 from rsjax.metrics.statistics import bootstrap, over_predicted_frames
 from rsjax.progress import Progress
-from rsjax.sample.generator import Generated, Generator
-from rsjax.sample.rollout import Tokens
+from rsjax.sample.generator import Generated, Generator, Tokens
 
 FILE = "result.msgpack"
 
@@ -31,7 +30,7 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out clips, stacked: the fields of :class:`rsjax.clip.Clip` with a leading axis, and what codes keep of them."""
+    """Held-out clips, stacked: fields of :class:`rsjax.clip.Clip` with a leading axis, and what tokens keep of them."""
 
     rgb: np.ndarray
     depth: np.ndarray

@@ -1,5 +1,6 @@
 """The stages of the main job; each reads what the one before left and can be run again."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -23,7 +24,7 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         resume: False starts an unfinished training stage over instead of going on from its checkpoint.
         command: how to repeat the run, for the report.
     """
-    works = {
+    works: dict[str, Callable[[Run], None]] = {
         "collect": collect_clips,
         "tokenizer": partial(train_tokenizer, resume=resume),
         "tokens": tokenize,

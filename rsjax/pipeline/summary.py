@@ -35,7 +35,10 @@ def write_summary(run: Run, command: str) -> None:
         preset=cfg.name,
         metrics=metrics,
         clips=[_figure(result.shown, i, cfg.mask.prompt_frames, cfg.loss) for i in range(len(result.shown["clip"]))],
-        logs={"tokenizer": read_log(run.directory / "tokenizer"), "world model": read_log(run.directory / "world_model")},
+        logs={
+            "tokenizer": read_log(run.directory / "tokenizer"),
+            "world model": read_log(run.directory / "world_model"),
+        },
         config=to_dict(cfg),
         versions=_versions(),
         seconds=seconds,

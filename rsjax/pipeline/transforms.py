@@ -10,9 +10,7 @@ from rsjax.data.store import Record
 from rsjax.tokenizer.depth_color import depth_to_color
 
 
-def tokenizer_images(
-    record: Record, rng: np.random.Generator, *, count: int, depth_share: float, scale: Any
-) -> Arrays:
+def tokenizer_images(record: Record, rng: np.random.Generator, *, count: int, depth_share: float, scale: Any) -> Arrays:
     """``count`` random frames of a clip, each as RGB or, with probability ``depth_share``, as colourised depth.
 
     Returns:
@@ -21,7 +19,8 @@ def tokenizer_images(
     chosen = rng.choice(len(record["rgb"]), count, replace=count > len(record["rgb"]))
     images = record["rgb"][chosen]
     as_depth = rng.random(count) < depth_share
-    colors = depth_to_color(record["depth"][chosen[as_depth]], *record["provenance"]["depth_range"], scale)
+    near, far = record["provenance"]["depth_range"]
+    colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, scale)
     images[as_depth] = colors.astype(np.uint8)
     return {"images": images}
 

@@ -9,16 +9,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
+from rsjax.clip import Array
 from rsjax.config import Config, SampleConfig, from_dict
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.model.world_model import WorldModel, branches
-from rsjax.sample.rollout import Tokens, rollout
+from rsjax.sample.rollout import rollout
 from rsjax.tokenizer.depth_color import color_to_depth, depth_to_color
 from rsjax.tokenizer.magvit2 import Tokenizer
 from rsjax.train.checkpoint import load_weights
+
+Tokens = dict[str, Int[Array, "B T h w"]]
 
 CHUNK = 160  # images per pass of the tokenizer: bounded memory, one compiled shape
 

@@ -1,7 +1,7 @@
 """Rollouts: from prompt frames and actions to the tokens of every frame, frame by frame (paper Eq. 1).
 
-With the temporal cache a frame costs ``steps`` frame passes and its commit one: the commit of frame t-1 (a pass with its
-final tokens) is fused with the first step of frame t, and the last commit is skipped. What a pass with masked cells
+With the temporal cache a frame costs ``steps`` frame passes and its commit one: the commit of frame t-1 (a pass with
+its final tokens) is fused with the first step of frame t, and the last commit is skipped. What a pass with masked cells
 writes into the cache is overwritten before anything reads it, so cached and uncached rollouts agree.
 
 Axes: B clips, T frames, H×W = S cells, A action dimensions.
@@ -75,7 +75,9 @@ def _apply(model: ModelConfig, params: Any, tokens: dict, mask: Array, actions: 
     return WorldModel(model).apply({"params": params}, grids, mask.reshape(shape), actions, start, cache)
 
 
-def _decode_cached(apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: Any) -> Any:
+def _decode_cached(
+    apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: Any
+) -> Any:
     """Frame t from the cache of frames before t-1: a pass over (t-1, t), then passes over t alone."""
     b, _, cells = next(iter(tokens.values())).shape
     pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
@@ -95,7 +97,9 @@ def _decode_cached(apply: Any, sample: SampleConfig, code_bits: int, keys: Array
     return _put(tokens, frame, t), cache
 
 
-def _decode_uncached(apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: None) -> Any:
+def _decode_uncached(
+    apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: None
+) -> Any:
     """Frame t from a full pass over all frames at every step."""
     b, frames, cells = next(iter(tokens.values())).shape
     frame = Frame({name: grid[:, 0] for name, grid in tokens.items()}, jnp.ones((b, cells), bool))

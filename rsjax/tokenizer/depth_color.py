@@ -11,8 +11,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.clip import Array
+
 Scale = Literal["linear", "inverse"]
-Array = Any  # numpy in, numpy out; JAX in, JAX out
+# numpy in, numpy out; JAX in, JAX out
 
 
 def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale: Scale) -> Float[Array, "*batch 3"]:

@@ -1,5 +1,7 @@
 """The tokenizer's training terms (reference: Open-MAGVIT2). Each returns (weighted sum, weight)."""
 
+from typing import cast
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -7,6 +9,8 @@ from rsjax.config import TokenizerConfig, TokenizerTrainConfig
 from rsjax.tokenizer import lfq
 from rsjax.tokenizer.magvit2 import Tokenizer, to_unit
 
+Images = Float[Array, "B H W 3"]
+Latents = Float[Array, "B h w D"]
 Term = tuple[Float[Array, ""], Float[Array, ""]]
 
 
@@ -18,7 +22,7 @@ def tokenizer_terms(
     The batch average inside the entropy term is that of this device's images.
     """
     target = to_unit(images)
-    output, latents = Tokenizer(config).apply({"params": params}, target)
+    output, latents = cast(tuple[Images, Latents], Tokenizer(config).apply({"params": params}, target))
     count = jnp.float32(images.shape[0])
     error = (target - output).astype(jnp.float32)
     means = {

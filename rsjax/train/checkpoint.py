@@ -103,7 +103,9 @@ def _shapes(tree: Any) -> Any:
 def _check_shapes(path: Path, like: Any, restored: Any) -> None:
     for (where, wanted), found in zip(jax.tree.leaves_with_path(like), jax.tree.leaves(restored), strict=True):
         if wanted.shape != found.shape:
-            raise _misfit(path, f"{jax.tree_util.keystr(where)} is {found.shape}, the configuration needs {wanted.shape}")
+            raise _misfit(
+                path, f"{jax.tree_util.keystr(where)} is {found.shape}, the configuration needs {wanted.shape}"
+            )
 
 
 def _misfit(path: Path, reason: object) -> CheckpointError:

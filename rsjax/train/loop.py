@@ -21,7 +21,7 @@ from rsjax.train.state import TrainState, create_state
 
 
 class DivergedError(UserError):
-    """The loss is not a number any more."""
+    """The loss or a parameter is not a number any more."""
 
 
 def fit(
@@ -50,7 +50,7 @@ def fit(
 
     Raises:
         CheckpointError: the newest checkpoint does not fit.
-        DivergedError: the loss is not finite.
+        DivergedError: the loss or a parameter is not finite; such a state is never saved.
         StoreError: too many damaged records, or a full disk.
     """
     if not resume:
@@ -73,12 +73,14 @@ def fit(
                 with clock.waiting():
                     batch = placement.put_batch(to_batch(next(batches)))
                 state, metrics = step_fn(state, batch)
-                if step % loop.log_every == 0 or step == last:
+                logs, saves = (step % every == 0 or step == last for every in (loop.log_every, loop.checkpoint_every))
+                if logs or saves:
                     scalars = {k: float(v) for k, v in placement.first(metrics).items()}
                     _check_finite(scalars, step, directory)
+                if logs:
                     log.write(step, scalars | clock.lap())
                 progress.update(step, loss=placement.first(metrics)["loss"])
-                if step % loop.checkpoint_every == 0 or step == last:
+                if saves:
                     checkpoints.save(placement.first(state), batches.state())
     finally:
         checkpoints.close()
@@ -86,11 +88,13 @@ def fit(
 
 
 def _check_finite(scalars: dict[str, float], step: int, directory: Path) -> None:
-    if not math.isfinite(scalars["loss"]):
-        raise DivergedError(
-            f"{directory}: the loss is {scalars['loss']} at step {step}; lower the learning rate "
-            f"(optimizer.learning-rate) and start again with --no-resume"
-        )
+    # A finite loss can have a gradient that is not: then the parameters tell.
+    for name in ("loss", "param_norm"):
+        if not math.isfinite(scalars[name]):
+            raise DivergedError(
+                f"{directory}: {name} is {scalars[name]} at step {step}; lower the learning rate "
+                f"(optimizer.learning-rate) and start again with --no-resume"
+            )
 
 
 class _Clock:

@@ -1,4 +1,4 @@
-"""What is trained: the tokenizer or the world model, as hashable objects that :func:`rsjax.train.step.train_step` takes."""
+"""What is trained: the tokenizer or the world model, as hashable objects for :func:`rsjax.train.step.train_step`."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol

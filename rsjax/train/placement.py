@@ -20,8 +20,8 @@ class Placement:
     """How states and batches lie on the devices, and the compiled step that takes them.
 
     Attributes:
-        devices: 1: the step is jitted. More: it is pmapped, states have a leading axis over devices, and the batch is
-            cut into as many parts.
+        devices: 0: the step is jitted, on one device. Else it is pmapped over as many: states have a leading axis over
+            devices, and the batch is cut into as many parts.
     """
 
     devices: int
@@ -33,20 +33,23 @@ class Placement:
         Raises:
             ConfigError: the batch cannot be cut evenly.
         """
+        if loop.placement == "jit":
+            return cls(0)
         local = jax.local_device_count()
-        devices = local if loop.placement == "pmap" or (loop.placement == "auto" and local > 1) else 0
-        if devices and loop.batch_size % devices:
+        if loop.placement == "pmap" and loop.batch_size % local:
             raise ConfigError(
-                f"batch_size {loop.batch_size} does not divide over {devices} devices; make it a multiple, or set "
-                f"placement to jit"
+                f"batch_size {loop.batch_size} does not divide over {local} devices; make it a multiple, or set "
+                f"placement to auto, which uses as many devices as divide it"
             )
-        return cls(devices)
+        devices = max(n for n in range(1, local + 1) if loop.batch_size % n == 0)
+        return cls(devices if devices > 1 or loop.placement == "pmap" else 0)
 
     def compile(self, objective: Objective, loop: LoopConfig) -> Any:
         """``step(state, batch) -> (state, metrics)``; the given state is donated."""
         step = partial(train_step, objective, loop)
         if self.devices:
-            return jax.pmap(partial(step, axis_name=AXIS), axis_name=AXIS, donate_argnums=0)
+            devices = jax.local_devices()[: self.devices]
+            return jax.pmap(partial(step, axis_name=AXIS), axis_name=AXIS, donate_argnums=0, devices=devices)
         return jax.jit(step, donate_argnums=0)
 
     def put_state(self, state: TrainState) -> TrainState:

@@ -22,7 +22,9 @@ def forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.nda
     return jax.tree.map(np.asarray, logits)
 
 
-def _apply_plain(config: ModelConfig, params: Any, tokens: Any, mask: Any, actions: Any, start: Any = 0, cache: Any = None):
+def _apply_plain(
+    config: ModelConfig, params: Any, tokens: Any, mask: Any, actions: Any, start: Any = 0, cache: Any = None
+):
     return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache)
 
 
@@ -40,7 +42,11 @@ def random_inputs(config: ModelConfig, seed: int = 0) -> tuple[dict[str, np.ndar
     rng = np.random.default_rng(seed)
     shape = (BATCH, config.frames, config.grid, config.grid)
     tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in branches(config)}
-    return tokens, rng.random(shape) < 0.4, rng.normal(size=(BATCH, config.frames, config.action_dim)).astype(np.float32)
+    return (
+        tokens,
+        rng.random(shape) < 0.4,
+        rng.normal(size=(BATCH, config.frames, config.action_dim)).astype(np.float32),
+    )
 
 
 # The model once more, cell by cell, from the paper's §2.3 and the public Genie's layout.
@@ -77,7 +83,9 @@ def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
     x = x.copy()
     b, t, s, _ = x.shape
     normed = layer_norm(x, p["norm1"])
-    x += [[sequence_attention(normed[i, j], p["spatial_attn"], config.heads, False) for j in range(t)] for i in range(b)]
+    x += [
+        [sequence_attention(normed[i, j], p["spatial_attn"], config.heads, False) for j in range(t)] for i in range(b)
+    ]
     before = layer_norm(x, p["norm_temporal"]) if config.temporal_norm else x.copy()
     for i in range(b):
         for cell in range(s):
@@ -102,7 +110,7 @@ def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, 
         action = actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"]
         h[name] = x + action[:, :, None] + p["pos_embed"][:t]
     for block in range(config.blocks):
-        own = jax.tree.map(lambda x: x[block], p["blocks"])
+        own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
         if config.depth:
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
@@ -245,7 +253,9 @@ def test_what_a_cache_held_of_a_frame_is_replaced() -> None:
         piece = {name: x[:, first] for name, x in given.items()}
         _, cache = _apply(DUAL, params, piece, mask[:, first], actions[:, first], 0, cache)
     rest = slice(3, None)
-    logits, _ = _apply(DUAL, params, {n: x[:, rest] for n, x in tokens.items()}, mask[:, rest], actions[:, rest], 3, cache)
+    logits, _ = _apply(
+        DUAL, params, {n: x[:, rest] for n, x in tokens.items()}, mask[:, rest], actions[:, rest], 3, cache
+    )
     for name in whole:
         np.testing.assert_allclose(logits[name], whole[name][:, rest], rtol=1e-4, atol=1e-4)
 

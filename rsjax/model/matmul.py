@@ -1,0 +1,37 @@
+"""The matrix product of linear layers, with bf16 operands and float32 accumulation where that is asked for.
+
+CPUs use their bf16 units only for bf16 × bf16 → float32, and the default gradient of such a product gives that up: its
+cotangents are float32, and its weight gradient contracts the first axes of both operands, for which XLA has no fast
+kernel. So the gradient is written by hand: cotangents are cast too, and the activations are transposed in memory.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+@jax.custom_vjp
+def matmul_bf16(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    """x·w with operands rounded to bf16 and float32 accumulation, forwards and backwards; float32 in and out."""
+    return _product(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16), 0)
+
+
+def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
+    x, w = x.astype(jnp.bfloat16), w.astype(jnp.bfloat16)
+    return _product(x, w, 0), (x, w)
+
+
+def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, w = saved
+    cotangent = cotangent.astype(jnp.bfloat16)
+    # A plain transpose is only another layout of the same memory; flattening behind a barrier makes XLA move it.
+    x_t = jax.lax.optimization_barrier(x.T.reshape(-1)).reshape(x.T.shape)
+    return _product(cotangent, w, 1), _product(x_t, cotangent, 0)
+
+
+def _product(x: Array, w: Array, contract: int) -> Array:
+    dimensions = (((1,), (contract,)), ((), ()))
+    return jax.lax.dot_general(x, w, dimensions, preferred_element_type=jnp.float32)
+
+
+matmul_bf16.defvjp(_forward, _backward)

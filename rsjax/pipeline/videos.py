@@ -1,0 +1,97 @@
+"""Videos from a trained run, one per clip."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rsjax.config import SampleConfig
+from rsjax.data.store import Record, Source, open_store
+from rsjax.errors import UserError
+from rsjax.pipeline.run import Run
+from rsjax.report.figures import ClipFigure, animation
+from rsjax.report.video import write_gif, write_mp4
+from rsjax.sample.generator import Generated, Generator
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to generate.
+
+    Attributes:
+        split: of the run's data set.
+        clips: numbers within the split, whose first frames are given.
+        actions_from: a clip of the same split whose actions drive them all; None: each clip's own.
+        actions: a .npy file of actions that drive them all, (T, A) in the data's units.
+        sample: fields of :class:`rsjax.config.SampleConfig` in which decoding differs from the run's own.
+    """
+
+    split: str
+    clips: tuple[int, ...]
+    actions_from: int | None
+    actions: Path | None
+    sample: dict[str, Any]
+
+
+def write_videos(
+    run: Path, data: Path, request: Request, out: Path, kind: Literal["mp4", "gif"], fps: float, scale: int
+) -> Iterator[Path]:
+    """Generates and writes a video per clip: truth and prediction side by side, with depth where the model has it.
+
+    Under foreign actions there is no truth to show, only what was generated.
+
+    Yields:
+        Each file's path, once it is written.
+
+    Raises:
+        UserError: the run or its data are missing, a clip does not exist, or the actions do not fit.
+    """
+    generator = Generator.load(run)
+    sample = dataclasses.replace(generator.config.sample, **request.sample)
+    source = open_store(Run(generator.config, run, data).clips).source(request.split)
+    missing = [n for n in (*request.clips, request.actions_from or 0) if not 0 <= n < len(source)]
+    if missing:
+        raise UserError(f"--clips: no clip {missing[0]} in the {request.split} split, it has 0 … {len(source) - 1}")
+    foreign = _foreign_actions(request, source, generator.config.model.action_dim, generator.config.model.frames)
+    for number in request.clips:
+        clip = source[number]
+        actions = clip["actions"] if foreign is None else foreign
+        made = _generate(generator, clip, actions, sample)
+        frames = _side_by_side(clip, made, number) if foreign is None else made.rgb[0]
+        path = out / f"{request.split}_{number:03d}.{kind}"
+        (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, 1 if foreign is None else scale)
+        yield path
+
+
+def _foreign_actions(request: Request, source: Source, width: int, longest: int) -> Float[np.ndarray, "T A"] | None:
+    if request.actions_from is not None:
+        return source[request.actions_from]["actions"]
+    if request.actions is None:
+        return None
+    try:
+        actions = np.load(request.actions, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
+    if actions.ndim != 2 or actions.shape[1] != width or not 2 <= len(actions) <= longest:
+        raise UserError(
+            f"{request.actions}: shape {actions.shape}; this model takes (T, {width}) with T from 2 to {longest}"
+        )
+    return actions
+
+
+def _generate(generator: Generator, clip: Record, actions: np.ndarray, sample: SampleConfig) -> Generated:
+    given = generator.config.mask.prompt_frames
+    prompt = {
+        "rgb": generator.codec.encode_rgb(clip["rgb"][None, :given]),
+        "depth": generator.codec.encode_depth(clip["depth"][None, :given]),
+    }
+    return generator.generate(prompt, actions[None], sample)
+
+
+def _side_by_side(clip: Record, made: Generated, number: int) -> UInt8[np.ndarray, "T H W 3"]:
+    depth = {} if made.depth is None else {"true_depth": clip["depth"], "predicted_depth": made.depth[0]}
+    return animation(ClipFigure(title=f"clip {number}", truth=clip["rgb"], prediction=made.rgb[0], **depth))

@@ -1,0 +1,94 @@
+import itertools
+import math
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.config import SampleConfig
+from rsjax.sample.maskgit import Frame, masked_after, sample_tokens, unmask_step
+
+B, CELLS, BITS = 2, 12, 6
+LOGITS = {name: jax.random.normal(jax.random.key(i), (B, CELLS, 2, 8)) * 3 for i, name in enumerate(("rgb", "depth"))}
+Order = Literal["random", "greedy"]
+
+
+@settings(deadline=None, max_examples=50)
+@given(steps=st.integers(1, 16), cells=st.integers(1, 256))
+def test_the_schedule_follows_the_cosine_down_to_nothing(steps: int, cells: int) -> None:
+    left = [int(masked_after(step, steps, cells)) for step in range(steps)]
+    assert left[-1] == 0
+    assert all(a >= b for a, b in itertools.pairwise(left))
+    for step, count in enumerate(left[:-1]):
+        exact = math.cos((step + 1) / steps * math.pi / 2) * cells
+        assert exact - 1e-3 <= count < exact + 1 + 1e-3
+
+
+def decode(config: SampleConfig, seed: int = 0) -> list[Frame]:
+    """The frames before the first and after every step, each step with other logits, as a model would give."""
+    frame = Frame({name: jnp.zeros((B, CELLS), jnp.int32) for name in LOGITS}, jnp.ones((B, CELLS), bool))
+    frames = [frame]
+    for step in range(config.steps):
+        logits = {name: jnp.roll(x, step, axis=1) for name, x in LOGITS.items()}
+        frame = unmask_step(config, BITS, jax.random.fold_in(jax.random.key(seed), step), step, frame, logits)
+        frames.append(frame)
+    return frames
+
+
+@pytest.mark.parametrize("unmask", ["random", "greedy"])
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_a_cell_is_decided_once_and_the_schedule_is_kept(unmask: Order, temperature: float) -> None:
+    config = SampleConfig(steps=5, temperature=temperature, unmask=unmask)
+    frames = decode(config)
+    for step, (before, after) in enumerate(itertools.pairwise(frames)):
+        np.testing.assert_array_equal(after.mask.sum(-1), masked_after(step, config.steps, CELLS))
+        assert not np.any(after.mask & ~before.mask)
+        for name in LOGITS:
+            decided = ~np.asarray(before.mask)
+            np.testing.assert_array_equal(after.tokens[name][decided], before.tokens[name][decided])
+
+
+def test_greedy_leaves_open_where_the_branches_together_are_least_sure() -> None:
+    before, after = decode(SampleConfig(steps=2, unmask="greedy"))[:2]
+    p = {name: np.asarray(jax.nn.softmax(x)).max(-1).prod(-1) for name, x in LOGITS.items()}  # of both vocabularies
+    joint = p["rgb"] * p["depth"]
+    left = int(masked_after(0, 2, CELLS))
+    for clip in range(B):
+        assert set(np.flatnonzero(after.mask[clip])) == set(np.argsort(joint[clip])[:left])
+    assert before.mask.all()
+
+
+def test_random_order_does_not_look_at_the_logits() -> None:
+    config = SampleConfig(steps=2)
+    start, key = decode(config)[0], jax.random.key(7)
+    flipped = {name: -x for name, x in LOGITS.items()}
+    one, other = (unmask_step(config, BITS, key, 0, start, x) for x in (LOGITS, flipped))
+    np.testing.assert_array_equal(one.mask, other.mask)
+    assert not np.array_equal(one.mask, unmask_step(config, BITS, jax.random.key(8), 0, start, LOGITS).mask)
+
+
+def test_at_temperature_zero_the_most_probable_codes_are_taken_whatever_the_key() -> None:
+    for seed in range(2):
+        tokens, log_p = sample_tokens(jax.random.key(seed), LOGITS["rgb"], 0.0, BITS)
+        best = np.asarray(LOGITS["rgb"]).argmax(-1)
+        np.testing.assert_array_equal(tokens, best[..., 0] + 8 * best[..., 1])
+        expected = np.log(np.asarray(jax.nn.softmax(LOGITS["rgb"])).max(-1).prod(-1))
+        np.testing.assert_allclose(log_p, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_temperature_divides_logits(temperature: float) -> None:
+    logits = np.array([[2.0, 0.0, 1.0, -1.0], [0.0, 0.5, -2.0, 1.5]], np.float32)
+    many = jnp.broadcast_to(logits, (1, 20_000, 2, 4))
+    tokens, log_p = sample_tokens(jax.random.key(0), many, temperature, 4)
+    for k in range(2):
+        p = np.exp(logits[k] / temperature)
+        frequency = np.bincount(np.asarray(tokens[0] >> 2 * k & 3), minlength=4) / 20_000
+        np.testing.assert_allclose(frequency, p / p.sum(), atol=0.02)
+    codes = np.stack([tokens[0] & 3, tokens[0] >> 2], -1)
+    plain = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
+    np.testing.assert_allclose(log_p[0], plain[0, codes[:, 0]] + plain[1, codes[:, 1]], rtol=1e-4)

@@ -1,0 +1,81 @@
+from dataclasses import replace
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.train.state import create_state, learning_rate
+from rsjax.train.step import train_step
+from tests.train.toy import Regression, records
+
+OPTIMIZER = OptimizerConfig(learning_rate=0.1, warmup_steps=4, final_share=0.2, weight_decay=0.03, grad_clip=0.5)
+LOOP = LoopConfig(steps=20, optimizer=OPTIMIZER)
+BATCH = {name: np.stack([record[name] for record in records()]) for name in ("x", "y")}
+
+
+def test_the_learning_rate_rises_to_its_peak_and_falls_to_its_final_share() -> None:
+    rates = np.array([learning_rate(LOOP)(step) for step in range(21)])
+    np.testing.assert_allclose(rates[[0, 2, 4, 12, 20]], [0.0, 0.05, 0.1, 0.1 * (0.2 + 0.8 / 2), 0.02], atol=1e-8)
+    assert np.all(np.diff(rates[:5]) > 0)
+    assert np.all(np.diff(rates[4:]) < 0)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_a_run_shorter_than_its_warm_up_has_a_schedule(steps: int) -> None:
+    rates = [float(learning_rate(LoopConfig(steps=steps))(step)) for step in range(steps + 1)]
+    assert 0 < max(rates) <= LoopConfig().optimizer.learning_rate * (1 + 1e-6)
+
+
+def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
+    """Three steps once more in numpy, after Loshchilov & Hutter's algorithm 2, with the clipping before it."""
+    loop, objective = replace(LOOP, ema=0.15), Regression()
+    state = create_state(objective, loop)
+    step = jax.jit(partial(train_step, objective, loop))
+    opt, theta = OPTIMIZER, np.concatenate([state.params["w"], state.params["b"][None]]).astype(np.float64)
+    average, m, v = theta.copy(), np.zeros(4), np.zeros(4)
+    for t in range(1, 4):
+        noise = 0.1 * float(jax.random.normal(jax.random.fold_in(jax.random.key(loop.seed + 1), t - 1)))
+        inputs = np.concatenate([BATCH["x"], np.ones((len(BATCH["y"]), 1))], axis=1)
+        error = inputs @ theta + noise - BATCH["y"]
+        gradient = 2.0 * 2 * error @ inputs / len(error)  # the term's weight is 2
+        norm = np.linalg.norm(gradient)
+        clipped = gradient * min(1, opt.grad_clip / norm)
+        m = opt.beta1 * m + (1 - opt.beta1) * clipped
+        v = opt.beta2 * v + (1 - opt.beta2) * clipped**2
+        rate = opt.learning_rate * (t - 1) / opt.warmup_steps
+        direction = m / (1 - opt.beta1**t) / (np.sqrt(v / (1 - opt.beta2**t)) + 1e-8)
+        update = -rate * (direction + opt.weight_decay * theta)
+        theta = theta + update
+        decay = min(loop.ema, t / (9 + t))
+        average = decay * average + (1 - decay) * theta
+
+        state, metrics = step(state, BATCH)
+        assert int(state.step) == t
+        assert norm > opt.grad_clip
+        expected = {
+            "loss": 2 * np.mean(error**2),
+            "error": np.mean(error**2),
+            "grad_norm": norm,
+            "param_norm": np.linalg.norm(theta),
+            "update_norm": np.linalg.norm(update),
+            "learning_rate": rate,
+        }
+        assert metrics.keys() == expected.keys()
+        for name, value in expected.items():
+            np.testing.assert_allclose(metrics[name], value, rtol=1e-4, atol=1e-7, err_msg=name)
+    np.testing.assert_allclose(np.concatenate([state.params["w"], state.params["b"][None]]), theta, rtol=1e-5)
+    np.testing.assert_allclose(np.concatenate([state.weights["w"], state.weights["b"][None]]), average, rtol=1e-5)
+
+
+def test_without_an_average_later_stages_use_the_parameters() -> None:
+    state = create_state(Regression(), LOOP)
+    assert state.ema is None
+    assert state.weights is state.params
+
+
+def test_a_fresh_state_follows_from_the_seed() -> None:
+    one, same, other = (create_state(Regression(), replace(LOOP, seed=seed)).params["w"] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
