@@ -37,7 +37,7 @@ def main() -> None:
     run = Run(config, options.run_dir or Path("runs") / config.name, options.data_dir)
     run.prepare(options.overwrite)
     run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
-    print(f"report: {(run.directory / 'report.html').absolute()}")
+    print(f"report: {run.output('report').absolute()}")
 
 
 if __name__ == "__main__":

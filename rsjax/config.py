@@ -109,8 +109,13 @@ class TokenizerConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with linear warm-up, a cosine to ``final_share`` of the peak, and clipping by the global norm."""
+    """Linear warm-up, a cosine to ``final_share`` of the peak, and clipping by the global norm.
 
+    ``muon`` orthogonalises the updates of the blocks' matrices (at AdamW's scale) and leaves the rest to AdamW with
+    Nesterov momentum. The paper does not name its optimizer; the public Genie uses AdamW.
+    """
+
+    kind: Literal["adamw", "muon"] = "adamw"
     learning_rate: float = 1e-4
     warmup_steps: int = 50
     final_share: float = 0.05
@@ -169,7 +174,10 @@ class ModelConfig:
     grid: int = 16
     code_bits: int = 18
     vocabularies: int = 2
-    action_dim: int = 28
+    action_dim: int = 28  # of what the action encoder sees
+    # The encoder also sees the sum of all actions so far (action_dim doubles). Where actions are pose deltas, that is
+    # the pose: a large model finds it by temporal attention, a small one on few steps need not. Not in the paper.
+    integrate_actions: bool = False
     width: int = 256
     blocks: int = 32
     heads: int = 8
@@ -180,6 +188,7 @@ class ModelConfig:
     temporal_norm: bool = False
     final_norm: bool = False
     embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 is torch's default and so the public code's
+    position_std: float = 0.0  # position and mask embeddings likewise; the public code starts them at zero
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
@@ -206,7 +215,7 @@ class MaskConfig:
     Rates are probabilities; see :mod:`rsjax.objective.masking` for the recipe's three steps.
     """
 
-    prompt_frames: int = 1  # frames given at generation and never masked in training; the paper gives one
+    prompt_frames: int = 1  # frames given at generation; the paper gives one
     random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
     corruption_probability: float = 0.5  # step 2 happens to this share of the batches
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
@@ -261,6 +270,10 @@ class EvalConfig:
     action_draws: int = 3  # random action sequences per clip and kind, for ΔPSNR
     report_clips: int = 4  # clips shown in the report
 
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "action_draws", "report_clips"):
+            _require(getattr(self, name) > 0, f"eval.{name} is {getattr(self, name)}; it must be positive")
+
 
 @dataclass(frozen=True)
 class Config:
@@ -288,12 +301,17 @@ class Config:
             f"mask.prompt_frames is {self.mask.prompt_frames} of {self.sim.frames} frames; "
             f"at least one frame must be left to predict",
         )
+        _require(
+            min(self.eval.clips, self.sim.test_episodes) >= 2,
+            f"eval.clips is {self.eval.clips} of sim.test_episodes {self.sim.test_episodes}; both must be at least 2, "
+            f"so that a clip can be generated under another one's actions",
+        )
         pairs = (
             ("sim.image_size", self.sim.image_size, "tokenizer.image_size", self.tokenizer.image_size),
             ("tokenizer grid", self.tokenizer.grid, "model.grid", self.model.grid),
             ("tokenizer.code_bits", self.tokenizer.code_bits, "model.code_bits", self.model.code_bits),
             ("tokenizer.vocabularies", self.tokenizer.vocabularies, "model.vocabularies", self.model.vocabularies),
-            ("sim action width (7 × control_steps)", self.sim.action_dim, "model.action_dim", self.model.action_dim),
+            ("what the action encoder sees", self.action_inputs, "model.action_dim", self.model.action_dim),
         )
         for left, left_value, right, right_value in pairs:
             _require(left_value == right_value, f"{left} is {left_value} but {right} is {right_value}; make them equal")
@@ -301,6 +319,11 @@ class Config:
             not self.loss.keypoints or self.loss.num_keypoints <= self.sim.tracks,
             f"loss.num_keypoints is {self.loss.num_keypoints} but only sim.tracks = {self.sim.tracks} are tracked",
         )
+
+    @property
+    def action_inputs(self) -> int:
+        """Width of what the action encoder sees: 7 × control_steps, and as much again for their sums if given."""
+        return self.sim.action_dim * (2 if self.model.integrate_actions else 1)
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def test_overrides_reach_their_field_and_no_other() -> None:
         (["tiny", "--train.steps"], "Missing value for argument '--train.steps'"),
         (["tiny", "--sample.unmask", "worst"], "Expected one of ('random', 'greedy')"),
         (["tiny", "--sim.frames", "99"], f"model.frames holds positions for {presets.get('tiny').model.frames}"),
-        (["tiny", "--sim.control-steps", "2"], "is 14 but model.action_dim is 28"),
+        (["debug", "--sim.control-steps", "2"], "is 14 but model.action_dim is 28"),
     ],
 )
 def test_each_mistake_gets_one_line_that_names_it(argv: list[str], expected: str) -> None:

@@ -103,6 +103,8 @@ def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> No
         ("mask", {"prompt_frames": 0}, "mask.prompt_frames is 0"),
         ("mask", {"prompt_frames": 6}, "mask.prompt_frames is 6 of 6 frames"),
         ("loss", {"num_keypoints": 65}, "loss.num_keypoints is 65"),
+        ("eval", {"clips": 1}, "eval.clips is 1 of sim.test_episodes 2"),
+        ("eval", {"batch_size": 0}, "eval.batch_size is 0"),
         ("sample", {"steps": 0}, "sample.steps is 0"),
         ("sample", {"temperature": -0.5}, "sample.temperature is -0.5"),
     ],

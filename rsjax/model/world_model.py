@@ -37,7 +37,7 @@ class TokenEmbed(nn.Module):
             )
             for k in range(cfg.vocabularies)
         )
-        mask_embed = self.param("mask_token_embed", nn.initializers.zeros, (cfg.width,))
+        mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.position_std), (cfg.width,))
         return jnp.where(mask[..., None], mask_embed, embedded)
 
 
@@ -70,7 +70,8 @@ class WorldModel(nn.Module):
         cfg = self.config
         b, t = mask.shape[:2]
         cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
-        position = self.param("pos_embed", nn.initializers.zeros, (cfg.frames, cfg.grid**2, cfg.width))
+        init = nn.initializers.normal(cfg.position_std)
+        position = self.param("pos_embed", init, (cfg.frames, cfg.grid**2, cfg.width))
         position = jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
         action = Dense(cfg.width, name="action_encoder")(actions)[:, :, None]
         x = {

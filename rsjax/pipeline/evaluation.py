@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num
 
-from rsjax.data.store import Store, decode, encode, write_atomically
+from rsjax.data.store import Store, StoreError, decode, encode, write_atomically
 from rsjax.metrics import control, pixels
 from rsjax.metrics.depth import depth_scores, result_key
 from rsjax.metrics.statistics import bootstrap, over_predicted_frames
 from rsjax.progress import Progress
 from rsjax.sample.generator import Generated, Generator, Tokens
-
-FILE = "result.msgpack"
 
 
 @dataclass(frozen=True)
@@ -173,12 +171,19 @@ def _shown(generator: Generator, held: HeldOut, own: Generated, other: Generated
     return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
 
 
-def save(folder: Path, result: Evaluation) -> None:
+def save(path: Path, result: Evaluation) -> None:
     """Writes a result; it appears whole or not at all."""
-    write_atomically(folder / FILE, encode({"metrics": result.metrics} | result.shown))
+    write_atomically(path, encode({"metrics": result.metrics} | result.shown))
 
 
-def load(folder: Path) -> Evaluation:
-    """Reads what :func:`save` wrote."""
-    record = decode((folder / FILE).read_bytes())
+def load(path: Path) -> Evaluation:
+    """Reads what :func:`save` wrote.
+
+    Raises:
+        StoreError: the file is damaged.
+    """
+    try:
+        record = decode(path.read_bytes())
+    except ValueError as error:
+        raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
     return Evaluation(record.pop("metrics"), record)

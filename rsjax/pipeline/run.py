@@ -20,6 +20,13 @@ from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
 TRAINED = ("tokenizer", "world_model")  # never replaced unasked
+OUTPUTS = {  # in the run directory; clips lie outside
+    "tokenizer": "tokenizer/weights",
+    "tokens": "tokens/store",
+    "world_model": "world_model/weights",
+    "evaluation": "evaluation/result.msgpack",
+    "report": "report.html",
+}
 RECIPE = 1  # raise it when the same configuration gives other results
 
 
@@ -46,7 +53,7 @@ class Run:
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.tokenizer, cfg.tokenizer_train),
-            "tokens": (),
+            "tokens": (cfg.model.integrate_actions,),
             "world_model": (cfg.model, cfg.mask, cfg.loss, cfg.train),
             "evaluation": (cfg.sample, cfg.eval),
             "report": (),
@@ -85,10 +92,15 @@ class Run:
         names = [name for name in here | saved if here.get(name) != saved.get(name)]
         return "; ".join(f"{name} is {saved.get(name)} there, {here.get(name)} here" for name in names) or "older code"
 
+    def output(self, stage: str) -> Path:
+        """What the stage leaves: a file or directory that appears whole."""
+        return self.clips if stage == "collect" else self.directory / OUTPUTS[stage]
+
     def finished(self, stage: str) -> bool:
         """Whether the stage's output is there and was made by this configuration."""
         mark = self.mark(stage)
-        return mark.get("key") == self.keys()[stage] and mark.get("finished", False)
+        done = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
+        return done and self.output(stage).exists()
 
     def mark(self, stage: str) -> dict[str, Any]:
         """What the directory knows of a stage: key, finished, seconds. Empty where it was not begun."""

@@ -41,7 +41,7 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         "report": "writing the report",
     }
     for number, name in enumerate(STAGES, 1):
-        if run.finished(name) and (name != "collect" or run.clips.exists()):
+        if run.finished(name):
             stage(number, len(STAGES), name, f"up to date, skipped ({duration(run.mark(name)['seconds'])} when it ran)")
             continue
         stage(number, len(STAGES), name, notes[name])
@@ -65,17 +65,16 @@ def train_tokenizer(run: Run, resume: bool) -> None:
         scale=cfg.tokenizer.depth_scale,
     )
     source = open_store(run.clips).source("train")
-    folder = run.directory / "tokenizer"
     state = fit(
         TokenizerObjective(cfg.tokenizer, train),
         train,
         lambda data: loader.batches(source, transform, train.batch_size, train.seed, state=data),
-        folder,
+        run.directory / "tokenizer",
         name="tokenizer",
         to_batch=transforms.image_batch,
         resume=resume,
     )
-    save_weights(folder / "weights", state.weights)
+    save_weights(run.output("tokenizer"), state.weights)
 
 
 def tokenize(run: Run) -> None:
@@ -98,14 +97,14 @@ def tokenize(run: Run) -> None:
 
         meta = {name: clips.manifest[name] for name in ("action_mean", "action_std", "depth_range")}
         key = {"key": run.keys()["tokens"], "source": str(run.clips)}
-        write_store(run.directory / "tokens" / "store", "tokens", {s: tokenized(s) for s in clips.splits}, meta | key)
+        write_store(run.output("tokens"), "tokens", {s: tokenized(s) for s in clips.splits}, meta | key)
 
 
 def _token_record(codec: Codec, clip: Record) -> Record:
     return {
         "rgb": codec.encode_rgb(clip["rgb"]),
         "depth": codec.encode_depth(clip["depth"]),
-        "actions": codec.units.normalise(clip["actions"]),
+        "actions": codec.units.action_inputs(clip["actions"], codec.config.model.integrate_actions),
         "tracks": clip["tracks"],
         "visible": clip["visible"],
         "task": clip["task"],
@@ -116,22 +115,21 @@ def _token_record(codec: Codec, clip: Record) -> Record:
 def train_world_model(run: Run, resume: bool) -> None:
     """Stage 4."""
     cfg, train = run.config, run.config.train
-    source = open_store(run.directory / "tokens" / "store").source("train")
-    folder = run.directory / "world_model"
+    source = open_store(run.output("tokens")).source("train")
     state = fit(
         WorldModelObjective.create(cfg),
         train,
         lambda data: loader.batches(source, transforms.token_clip, train.batch_size, train.seed, state=data),
-        folder,
+        run.directory / "world_model",
         name="world model",
         to_batch=transforms.token_batch,
         resume=resume,
     )
-    save_weights(folder / "weights", state.weights)
+    save_weights(run.output("world_model"), state.weights)
 
 
 def evaluate(run: Run) -> None:
     """Stage 5: metrics and the arrays that the report shows."""
     with disk_guard(run.directory):
         result = evaluation.evaluate(Generator.load(run.directory), open_store(run.clips))
-        evaluation.save(run.directory / "evaluation", result)
+        evaluation.save(run.output("evaluation"), result)

@@ -27,7 +27,7 @@ def write_summary(run: Run, command: str) -> None:
     Args:
         command: how to repeat the run.
     """
-    result = evaluation.load(run.directory / "evaluation")
+    result = evaluation.load(run.output("evaluation"))
     seconds = {stage: run.mark(stage)["seconds"] for stage in STAGES[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
@@ -46,7 +46,7 @@ def write_summary(run: Run, command: str) -> None:
         show_targets=cfg.name == "tiny",
     )
     with disk_guard(run.directory):
-        write_report(run.directory / "report.html", report)
+        write_report(run.output("report"), report)
         write_atomically(run.directory / "metrics.json", json.dumps(metrics, indent=1).encode())
 
 

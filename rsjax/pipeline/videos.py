@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rsjax.config import SampleConfig
+from rsjax.config import Config, SampleConfig
 from rsjax.data.store import Record, Source, open_store
 from rsjax.errors import UserError
 from rsjax.pipeline.run import Run
@@ -53,10 +53,14 @@ def write_videos(
     generator = Generator.load(run)
     sample = dataclasses.replace(generator.config.sample, **request.sample)
     source = open_store(Run(generator.config, run, data).clips).source(request.split)
-    missing = [n for n in (*request.clips, request.actions_from or 0) if not 0 <= n < len(source)]
-    if missing:
-        raise UserError(f"--clips: no clip {missing[0]} in the {request.split} split, it has 0 … {len(source) - 1}")
-    foreign = _foreign_actions(request, source, generator.config.model.action_dim, generator.config.model.frames)
+    for flag, numbers in (("--clips", request.clips), ("--actions-from", (request.actions_from or 0,))):
+        for number in numbers:
+            if not 0 <= number < len(source):
+                last = len(source) - 1
+                raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
+    if not fps > 0 or scale < 1:
+        raise UserError(f"--fps is {fps} and --scale is {scale}; both must be positive")
+    foreign = _foreign_actions(request, source, generator.config)
     for number in request.clips:
         clip = source[number]
         actions = clip["actions"] if foreign is None else foreign
@@ -67,7 +71,7 @@ def write_videos(
         yield path
 
 
-def _foreign_actions(request: Request, source: Source, width: int, longest: int) -> Float[np.ndarray, "T A"] | None:
+def _foreign_actions(request: Request, source: Source, config: Config) -> Float[np.ndarray, "T A"] | None:
     if request.actions_from is not None:
         return source[request.actions_from]["actions"]
     if request.actions is None:
@@ -76,10 +80,12 @@ def _foreign_actions(request: Request, source: Source, width: int, longest: int)
         actions = np.load(request.actions, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
-    if actions.ndim != 2 or actions.shape[1] != width or not 2 <= len(actions) <= longest:
-        raise UserError(
-            f"{request.actions}: shape {actions.shape}; this model takes (T, {width}) with T from 2 to {longest}"
-        )
+    width, shortest, longest = config.sim.action_dim, config.mask.prompt_frames + 1, config.model.frames
+    if actions.ndim != 2 or actions.shape[1] != width or not shortest <= len(actions) <= longest:
+        fits = f"(T, {width}) with T from {shortest} to {longest}"
+        raise UserError(f"{request.actions}: shape {actions.shape}; this model takes {fits}")
+    if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
+        raise UserError(f"{request.actions}: {actions.dtype} with values that are not finite numbers; give floats")
     return actions
 
 

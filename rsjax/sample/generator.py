@@ -23,7 +23,7 @@ from rsjax.train.checkpoint import load_weights
 
 Tokens = dict[str, Int[Array, "B T h w"]]
 
-CHUNK = 160  # images per pass of the tokenizer: bounded memory, one compiled shape
+CHUNK = 128  # images per pass of the tokenizer at the most: bounded memory
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,19 @@ class Units:
         """The units in a store's manifest."""
         return cls(*(tuple(store.manifest[name]) for name in ("action_mean", "action_std", "depth_range")))
 
-    def normalise(self, actions: Float[np.ndarray, "*B T A"]) -> Float32[np.ndarray, "*B T A"]:
-        """Actions to zero mean and unit variance; row 0, into the first frame, stays zero.
+    def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
+        """What the action encoder sees: actions at zero mean and unit variance; row 0, into the first frame, is zero.
 
         A dimension that hardly varies is not blown up: its deviation counts as at least 0.001.
+
+        Args:
+            actions: in the data's units.
+            integrate: append their sum over the frames so far, at a quarter of its size.
         """
         scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
         scaled[..., 0, :] = 0.0
+        if integrate:
+            scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
         return scaled.astype(np.float32)
 
 
@@ -84,10 +90,11 @@ class Codec:
     def _chunked(self, function: Any, images: np.ndarray, item_axes: int) -> np.ndarray:
         lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
         flat = images.reshape(-1, *item)
+        size = min(CHUNK, 2 ** (len(flat) - 1).bit_length())  # few shapes, each compiled once
         out = []
-        for start in range(0, len(flat), CHUNK):
-            chunk = flat[start : start + CHUNK]
-            padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
+        for start in range(0, len(flat), size):
+            chunk = flat[start : start + size]
+            padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
             out.append(np.asarray(function(self.config.tokenizer, self.params, padded))[: len(chunk)])
         joined = np.concatenate(out)
         return joined.reshape(*lead, *joined.shape[1:])
@@ -140,7 +147,7 @@ class Generator:
             actions: in the data's units; row t leads into frame t, row 0 is not used.
             depth: decode depth too; it costs as much as the frames.
         """
-        normalised = jnp.asarray(self.codec.units.normalise(actions))
+        normalised = jnp.asarray(self.codec.units.action_inputs(actions, self.config.model.integrate_actions))
         given = {name: jnp.asarray(prompt[name]) for name in branches(self.config.model)}
         tokens = rollout(self.config.model, sample, self.params, given, normalised, jax.random.key(sample.seed))
         metres = self.codec.decode_depth(tokens["depth"]) if depth and "depth" in tokens else None
@@ -148,11 +155,20 @@ class Generator:
 
 
 def load_config(run: Path) -> Config:
-    """The configuration that a run directory was made with."""
+    """The configuration that a run directory was made with.
+
+    Raises:
+        UserError: there is none, it is damaged, or of another version.
+    """
     path = run / "config.json"
     if not path.exists():
         raise UserError(f"{path}: missing, so {run} is not a run directory; make one with python -m experiments.train")
-    return from_dict(Config, json.loads(path.read_text()))
+    try:
+        return from_dict(Config, json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a configuration ({error}); the train command of this run writes it again"
+        ) from error
 
 
 def load_tokenizer(config: Config, run: Path) -> Any:

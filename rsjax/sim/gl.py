@@ -8,7 +8,8 @@ from rsjax.errors import UserError
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference
 
-CURE = "install one with `make setup` or `apt-get install libegl1 libosmesa6`"
+# What a bare Debian 12 or 13 lacks: libEGL alone finds no driver, and PyOpenGL's OSMesa wants libGL beside it.
+CURE = "install one with `make setup` or `apt-get install libegl1 libgl1 libgl1-mesa-dri libosmesa6`"
 
 
 class GLError(UserError):

@@ -1,6 +1,8 @@
 """Checkpoints: the whole state with the place in the data, and the finished weights that later stages read."""
 
+import errno
 import logging
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,9 @@ from rsjax.data.store import disk_guard
 from rsjax.errors import UserError
 from rsjax.train.state import TrainState
 
-# Orbax tells of every step of every save; a user has the progress line.
-logging.getLogger("absl").setLevel(logging.WARNING)
+# Orbax tells of every step of every save, and of each error at length in each of its threads; a user has the progress
+# line, and the error arrives as an exception too.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class CheckpointError(UserError):
@@ -44,6 +47,7 @@ class Checkpoints:
         """
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(data))
         with disk_guard(self.directory):
+            _need_room(self.directory, state)
             self._manager.save(int(state.step), args=arguments)
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
@@ -58,10 +62,10 @@ class Checkpoints:
         step = self.latest()
         arguments = ocp.args.Composite(state=ocp.args.StandardRestore(_shapes(like)), data=ocp.args.JsonRestore())
         try:
+            _check_shapes(self.directory / str(step) / "state", like)
             restored = self._manager.restore(step, args=arguments)
-        except Exception as error:  # orbax reports misfits and damage as many types
+        except Exception as error:  # orbax reports damage as many types
             raise _misfit(self.directory / str(step), error) from error
-        _check_shapes(self.directory / str(step), like, restored["state"])
         return restored["state"], restored["data"]
 
     def close(self) -> None:
@@ -72,6 +76,7 @@ class Checkpoints:
 def save_weights(path: Path, weights: Any) -> None:
     """Writes parameters alone; they appear whole or not at all."""
     with disk_guard(path), ocp.StandardCheckpointer() as checkpointer:
+        _need_room(path.parent, weights)
         checkpointer.save(path.absolute(), weights, force=True)
 
 
@@ -87,12 +92,17 @@ def load_weights(path: Path, like: Any) -> Any:
     if not path.exists():
         raise CheckpointError(f"{path}: no such weights; train first (python -m experiments.train)")
     try:
+        _check_shapes(path, like)
         with ocp.StandardCheckpointer() as checkpointer:
-            weights = checkpointer.restore(path.absolute(), _shapes(like))
+            return checkpointer.restore(path.absolute(), _shapes(like))
     except Exception as error:  # as above
         raise _misfit(path, error) from error
-    _check_shapes(path, like, weights)
-    return weights
+
+
+def _need_room(folder: Path, tree: Any) -> None:
+    # On a full disk TensorStore prints tracebacks from callbacks that outlive orbax: so it is looked up first.
+    if shutil.disk_usage(folder).free < sum(x.nbytes for x in jax.tree.leaves(tree)):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def _shapes(tree: Any) -> Any:
@@ -100,12 +110,21 @@ def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), tree)
 
 
-def _check_shapes(path: Path, like: Any, restored: Any) -> None:
-    for (where, wanted), found in zip(jax.tree.leaves_with_path(like), jax.tree.leaves(restored), strict=True):
-        if wanted.shape != found.shape:
-            raise _misfit(
-                path, f"{jax.tree_util.keystr(where)} is {found.shape}, the configuration needs {wanted.shape}"
+def _check_shapes(path: Path, like: Any) -> None:
+    # Looked up before anything is read: when a read does not fit, TensorStore prints tracebacks as on a full disk.
+    with ocp.StandardCheckpointer() as checkpointer:
+        saved = _flat_shapes(checkpointer.metadata(path.absolute()).item_metadata.tree)
+    wanted = _flat_shapes(like)
+    for name in sorted(wanted.keys() | saved.keys()):
+        if wanted.get(name) != saved.get(name):
+            raise ValueError(
+                f"{name} is {saved.get(name, 'missing')}, the configuration needs {wanted.get(name, 'none')}"
             )
+
+
+def _flat_shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    leaves = ocp.tree.to_flat_dict(ocp.tree.serialize_tree(tree))
+    return {".".join(map(str, path)): tuple(leaf.shape) for path, leaf in leaves.items() if hasattr(leaf, "shape")}
 
 
 def _misfit(path: Path, reason: object) -> CheckpointError:

@@ -54,7 +54,7 @@ def fit(
         StoreError: too many damaged records, or a full disk.
     """
     if not resume:
-        shutil.rmtree(directory, ignore_errors=True)
+        shutil.rmtree(directory / "checkpoints", ignore_errors=True)
     checkpoints = Checkpoints(directory / "checkpoints")
     placement = Placement.create(loop)
     state, data = create_state(objective, loop), None

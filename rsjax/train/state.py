@@ -37,12 +37,32 @@ def learning_rate(loop: LoopConfig) -> optax.Schedule:
 
 
 def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
-    """Clipping by the global norm, then AdamW."""
+    """Clipping by the global norm, then AdamW or Muon."""
     opt = loop.optimizer
-    return optax.chain(
-        optax.clip_by_global_norm(opt.grad_clip),
-        optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay),
-    )
+    if opt.kind == "muon":
+        inner = optax.contrib.muon(
+            learning_rate(loop),
+            weight_decay=opt.weight_decay,
+            adam_b1=opt.beta1,
+            adam_b2=opt.beta2,
+            adam_weight_decay=opt.weight_decay,
+            muon_weight_dimension_numbers=_block_matrices,
+            consistent_rms=0.2,
+        )
+    else:
+        inner = optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay)
+    return optax.chain(optax.clip_by_global_norm(opt.grad_clip), inner)
+
+
+def _block_matrices(params: Any) -> Any:
+    """Which parameters are matrices inside blocks, (blocks, in, out); None for embeddings, heads, biases and norms."""
+
+    def axes(path: Any, value: Any) -> optax.contrib.MuonDimensionNumbers | None:
+        names = [key.key for key in path]
+        matrix = "blocks" in names and names[-1] == "kernel"
+        return optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2) if matrix else None
+
+    return jax.tree.map_with_path(axes, params)
 
 
 def create_state(objective: Objective, loop: LoopConfig) -> TrainState:

@@ -26,5 +26,5 @@ def test_respects_the_users_choice(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_none_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "")
     machine_with(monkeypatch)
-    with pytest.raises(gl.GLError, match=r"make setup.*apt-get install libegl1 libosmesa6"):
+    with pytest.raises(gl.GLError, match=r"make setup.*apt-get install libegl1 libgl1 libgl1-mesa-dri libosmesa6"):
         gl.choose_gl()

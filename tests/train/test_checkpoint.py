@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from rsjax.config import LoopConfig
+from rsjax.data.store import StoreError
+from rsjax.train import checkpoint as module
 from rsjax.train.checkpoint import CheckpointError, Checkpoints, load_weights, save_weights
 from rsjax.train.state import create_state
 from tests.train.toy import Regression, train
@@ -62,6 +64,23 @@ def test_a_damaged_checkpoint_is_named(trained: Path) -> None:
     with pytest.raises(CheckpointError, match=rf"{trained}/checkpoints/2: .*damaged") as raised:
         train(replace(LOOP, steps=3), trained)
     assert "\n" not in str(raised.value)
+
+
+def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = create_state(Regression(), LOOP)
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    usage = module.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=10))
+    for name, save in (
+        ("checkpoints", lambda: checkpoints.save(state, {})),
+        ("weights", lambda: save_weights(tmp_path / "weights", state.params)),
+    ):
+        with pytest.raises(StoreError, match=f"{tmp_path / name}: the disk is full"):
+            save()
+    checkpoints.close()
+    assert [path for path in tmp_path.rglob("*") if path.name != "checkpoints"] == []
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=30))
+    save_weights(tmp_path / "weights", {"w": np.zeros(4, np.float32)})
 
 
 def test_weights_alone_come_back_and_may_be_written_again(tmp_path: Path) -> None:

@@ -14,7 +14,13 @@ from rsjax.train.state import TrainState, create_state
 from tests.train.toy import Regression, loader, records, train
 
 LOOP = LoopConfig(
-    steps=9, batch_size=2, optimizer=OptimizerConfig(1e-2, 2), ema=0.9, log_every=1, checkpoint_every=4, placement="jit"
+    steps=9,
+    batch_size=2,
+    optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=2),
+    ema=0.9,
+    log_every=1,
+    checkpoint_every=4,
+    placement="jit",
 )
 
 

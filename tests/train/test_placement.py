@@ -3,6 +3,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,20 +31,30 @@ def test_every_placement_gives_the_same_parameters_on_uneven_batches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("placement", "local", "devices"), [("jit", 4, 0), ("pmap", 4, 4), ("auto", 4, 4), ("auto", 1, 0), ("pmap", 1, 1)]
+    ("placement", "local", "batch_size", "devices"),
+    [
+        ("jit", 4, 8, 0),
+        ("pmap", 4, 8, 4),
+        ("pmap", 1, 8, 1),
+        ("auto", 4, 8, 4),
+        ("auto", 4, 6, 3),
+        ("auto", 4, 5, 0),
+        ("auto", 1, 8, 0),
+    ],
 )
-def test_auto_takes_all_devices_where_there_are_several(
-    placement: str, local: int, devices: int, monkeypatch: pytest.MonkeyPatch
+def test_auto_takes_as_many_devices_as_divide_the_batch(
+    placement: Any, local: int, batch_size: int, devices: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(jax, "local_device_count", lambda: local)
-    assert Placement.create(LoopConfig(batch_size=8, placement=placement)).devices == devices  # type: ignore[arg-type]
+    assert Placement.create(LoopConfig(batch_size=batch_size, placement=placement)).devices == devices
 
 
-def test_a_batch_that_cannot_be_cut_evenly_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_that_does_not_divide_over_all_devices_is_refused_where_all_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(jax, "local_device_count", lambda: 4)
     with pytest.raises(ConfigError, match="batch_size 6 does not divide over 4 devices; make it a multiple"):
-        Placement.create(LoopConfig(batch_size=6))
-    assert Placement.create(LoopConfig(batch_size=6, placement="jit")).devices == 0
+        Placement.create(LoopConfig(batch_size=6, placement="pmap"))
 
 
 def test_each_device_takes_its_own_consecutive_clips() -> None:

@@ -3,10 +3,11 @@ from functools import partial
 
 import jax
 import numpy as np
+import optax
 import pytest
 
 from rsjax.config import LoopConfig, OptimizerConfig
-from rsjax.train.state import create_state, learning_rate
+from rsjax.train.state import create_state, learning_rate, make_optimizer
 from rsjax.train.step import train_step
 from tests.train.toy import Regression, records
 
@@ -79,3 +80,31 @@ def test_a_fresh_state_follows_from_the_seed() -> None:
     one, same, other = (create_state(Regression(), replace(LOOP, seed=seed)).params["w"] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert not np.array_equal(one, other)
+
+
+def test_muon_orthogonalises_the_blocks_matrices_and_leaves_the_rest_to_adamw() -> None:
+    rng = np.random.default_rng(0)
+    normal = lambda *shape: jax.numpy.asarray(rng.normal(size=shape), "float32")  # noqa: E731
+    params = {
+        "blocks": {"kernel": normal(2, 6, 4), "bias": normal(2, 4)},
+        "embed": {"embedding": normal(5, 4)},
+        "head": {"kernel": normal(4, 3)},
+    }
+    grads = jax.tree.map(lambda x: normal(*x.shape), params)
+    grads["blocks"]["kernel"] *= np.logspace(0, -1.5, 4)  # badly conditioned
+    loop = LoopConfig(steps=20, optimizer=replace(OPTIMIZER, kind="muon", weight_decay=0.0))
+    adam = optax.nadamw(learning_rate(loop), OPTIMIZER.beta1, OPTIMIZER.beta2, weight_decay=0.0)
+    updates = {}
+    for kind, tx in {
+        "muon": make_optimizer(loop),
+        "adamw": optax.chain(optax.clip_by_global_norm(OPTIMIZER.grad_clip), adam),
+    }.items():
+        _, state = tx.update(grads, tx.init(params), params)  # the learning rate of the first step is 0
+        updates[kind], _ = tx.update(grads, state, params)
+    for update, gradient in zip(updates["muon"]["blocks"]["kernel"], grads["blocks"]["kernel"], strict=True):
+        assert np.linalg.cond(gradient) > 10
+        assert np.linalg.cond(update) < 2.5  # Newton–Schulz brings singular values near one another, not together
+        assert np.sum(update * gradient) < 0
+    for path in (("blocks", "bias"), ("embed", "embedding"), ("head", "kernel")):
+        ours, adamw = (updates[kind][path[0]][path[1]] for kind in ("muon", "adamw"))
+        np.testing.assert_allclose(ours, adamw, rtol=1e-5)

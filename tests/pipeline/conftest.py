@@ -1,0 +1,76 @@
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Runs the project's commands as a user does, each in a process of its own. What they compile is kept for the next.
+
+    Attributes:
+        data: the ``--data-dir`` of them all.
+        cache: where compiled programs are kept.
+    """
+
+    data: Path
+    cache: Path
+
+    def __call__(self, module: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", module, *map(str, arguments), "--data-dir", str(self.data)]
+        environment = os.environ | {
+            "JAX_COMPILATION_CACHE_DIR": str(self.cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PLATFORMS": "cpu",
+        }
+        return subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
+
+    def train(self, run: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+        return self("experiments.train", "debug", "--run-dir", run, *arguments)
+
+    def refused(self, module: str, *arguments: object) -> str:
+        """The one line on standard error of a command that cannot be carried out."""
+        done = self(module, *arguments)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.startswith("error: ")
+        assert done.stderr.count("\n") == 1, done.stderr
+        return done.stderr
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory that all processes of this test session share."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def command(shared: Path) -> Commands:
+    return Commands(shared / "data", shared / "compiled")
+
+
+@pytest.fixture(scope="session")
+def debug(gl: str, shared: Path, command: Commands) -> Path:
+    """The directory of one whole run of ``debug``; ``output`` in it is what the command printed. Only for reading."""
+    run = shared / "debug"
+    with (shared / "debug.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not run.exists():
+            done = command.train(shared / "debug.tmp")
+            assert done.returncode == 0, done.stderr
+            (shared / "debug.tmp" / "output").write_text(done.stdout + done.stderr)
+            (shared / "debug.tmp").rename(run)
+    return run
+
+
+@pytest.fixture
+def run(debug: Path, tmp_path: Path) -> Path:
+    """A copy of the whole run, to work on."""
+    return shutil.copytree(debug, tmp_path / "run")

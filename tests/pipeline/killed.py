@@ -1,0 +1,46 @@
+"""``experiments.train``, killed without warning: ``python -m tests.pipeline.killed PLACE PRESET …``.
+
+PLACE is ``tokens`` (stage 3, half of its store written) or ``world_model`` (stage 4, after the checkpoint of step 2).
+"""
+
+import os
+import signal
+import sys
+from typing import Any
+
+from experiments.train import main
+from rsjax.pipeline import stages
+from rsjax.train.checkpoint import Checkpoints
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def in_tokens() -> None:
+    record, count = stages._token_record, 0
+
+    def dying(*args: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == 4:
+            die()
+        return record(*args)
+
+    stages._token_record = dying  # type: ignore[assignment]
+
+
+def in_world_model() -> None:
+    save = Checkpoints.save
+
+    def dying(self: Checkpoints, state: Any, data: Any) -> None:
+        save(self, state, data)
+        if self.directory.parent.name == "world_model" and state.step == 2:
+            die()
+
+    Checkpoints.save = dying  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    {"tokens": in_tokens, "world_model": in_world_model}[sys.argv.pop(1)]()
+    main()

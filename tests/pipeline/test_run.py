@@ -1,0 +1,150 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsjax import presets
+from rsjax.config import Config
+from rsjax.pipeline import run as module
+from rsjax.pipeline.run import STAGES, TRAINED, Run, RunError
+
+DEBUG = presets.debug()
+
+
+def changed(section: str, field: str, value: Any) -> Config:
+    return replace(DEBUG, **{section: replace(getattr(DEBUG, section), **{field: value})})
+
+
+def keys(config: Config) -> dict[str, str]:
+    return Run(config, Path("run"), Path("data")).keys()
+
+
+def make(run: Run, *stages: str) -> None:
+    """Finishes stages without doing their work."""
+    for stage in stages:
+        with run.stage(stage) as folder:
+            run.output(stage).parent.mkdir(parents=True, exist_ok=True)
+            run.output(stage).write_text("done")
+            assert folder == run.directory / stage
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value", "first"),
+    [
+        ("sim", "seed", 1, "collect"),
+        ("sim", "episodes", 9, "collect"),
+        ("tokenizer", "channels", 32, "tokenizer"),
+        ("tokenizer_train", "entropy", 0.2, "tokenizer"),
+        ("model", "width", 64, "world_model"),
+        ("mask", "corruption_keep", 0.5, "world_model"),
+        ("loss", "gamma", 4.0, "world_model"),
+        ("train", "ema", 0.5, "world_model"),
+        ("sample", "steps", 3, "evaluation"),
+        ("eval", "action_draws", 2, "evaluation"),
+    ],
+)
+def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(
+    section: str, field: str, value: Any, first: str
+) -> None:
+    before, after = keys(DEBUG), keys(changed(section, field, value))
+    assert tuple(before) == STAGES
+    different = [stage for stage in STAGES if before[stage] != after[stage]]
+    assert different == list(STAGES[STAGES.index(first) :])
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value"),
+    [("sim", "workers", 3), ("train", "log_every", 7), ("tokenizer_train", "checkpoint_every", 9)],
+)
+def test_how_a_run_is_carried_out_changes_no_key(section: str, field: str, value: Any) -> None:
+    assert keys(changed(section, field, value)) == keys(DEBUG)
+
+
+def test_every_stages_key_is_its_own() -> None:
+    assert len(set(keys(DEBUG).values())) == len(STAGES)
+
+
+def test_a_stage_is_finished_when_its_work_and_its_output_are_there(tmp_path: Path) -> None:
+    run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
+    for stage in STAGES:
+        assert not run.finished(stage)
+        make(run, stage)
+        assert run.finished(stage)
+        run.output(stage).unlink()
+        assert not run.finished(stage), "its output was deleted"
+    make(run, "evaluation")
+    assert not Run(changed("sample", "steps", 3), run.directory, run.data_directory).finished("evaluation")
+
+
+def test_an_interrupted_stage_is_not_finished_and_its_seconds_add_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
+    run = Run(DEBUG, tmp_path, tmp_path)
+    run.output("tokenizer").mkdir(parents=True)
+
+    def interrupted() -> None:
+        with run.stage("tokenizer"):
+            assert run.mark("tokenizer") == {"key": run.keys()["tokenizer"], "finished": False, "seconds": 0.0}
+            clock[0] = 5.0
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not run.finished("tokenizer")
+    assert run.mark("tokenizer")["seconds"] == 5.0
+    with run.stage("tokenizer"):
+        clock[0] = 7.0
+    assert run.finished("tokenizer")
+    assert run.mark("tokenizer")["seconds"] == 7.0
+    with Run(changed("tokenizer", "channels", 32), tmp_path, tmp_path).stage("tokenizer"):
+        clock[0] = 8.0
+    assert run.mark("tokenizer")["seconds"] == 1.0, "another configuration's seconds do not count"
+
+
+def test_another_configurations_training_is_refused_by_name_and_nothing_changes(tmp_path: Path) -> None:
+    run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    make(run, *STAGES)
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    other = Run(changed("model", "width", 64), run.directory, run.data_directory)
+    with pytest.raises(
+        RunError, match=r"a world model of another .* \(model.width is 32 there, 64 here\); .*--overwri"
+    ):
+        other.prepare(overwrite=False)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value", "removed"),
+    [
+        ("model", "width", 64, ["world_model"]),
+        ("tokenizer", "channels", 32, list(TRAINED)),
+        ("sample", "steps", 3, []),
+    ],
+)
+def test_overwrite_removes_the_trained_stages_that_differ_and_no_more(
+    tmp_path: Path, section: str, field: str, value: Any, removed: list[str]
+) -> None:
+    run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    make(run, *STAGES)
+    other = Run(changed(section, field, value), run.directory, run.data_directory)
+    other.prepare(overwrite=True)
+    assert [stage for stage in STAGES if not (run.directory / stage).exists()] == removed
+    assert json.loads((run.directory / "config.json").read_text())[section][field] == value
+
+
+def test_a_mark_of_older_code_is_refused_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Run(DEBUG, tmp_path, tmp_path)
+    run.prepare(overwrite=False)
+    make(run, "tokenizer")
+    monkeypatch.setattr(module, "RECIPE", module.RECIPE + 1)
+    with pytest.raises(RunError, match="older code"):
+        run.prepare(overwrite=False)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(RunError, match="config.json is missing or damaged"):
+        run.prepare(overwrite=False)

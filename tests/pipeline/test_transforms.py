@@ -1,0 +1,74 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from rsjax.data.store import Record, encode_clip
+from rsjax.pipeline import transforms
+from rsjax.tokenizer.depth_color import depth_to_color
+from tests.pipeline import toy
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return encode_clip(toy.clip(0))
+
+
+def draws(record: Record, depth_share: float, count: int = 4, seeds: int = 50) -> Iterator[np.ndarray]:
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        arrays = transforms.tokenizer_images(record, rng, count=count, depth_share=depth_share, scale="inverse")
+        yield arrays["images"]
+
+
+def which(image: np.ndarray, images: np.ndarray) -> int | None:
+    """The place of an image among others."""
+    found = np.flatnonzero((images == image).all((1, 2, 3)))
+    return int(found[0]) if len(found) else None
+
+
+@pytest.mark.parametrize(("share", "low", "high"), [(0.0, 0, 0), (0.25, 30, 70), (1.0, 200, 200)])
+def test_images_are_different_frames_of_which_a_share_is_depth(
+    record: Record, share: float, low: int, high: int
+) -> None:
+    colors = depth_to_color(record["depth"], *toy.DEPTH_RANGE, "inverse").astype(np.uint8)
+    depths = 0
+    for images in draws(record, share):
+        assert images.dtype == np.uint8
+        assert images.shape == (4, 64, 64, 3)
+        as_rgb, as_depth = ([which(image, frames) for image in images] for frames in (record["rgb"], colors))
+        chosen = [rgb if rgb is not None else depth for rgb, depth in zip(as_rgb, as_depth, strict=True)]
+        assert None not in chosen
+        assert len(set(chosen)) == 4, "a frame twice, though there are enough"
+        depths += sum(place is not None for place in as_depth)
+    assert low <= depths <= high
+
+
+def test_a_short_clip_gives_frames_twice(record: Record) -> None:
+    images = next(draws(record, 0.0, count=10))
+    assert {which(image, record["rgb"]) for image in images} <= set(range(6))
+
+
+def test_the_generator_alone_decides_and_the_record_stays_as_it_is(record: Record) -> None:
+    before = {name: np.copy(record[name]) for name in ("rgb", "depth")}
+    one, other = (np.stack(list(draws(record, 0.5, seeds=5))) for _ in range(2))
+    np.testing.assert_array_equal(one, other)
+    assert not np.array_equal(one[0], one[1])
+    for name, array in before.items():
+        np.testing.assert_array_equal(record[name], array)
+
+
+def test_images_of_several_clips_are_one_batch() -> None:
+    images = np.arange(2 * 3 * 4 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 4, 3)
+    batch = transforms.image_batch({"images": images})
+    np.testing.assert_array_equal(batch, np.concatenate([images[0], images[1]]))
+
+
+def test_a_token_batch_counts_every_clip_and_numbers_them(record: Record) -> None:
+    grid = np.zeros((6, 8, 8), np.int32)
+    arrays = transforms.token_clip(record | {"rgb": grid, "depth": grid + 1}, np.random.default_rng(0))
+    batch = transforms.token_batch({name: np.stack([array] * 3) for name, array in arrays.items()})
+    assert batch.weight.tolist() == [1, 1, 1]
+    assert batch.index.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(batch.depth, np.ones((3, 6, 8, 8)))
+    np.testing.assert_array_equal(batch.tracks[1], record["tracks"])

@@ -1,0 +1,122 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax import presets
+from rsjax.config import to_dict
+from rsjax.errors import UserError
+from rsjax.model.world_model import WorldModel
+from rsjax.sample import generator as module
+from rsjax.sample.generator import Codec, Generator, Units, load_config
+from rsjax.sample.rollout import rollout
+from rsjax.tokenizer.depth_color import depth_to_color
+from rsjax.tokenizer.magvit2 import Tokenizer
+
+CONFIG = presets.debug()
+WIDTH = CONFIG.sim.action_dim
+UNITS = Units(tuple(np.linspace(-1, 1, WIDTH)), (0.0, *np.linspace(0.1, 2, WIDTH - 1)), (0.4, 3.0))
+
+
+@pytest.fixture(scope="module")
+def codec() -> Codec:
+    return Codec(CONFIG, jax.jit(Tokenizer(CONFIG.tokenizer).init_params)(jax.random.key(0)), UNITS)
+
+
+@given(seed=st.integers(0, 99), frames=st.integers(2, 6), clips=st.integers(1, 3))
+def test_action_inputs_are_undone_by_mean_and_deviation_and_begin_with_zeros(
+    seed: int, frames: int, clips: int
+) -> None:
+    actions = np.random.default_rng(seed).normal(size=(clips, frames, WIDTH)).astype(np.float32)
+    before = actions.copy()
+    inputs = UNITS.action_inputs(actions, integrate=False)
+    assert inputs.dtype == np.float32
+    assert not inputs[:, 0].any()
+    # The first dimension has no deviation: it is divided by 0.001, not by 0.
+    back = inputs[:, 1:] * np.array([1e-3, *UNITS.action_std[1:]]) + UNITS.action_mean
+    np.testing.assert_allclose(back, actions[:, 1:], atol=1e-5)
+    np.testing.assert_array_equal(actions, before)
+    assert UNITS.action_inputs(actions[0], integrate=False).tolist() == inputs[0].tolist()
+
+
+def test_integrated_actions_follow_the_plain_ones_and_their_differences_are_these() -> None:
+    actions = np.random.default_rng(0).normal(size=(2, 5, WIDTH)).astype(np.float32)
+    plain, both = (UNITS.action_inputs(actions, integrate=value) for value in (False, True))
+    np.testing.assert_array_equal(both[..., :WIDTH], plain)
+    np.testing.assert_allclose(np.diff(both[..., WIDTH:], axis=-2) * 4, plain[:, 1:], rtol=1e-3, atol=1e-3)
+    assert not both[:, 0].any()
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7])
+def test_chunks_of_any_size_give_the_same(codec: Codec, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (2, 3, 64, 64, 3), np.uint8)
+    tokens = rng.integers(0, 256, (2, 3, 8, 8), np.int32)
+    apply = jax.jit(Tokenizer(CONFIG.tokenizer).apply, static_argnames="method")
+    whole = apply({"params": codec.params}, frames.reshape(6, 64, 64, 3), method="encode")
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    np.testing.assert_array_equal(codec.encode_rgb(frames), np.reshape(whole, (2, 3, 8, 8)))
+    decoded = apply({"params": codec.params}, tokens.reshape(6, 8, 8), method="decode")
+    plain = np.round(np.reshape(decoded, frames.shape)).astype(np.uint8)
+    got = codec.decode_rgb(tokens)
+    assert got.dtype == np.uint8
+    assert np.abs(got.astype(int) - plain).max() <= 1  # at a half, rounding follows float32's last bit
+
+
+def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = np.random.default_rng(0).uniform(*UNITS.depth_range, (2, 3, 64, 64)).astype(np.float32)
+    colors = depth_to_color(depth, *UNITS.depth_range, "inverse").astype(np.uint8)
+    tokens = codec.encode_depth(depth)
+    np.testing.assert_array_equal(tokens, codec.encode_rgb(colors))
+    # With a tokenizer that keeps everything, metres are right to half of one of the map's 766 levels.
+    monkeypatch.setattr(module, "_decode", lambda config, params, tokens: np.resize(colors, (len(tokens), 64, 64, 3)))
+    metres = codec.decode_depth(tokens)
+    assert metres.shape == depth.shape
+    level = (1 / UNITS.depth_range[0] - 1 / UNITS.depth_range[1]) / 765
+    assert np.abs(1 / metres - 1 / depth).max() <= 0.51 * level
+
+
+@pytest.mark.parametrize("depth_branch", [True, False])
+def test_generate_is_a_rollout_decoded(codec: Codec, depth_branch: bool) -> None:
+    model = replace(CONFIG.model, depth=depth_branch)
+    params = jax.jit(WorldModel(model).init_params)(jax.random.key(1))
+    generator = Generator(replace(CONFIG, model=model), codec, params)
+    rng = np.random.default_rng(0)
+    prompt = {name: rng.integers(0, 256, (2, 1, 8, 8), np.int32) for name in ("rgb", "depth")}
+    actions = rng.normal(size=(2, 4, WIDTH)).astype(np.float32)
+    made = generator.generate(prompt, actions, CONFIG.sample)
+    given = {name: grid for name, grid in prompt.items() if name == "rgb" or depth_branch}
+    inputs = UNITS.action_inputs(actions, integrate=False)
+    tokens = rollout(model, CONFIG.sample, params, given, inputs, jax.random.key(CONFIG.sample.seed))
+    assert made.tokens.keys() == given.keys()
+    np.testing.assert_array_equal(made.tokens["rgb"], tokens["rgb"])
+    np.testing.assert_array_equal(made.rgb, codec.decode_rgb(np.asarray(tokens["rgb"])))
+    if depth_branch:
+        np.testing.assert_array_equal(made.depth, codec.decode_depth(np.asarray(tokens["depth"])))
+        assert generator.generate(prompt, actions, CONFIG.sample, depth=False).depth is None
+    else:
+        assert made.depth is None
+    unread = actions.copy()
+    unread[:, 0] = 9.0
+    np.testing.assert_array_equal(generator.generate(prompt, unread, CONFIG.sample).rgb, made.rgb)
+
+
+def test_a_runs_configuration_comes_back_or_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is not a run directory"):
+        load_config(tmp_path)
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(to_dict(CONFIG)))
+    assert load_config(tmp_path) == CONFIG
+    for text, words in (
+        (path.read_text()[:-5], "config.json: not a configuration"),
+        (json.dumps(to_dict(CONFIG) | {"colour": 1}), "Config has no field colour"),
+        ("{}", "config.json: not a configuration"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=words):
+            load_config(tmp_path)
