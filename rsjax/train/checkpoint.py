@@ -123,7 +123,7 @@ def _check_shapes(path: Path, like: Any) -> None:
 
 
 def _flat_shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    leaves = ocp.tree.to_flat_dict(ocp.tree.serialize_tree(tree))
+    leaves = ocp.tree.to_flat_dict(ocp.tree.serialize_tree(tree, keep_empty_nodes=True))
     return {".".join(map(str, path)): tuple(leaf.shape) for path, leaf in leaves.items() if hasattr(leaf, "shape")}
 
 
