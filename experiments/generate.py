@@ -21,8 +21,8 @@ class Options:
     """Where the run's data set is kept."""
     split: Literal["test", "train"] = "test"
     """Which clips the first frames come from."""
-    clips: tuple[int, ...] = (0, 1, 2, 3)
-    """Their numbers within the split."""
+    clips: tuple[int, ...] = ()
+    """Their numbers within the split; the first four if none is named."""
     actions_from: int | None = None
     """Generate under this clip's actions instead of each clip's own."""
     actions: Path | None = None

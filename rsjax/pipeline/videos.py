@@ -24,7 +24,7 @@ class Request:
 
     Attributes:
         split: of the run's data set.
-        clips: numbers within the split, whose first frames are given.
+        clips: numbers within the split, whose first frames are given; none: the first four.
         actions_from: a clip of the same split whose actions drive them all; None: each clip's own.
         actions: a .npy file of actions that drive them all, (T, A) in the data's units.
         sample: fields of :class:`rsjax.config.SampleConfig` in which decoding differs from the run's own.
@@ -53,7 +53,8 @@ def write_videos(
     generator = Generator.load(run)
     sample = dataclasses.replace(generator.config.sample, **request.sample)
     source = open_store(Run(generator.config, run, data).clips).source(request.split)
-    for flag, numbers in (("--clips", request.clips), ("--actions-from", (request.actions_from or 0,))):
+    clips = request.clips or tuple(range(min(4, len(source))))
+    for flag, numbers in (("--clips", clips), ("--actions-from", (request.actions_from or 0,))):
         for number in numbers:
             if not 0 <= number < len(source):
                 last = len(source) - 1
@@ -61,12 +62,12 @@ def write_videos(
     if not fps > 0 or scale < 1:
         raise UserError(f"--fps is {fps} and --scale is {scale}; both must be positive")
     foreign = _foreign_actions(request, source, generator.config)
-    for number in request.clips:
+    for number in clips:
         clip = source[number]
         actions = clip["actions"] if foreign is None else foreign
         made = _generate(generator, clip, actions, sample)
         frames = _side_by_side(clip, made, number) if foreign is None else made.rgb[0]
-        path = out / f"{request.split}_{number:03d}.{kind}"
+        path = out / f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}.{kind}"
         (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, 1 if foreign is None else scale)
         yield path
 

@@ -52,11 +52,11 @@ def test_under_other_actions_the_prediction_alone(debug: Path, command: Commands
     actions = np.random.default_rng(0).normal(size=(4, 28)).astype(np.float32)
     np.save(tmp_path / "actions.npy", actions)
     short = generate(command, debug, tmp_path / "file", "--clips", 0, "--actions", tmp_path / "actions.npy")
-    assert short["test_000.mp4"].shape == (4, 256, 256, 3)
+    assert short["test_000_other_actions.mp4"].shape == (4, 256, 256, 3)
     taken = generate(
         command, debug, tmp_path / "clip", "--split", "train", "--clips", 2, "--actions-from", 1, "--scale", 2
     )
-    assert taken["train_002.mp4"].shape == (FRAMES, 128, 128, 3)
+    assert taken["train_002_other_actions.mp4"].shape == (FRAMES, 128, 128, 3)
 
 
 def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
