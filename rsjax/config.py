@@ -220,9 +220,6 @@ class MaskConfig:
     corruption_probability: float = 0.5  # step 2 happens to this share of the batches
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
     corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
-    # Standard deviation of noise on what the action encoder sees in training. Few clips are told apart, and learned by
-    # heart, by the noise in their actions; this hides it. Not in the paper, which has millions of clips.
-    action_noise: float = 0.0
 
     def __post_init__(self) -> None:
         _require(self.prompt_frames >= 1, f"mask.prompt_frames is {self.prompt_frames}; at least 1 frame is given")

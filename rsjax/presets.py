@@ -8,7 +8,6 @@ from rsjax.config import (
     EvalConfig,
     LoopConfig,
     LossConfig,
-    MaskConfig,
     ModelConfig,
     OptimizerConfig,
     SimConfig,
@@ -77,12 +76,10 @@ def tiny() -> Config:
             position_std=0.5,
             compute_dtype="bfloat16",
         ),
-        # 180 clips are soon known by heart: noise on the actions and weight decay are there against that.
-        mask=MaskConfig(action_noise=0.25),
         train=LoopConfig(
-            steps=1500,
+            steps=1900,
             batch_size=4,
-            optimizer=OptimizerConfig(kind="muon", learning_rate=2e-3, final_share=0.02, weight_decay=0.3),
+            optimizer=OptimizerConfig(kind="muon", learning_rate=2e-3, final_share=0.02),
             ema=0.995,
             checkpoint_every=400,
         ),

@@ -116,11 +116,10 @@ def train_world_model(run: Run, resume: bool) -> None:
     """Stage 4."""
     cfg, train = run.config, run.config.train
     source = open_store(run.output("tokens")).source("train")
-    transform = partial(transforms.token_clip, action_noise=cfg.mask.action_noise)
     state = fit(
         WorldModelObjective.create(cfg),
         train,
-        lambda data: loader.batches(source, transform, train.batch_size, train.seed, state=data),
+        lambda data: loader.batches(source, transforms.token_clip, train.batch_size, train.seed, state=data),
         run.directory / "world_model",
         name="world model",
         to_batch=transforms.token_batch,

@@ -31,12 +31,9 @@ def image_batch(arrays: Arrays) -> np.ndarray:
     return images.reshape(-1, *images.shape[2:])
 
 
-def token_clip(record: Record, rng: np.random.Generator, *, action_noise: float = 0.0) -> Arrays:
-    """The arrays of a token record that a training step reads, the actions with Gaussian noise (but for row 0)."""
-    clip = {name: record[name] for name in ("rgb", "depth", "actions", "tracks", "visible")}
-    noise = action_noise * rng.standard_normal(clip["actions"].shape, np.float32)
-    noise[0] = 0.0
-    return clip | {"actions": clip["actions"] + noise}
+def token_clip(record: Record, rng: np.random.Generator) -> Arrays:
+    """The arrays of a token record that a training step reads."""
+    return {name: record[name] for name in ("rgb", "depth", "actions", "tracks", "visible")}
 
 
 def token_batch(arrays: Arrays) -> Batch:

@@ -72,16 +72,3 @@ def test_a_token_batch_counts_every_clip_and_numbers_them(record: Record) -> Non
     assert batch.index.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(batch.depth, np.ones((3, 6, 8, 8)))
     np.testing.assert_array_equal(batch.tracks[1], record["tracks"])
-
-
-def test_noise_lies_on_the_actions_alone_and_the_first_row_stays_zero(record: Record) -> None:
-    grid = np.zeros((6, 8, 8), np.int32)
-    record = record | {"rgb": grid, "depth": grid, "actions": np.zeros((6, 500), np.float32)}
-    clip = transforms.token_clip(record, np.random.default_rng(0), action_noise=0.25)
-    assert not clip["actions"][0].any()
-    assert clip["actions"].dtype == np.float32
-    np.testing.assert_allclose(clip["actions"][1:].std(), 0.25, rtol=0.05)
-    again = transforms.token_clip(record, np.random.default_rng(0), action_noise=0.25)
-    np.testing.assert_array_equal(clip["actions"], again["actions"])
-    for name in ("rgb", "depth", "tracks", "visible"):
-        np.testing.assert_array_equal(clip[name], record[name])
