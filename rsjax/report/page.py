@@ -24,9 +24,11 @@ _COLUMNS = (
     ("depth_absrel", "depth AbsRel ↓", 4),
     ("depth_delta1", "depth δ₁ ↑", 3),
     ("depth_delta2", "depth δ₂ ↑", 3),
+    ("delta_psnr", "ΔPSNR, another clip's actions, dB ↑", 2),
+    ("delta_psnr_uniform", "ΔPSNR, uniform actions, dB ↑", 2),
 )
 _DELTA_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
-_DELTA_COLUMNS = (("", "mean over predicted frames, dB", 2), ("_t4", "Δ₄, dB", 2))
+_DELTA_COLUMNS = (("_t4", "Δ₄, dB", 2),)
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def _cell(metrics: Mapping[str, float], key: str, digits: int) -> dict[str, str]
     bounds = [metrics.get(f"{key}_{side}") for side in ("low", "high")]
     value = metrics.get(key)
     interval = "" if None in bounds else " – ".join(f"{bound:.{digits}f}" for bound in bounds)
-    return {"value": "" if value is None else f"{value:.{digits}f}", "interval": interval}
+    return {"value": "–" if value is None else f"{value:.{digits}f}", "interval": interval}
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:
