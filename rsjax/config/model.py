@@ -1,0 +1,87 @@
+"""Settings of the world model, its masked training and its objective."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rsjax.config.fields import require
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The dual-branch spatial-temporal transformer (paper §2.3)."""
+
+    frames: int = 16
+    grid: int = 16
+    code_bits: int = 18
+    vocabularies: int = 2
+    action_dim: int = 28  # of what the action encoder sees
+    # The encoder also sees the sum of all actions so far (action_dim doubles). Where actions are pose deltas, that is
+    # the pose: a large model finds it by temporal attention, a small one on few steps need not. Not in the paper.
+    integrate_actions: bool = False
+    width: int = 256
+    blocks: int = 32
+    heads: int = 8
+    mlp_ratio: int = 4
+    depth: bool = True  # False: the second branch and the projections do not exist at all
+    # The public Genie normalises before spatial attention and the MLP, not before temporal attention and
+    # not at the end; small models on few steps learn faster with both.
+    temporal_norm: bool = False
+    final_norm: bool = False
+    embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 is torch's default and so the public code's
+    position_std: float = 0.0  # position and mask embeddings likewise; the public code starts them at zero
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+
+    def __post_init__(self) -> None:
+        require(
+            self.width % self.heads == 0,
+            f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
+        )
+        require(
+            self.code_bits % self.vocabularies == 0,
+            f"model.code_bits {self.code_bits} does not divide into {self.vocabularies} vocabularies; "
+            f"make it a multiple of model.vocabularies",
+        )
+
+    @property
+    def vocabulary_size(self) -> int:
+        """Codes per factorised vocabulary: 2^(D/n)."""
+        return 2 ** (self.code_bits // self.vocabularies)
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Masked training with corruption, after the public Genie (reference: 1xgpt).
+
+    Rates are probabilities; see :mod:`rsjax.objective.masking` for the recipe's three steps.
+    """
+
+    prompt_frames: int = 1  # frames given at generation; the paper gives one
+    random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
+    corruption_probability: float = 0.5  # step 2 happens to this share of the batches
+    corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
+    corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+
+    def __post_init__(self) -> None:
+        require(self.prompt_frames >= 1, f"mask.prompt_frames is {self.prompt_frames}; at least 1 frame is given")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Eq. 8: L = rgb·L_RGB + λ₁·L_Depth + λ₂·L_Keypoint + λ₃·L_Attention. Field names are term names."""
+
+    rgb: float = 1.0
+    depth: float = 1.0  # λ₁
+    keypoint: float = 0.01  # λ₂
+    attention: float = 1.0  # λ₃
+    gamma: float = 5.0  # γ of Eq. 6
+    keypoints: bool = True  # False: neither the keypoint nor the attention term exists
+    num_keypoints: int = 32  # K of the top-K; the paper does not give its K
+
+    def terms(self, depth_branch: bool) -> dict[str, float]:
+        """The weights of the terms that are on, by term name."""
+        weights = {"rgb": self.rgb}
+        if depth_branch:
+            weights["depth"] = self.depth
+        if self.keypoints:
+            weights |= {"keypoint": self.keypoint, "attention": self.attention}
+        return weights

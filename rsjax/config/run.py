@@ -1,0 +1,89 @@
+"""Settings of sampling and evaluation, and the whole of a run."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rsjax.config.fields import require
+from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
+from rsjax.config.sim import SimConfig
+from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
+from rsjax.config.train import LoopConfig
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """MaskGIT decoding within a frame."""
+
+    steps: int = 2
+    temperature: float = 0.0  # logits are divided by it; 0 takes the most probable code
+    unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the frame before
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 1, f"sample.steps is {self.steps}; a frame needs at least 1 decoding step")
+        require(self.temperature >= 0, f"sample.temperature is {self.temperature}; it cannot be negative")
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Evaluation on held-out clips."""
+
+    clips: int = 20
+    batch_size: int = 10
+    action_draws: int = 3  # random action sequences per clip and kind, for ΔPSNR
+    report_clips: int = 4  # clips shown in the report
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "action_draws", "report_clips"):
+            require(getattr(self, name) > 0, f"eval.{name} is {getattr(self, name)}; it must be positive")
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run. Built from a preset; never changed while it runs."""
+
+    name: str
+    sim: SimConfig = SimConfig()
+    tokenizer: TokenizerConfig = TokenizerConfig()
+    tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
+    model: ModelConfig = ModelConfig()
+    mask: MaskConfig = MaskConfig()
+    loss: LossConfig = LossConfig()
+    train: LoopConfig = LoopConfig()
+    sample: SampleConfig = SampleConfig()
+    eval: EvalConfig = EvalConfig()
+
+    def __post_init__(self) -> None:
+        require(
+            self.sim.frames <= self.model.frames,
+            f"sim.frames is {self.sim.frames} but model.frames holds positions for {self.model.frames}; "
+            f"shorten the clips or enlarge model.frames",
+        )
+        require(
+            self.mask.prompt_frames < self.sim.frames,
+            f"mask.prompt_frames is {self.mask.prompt_frames} of {self.sim.frames} frames; "
+            f"at least one frame must be left to predict",
+        )
+        require(
+            min(self.eval.clips, self.sim.test_episodes) >= 2,
+            f"eval.clips is {self.eval.clips} of sim.test_episodes {self.sim.test_episodes}; both must be at least 2, "
+            f"so that a clip can be generated under another one's actions",
+        )
+        pairs = (
+            ("sim.image_size", self.sim.image_size, "tokenizer.image_size", self.tokenizer.image_size),
+            ("tokenizer grid", self.tokenizer.grid, "model.grid", self.model.grid),
+            ("tokenizer.code_bits", self.tokenizer.code_bits, "model.code_bits", self.model.code_bits),
+            ("tokenizer.vocabularies", self.tokenizer.vocabularies, "model.vocabularies", self.model.vocabularies),
+            ("what the action encoder sees", self.action_inputs, "model.action_dim", self.model.action_dim),
+        )
+        for left, left_value, right, right_value in pairs:
+            require(left_value == right_value, f"{left} is {left_value} but {right} is {right_value}; make them equal")
+        require(
+            not self.loss.keypoints or self.loss.num_keypoints <= self.sim.tracks,
+            f"loss.num_keypoints is {self.loss.num_keypoints} but only sim.tracks = {self.sim.tracks} are tracked",
+        )
+
+    @property
+    def action_inputs(self) -> int:
+        """Width of what the action encoder sees: 7 × control_steps, and as much again for their sums if given."""
+        return self.sim.action_dim * (2 if self.model.integrate_actions else 1)

@@ -1,0 +1,35 @@
+"""Settings of the simulator's episodes."""
+
+from dataclasses import dataclass
+
+from rsjax.config.fields import require, runtime
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """Lift episodes collected in the simulator (:mod:`rsjax.sim`)."""
+
+    episodes: int = 200
+    test_episodes: int = 20  # the last ones of the collection, never seen in training
+    frames: int = 16
+    control_steps: int = 4  # 20 Hz control steps between frames; a frame's action is their concatenation
+    image_size: int = 64
+    camera: str = "agentview"
+    tracks: int = 256  # N₀: dense keypoint tracks per clip
+    seed: int = 0
+    workers: int = runtime(0)  # 0: one process per core
+
+    def __post_init__(self) -> None:
+        require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")
+        require(
+            0 < self.test_episodes < self.episodes,
+            f"sim.test_episodes is {self.test_episodes}; it must lie between 1 and sim.episodes - 1 "
+            f"({self.episodes - 1}), so that both splits have clips",
+        )
+        for name in ("control_steps", "image_size", "tracks"):
+            require(getattr(self, name) > 0, f"sim.{name} is {getattr(self, name)}; it must be positive")
+
+    @property
+    def action_dim(self) -> int:
+        """Width of one frame's action: ``control_steps`` controls of 7 (6-D pose delta, gripper)."""
+        return 7 * self.control_steps
