@@ -1,13 +1,14 @@
 """Videos from a trained run. ``python -m experiments.generate runs/tiny --clips 0 3 --format gif``"""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
 from experiments.cli import main_errors, parse_options
+from rsjax.config import SampleConfig
 from rsjax.runtime import tune_process
 
 
@@ -27,6 +28,8 @@ class Options:
     """Generate under this clip's actions instead of each clip's own."""
     actions: Path | None = None
     """Generate under the actions in this .npy file, float (T, A), in the data's units; row t leads into frame t."""
+    frames: int | None = None
+    """How many frames to show, also more than the model was trained on; actions that end before begin again."""
     out: Path | None = None
     """Where to write; RUN/generated if not given."""
     format: Literal["mp4", "gif"] = "mp4"
@@ -36,11 +39,19 @@ class Options:
     scale: int = 4
     """Pixels per pixel, where prediction alone is shown."""
     steps: int | None = None
-    """Decoding steps a frame; the run's own if not given, as with the next three."""
+    """Decoding steps a frame; the run's own if not given, as with all that follow."""
     temperature: float | None = None
     """Logits are divided by it; 0 takes the most probable code."""
     unmask: Literal["random", "greedy"] | None = None
     """Which cells are decided first: at random, or those most sure."""
+    top_k: int | None = None
+    """Draw among each vocabulary's this many most probable codes; 0: among all."""
+    guidance: float | None = None
+    """How strongly actions guide; 1: as trained, others need a model trained with model.action_dropout."""
+    window_stride: int | None = None
+    """Frames that leave a full window at once (learned positions); 0: half of it."""
+    cache_dtype: Literal["float32", "bfloat16"] | None = None
+    """Of what is remembered from frame to frame."""
     seed: int | None = None
     """Of the draws."""
 
@@ -52,9 +63,9 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.generate", Options.__doc__ or "", Options())
     from rsjax.pipeline.videos import Request, write_videos
 
-    decoding = {name: getattr(options, name) for name in ("steps", "temperature", "unmask", "seed")}
+    decoding = {field.name: getattr(options, field.name) for field in fields(SampleConfig)}
     sample = {name: value for name, value in decoding.items() if value is not None}
-    request = Request(options.split, options.clips, options.actions_from, options.actions, sample)
+    request = Request(options.split, options.clips, options.actions_from, options.actions, options.frames, sample)
     out = options.out or options.run / "generated"
     for path in write_videos(options.run, options.data_dir, request, out, options.format, options.fps, options.scale):
         print(path)

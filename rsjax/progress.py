@@ -19,6 +19,11 @@ def stage(number: int, of: int, name: str, note: str, console: Console | None = 
     _say(console or Console(), f"[{number}/{of}] {name}: {note}")
 
 
+def note(line: str, console: Console | None = None) -> None:
+    """Prints a line that a stage has to say once, such as that a part of it is off."""
+    _say(console or Console(), f"  note: {line}")
+
+
 def duration(seconds: float) -> str:
     """Seconds in words: ``42 s``, ``3 min 05 s``, ``2 h 07 min``."""
     whole = round(seconds)

@@ -96,9 +96,15 @@ def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> No
         ("tokenizer", {"image_size": 65}, "not divisible by the downsampling 8"),
         ("tokenizer", {"code_bits": 9}, "tokenizer.code_bits 9 does not divide into 2"),
         ("tokenizer", {"norm_groups": 5}, "tokenizer.norm_groups 5"),
+        ("tokenizer", {"image_size": 8, "adaptive_norm": True}, "needs a grid of more than one cell"),
+        ("tokenizer_train", {"adversarial": -0.1}, "tokenizer_train.adversarial is -0.1"),
         ("tokenizer", {"patch_size": 8}, "tokenizer grid is 4 but model.grid is 8"),
         ("tokenizer", {"code_bits": 10}, "tokenizer.code_bits is 10 but model.code_bits is 8"),
         ("model", {"heads": 3}, "model.width 32 is not divisible by model.heads 3"),
+        ("model", {"action_dim": -1}, "model.action_dim is -1"),
+        ("model", {"action_dim": 0, "integrate_actions": True}, "model.action_dim is 0"),
+        ("model", {"action_dim": 0, "action_dropout": 0.1}, "model.action_dim is 0"),
+        ("model", {"action_dropout": 1.0}, "model.action_dropout is 1.0"),
         ("model", {"vocabularies": 1}, "tokenizer.vocabularies is 2 but model.vocabularies is 1"),
         ("mask", {"prompt_frames": 0}, "mask.prompt_frames is 0"),
         ("mask", {"prompt_frames": 6}, "mask.prompt_frames is 6 of 6 frames"),
@@ -114,6 +120,11 @@ def test_what_cannot_run_is_refused_by_name(section: str, changes: dict[str, Any
         dataclasses.replace(BASE, **{section: dataclasses.replace(getattr(BASE, section), **changes)})
     assert names in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_model_without_actions_fits_any_data() -> None:
+    model = dataclasses.replace(BASE.model, action_dim=0)
+    assert dataclasses.replace(BASE, model=model).model.action_dim == 0
 
 
 def test_more_keypoints_than_tracks_are_fine_when_keypoints_are_off() -> None:

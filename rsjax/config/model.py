@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import require
+from rsjax.config.fields import require, runtime
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class ModelConfig:
     grid: int = 16
     code_bits: int = 18
     vocabularies: int = 2
-    action_dim: int = 28  # of what the action encoder sees
+    action_dim: int = 28  # of what the action encoder sees; 0: there is no encoder, actions are not read (Genie)
     # The encoder also sees the sum of all actions so far (action_dim doubles). Where actions are pose deltas, that is
     # the pose: a large model finds it by temporal attention, a small one on few steps need not. Not in the paper.
     integrate_actions: bool = False
@@ -22,14 +22,26 @@ class ModelConfig:
     blocks: int = 32
     heads: int = 8
     mlp_ratio: int = 4
+    # Training shows a learned null action in place of all of this share of the clips' own, so that sampling can guide
+    # (classifier-free). Not in the paper.
+    action_dropout: float = 0.0
+    # rotary: time enters by turning temporal queries and keys, positions within a frame stay learned. Then a rollout
+    # rolls on beyond ``frames``, which is how far a frame looks back. The public code learns all positions.
+    positions: Literal["learned", "rotary"] = "learned"
     depth: bool = True  # False: the second branch and the projections do not exist at all
     # The public Genie normalises before spatial attention and the MLP, not before temporal attention and
     # not at the end; small models on few steps learn faster with both.
     temporal_norm: bool = False
     final_norm: bool = False
+    # Options of the public code that its published weights may have been trained with. qk_norm: queries and keys are
+    # normalised per head, by one LayerNorm for both; the norms before spatial attention and the MLP then do not exist.
+    qk_norm: bool = False
+    mup: bool = False  # attention scale 8/head width instead of its root; the heads' input ÷ (width/256)
     embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 is torch's default and so the public code's
     position_std: float = 0.0  # position and mask embeddings likewise; the public code starts them at zero
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    unroll: int = runtime(1)  # blocks per turn of the scan over them: more are faster on a CPU, and compile longer
+    remat: bool = runtime(False)  # recompute each block in the backward pass instead of keeping its activations
 
     def __post_init__(self) -> None:
         require(
@@ -41,6 +53,27 @@ class ModelConfig:
             f"model.code_bits {self.code_bits} does not divide into {self.vocabularies} vocabularies; "
             f"make it a multiple of model.vocabularies",
         )
+        require(
+            self.positions == "learned" or self.head_width % 2 == 0,
+            f"model.positions is 'rotary', which turns pairs of channels, but a head has {self.head_width} "
+            f"(model.width / model.heads); change one of them",
+        )
+        require(self.unroll >= 1, f"model.unroll is {self.unroll}; it must be at least 1")
+        require(self.action_dim >= 0, f"model.action_dim is {self.action_dim}; it cannot be negative")
+        require(
+            self.action_dim > 0 or not (self.integrate_actions or self.action_dropout),
+            "model.action_dim is 0, so there are no actions for model.integrate_actions or model.action_dropout; "
+            "set them to False and 0",
+        )
+        require(
+            0 <= self.action_dropout < 1,
+            f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
+        )
+
+    @property
+    def head_width(self) -> int:
+        """Channels of one attention head."""
+        return self.width // self.heads
 
     @property
     def vocabulary_size(self) -> int:

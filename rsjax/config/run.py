@@ -12,16 +12,38 @@ from rsjax.config.train import LoopConfig
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """MaskGIT decoding within a frame."""
+    """MaskGIT decoding within a frame, and what is remembered from frame to frame."""
 
     steps: int = 2
     temperature: float = 0.0  # logits are divided by it; 0 takes the most probable code
+    top_k: int = 0  # draw among each vocabulary's this many most probable codes; 0: among all
     unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the frame before
+    # g of logits = without + g·(with - without the actions). 1: the model as it is. Others need model.action_dropout
+    # and two passes in one.
+    guidance: float = 1.0
+    # Learned positions only: when model.frames are full, the first window_stride drop out and the rest are encoded anew
+    # from position 0. Fewer: a longer memory and more work. 0: half of model.frames.
+    window_stride: int = 0
+    cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
     seed: int = 0
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, f"sample.steps is {self.steps}; a frame needs at least 1 decoding step")
-        require(self.temperature >= 0, f"sample.temperature is {self.temperature}; it cannot be negative")
+        for name in ("temperature", "top_k", "window_stride"):
+            require(getattr(self, name) >= 0, f"sample.{name} is {getattr(self, name)}; it cannot be negative")
+
+    def check(self, model: ModelConfig) -> None:
+        """Raises :class:`rsjax.config.ConfigError` where ``model`` cannot be sampled like this."""
+        require(
+            self.guidance == 1 or model.action_dropout > 0,
+            f"sample.guidance is {self.guidance} but the model never saw clips without actions; "
+            f"set it to 1, or train with model.action_dropout above 0",
+        )
+        require(
+            self.window_stride < model.frames,
+            f"sample.window_stride is {self.window_stride} of model.frames = {model.frames}; "
+            f"at least one frame must stay in the window",
+        )
 
 
 @dataclass(frozen=True)
@@ -69,13 +91,17 @@ class Config:
             f"eval.clips is {self.eval.clips} of sim.test_episodes {self.sim.test_episodes}; both must be at least 2, "
             f"so that a clip can be generated under another one's actions",
         )
-        pairs = (
+        self.sample.check(self.model)
+        pairs = [
             ("sim.image_size", self.sim.image_size, "tokenizer.image_size", self.tokenizer.image_size),
             ("tokenizer grid", self.tokenizer.grid, "model.grid", self.model.grid),
             ("tokenizer.code_bits", self.tokenizer.code_bits, "model.code_bits", self.model.code_bits),
             ("tokenizer.vocabularies", self.tokenizer.vocabularies, "model.vocabularies", self.model.vocabularies),
-            ("what the action encoder sees", self.action_inputs, "model.action_dim", self.model.action_dim),
-        )
+        ]
+        if self.model.action_dim:
+            pairs.append(
+                ("what the action encoder sees", self.action_inputs, "model.action_dim", self.model.action_dim)
+            )
         for left, left_value, right, right_value in pairs:
             require(left_value == right_value, f"{left} is {left_value} but {right} is {right_value}; make them equal")
         require(

@@ -9,7 +9,7 @@ import flax.linen as nn
 from jaxtyping import Array, Float
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import Attention, Dense, KeyValues
+from rsjax.model.attention import Attention, Dense, KeyValues, layer_norm
 
 Features = Float[Array, "B T S C"]
 
@@ -17,7 +17,8 @@ Features = Float[Array, "B T S C"]
 class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
 
-    There is no norm before temporal attention unless ``config.temporal_norm``; GELU is the exact one.
+    There is no norm before temporal attention unless ``config.temporal_norm``, and neither norm1 nor norm2 with
+    ``config.qk_norm``; GELU is the exact one.
     """
 
     config: ModelConfig
@@ -26,17 +27,13 @@ class STBlock(nn.Module):
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
         cfg = self.config
         bf16 = cfg.compute_dtype == "bfloat16"
-        x = x + Attention(cfg.width, cfg.heads, bf16, name="spatial_attn").spatial(layer_norm("norm1")(x))
+        normed = lambda name, x: x if cfg.qk_norm else layer_norm(name)(x)  # noqa: E731
+        x = x + Attention(cfg, name="spatial_attn").spatial(normed("norm1", x))
         before_time = layer_norm("norm_temporal")(x) if cfg.temporal_norm else x
-        out, cache = Attention(cfg.width, cfg.heads, bf16, name="temporal_attn").temporal(before_time, start, cache)
+        out, cache = Attention(cfg, name="temporal_attn").temporal(before_time, start, cache)
         x = x + out
-        h = Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(layer_norm("norm2")(x))
+        h = Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed("norm2", x))
         return x + Dense(cfg.width, bf16, name="fc2")(nn.gelu(h, approximate=False)), cache
-
-
-def layer_norm(name: str) -> nn.LayerNorm:
-    """LayerNorm with torch's epsilon, in float32."""
-    return nn.LayerNorm(epsilon=1e-5, name=name)
 
 
 class DualBlock(nn.Module):

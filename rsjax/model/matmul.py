@@ -24,14 +24,21 @@ def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
 def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, w = saved
     cotangent = cotangent.astype(jnp.bfloat16)
-    # A plain transpose is only another layout of the same memory; flattening behind a barrier makes XLA move it.
-    x_t = jax.lax.optimization_barrier(x.T.reshape(-1)).reshape(x.T.shape)
-    return _product(cotangent, w, 1), _product(x_t, cotangent, 0)
+    if x.shape[1] <= cotangent.shape[1]:  # the narrower operand is less to move
+        return _product(cotangent, w, 1), _product(transposed_in_memory(x), cotangent, 0)
+    # Behind a barrier, or XLA turns the product around again to a form that it has no bf16 kernel for.
+    return _product(cotangent, w, 1), jax.lax.optimization_barrier(_product(transposed_in_memory(cotangent), x, 0)).T
 
 
 def _product(x: Array, w: Array, contract: int) -> Array:
     dimensions = (((1,), (contract,)), ((), ()))
     return jax.lax.dot_general(x, w, dimensions, preferred_element_type=jnp.float32)
+
+
+def transposed_in_memory(x: Float[Array, "*N K M"]) -> Float[Array, "*N M K"]:
+    """The last two axes swapped, and moved: a plain transpose is only another layout of the same memory."""
+    y = x.swapaxes(-1, -2)
+    return jax.lax.optimization_barrier(y.reshape(-1)).reshape(y.shape)
 
 
 matmul_bf16.defvjp(_forward, _backward)

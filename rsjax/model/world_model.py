@@ -14,11 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import Dense, KeyValues
-from rsjax.model.blocks import DualBlock, layer_norm
+from rsjax.model.attention import Dense, KeyValues, layer_norm
+from rsjax.model.blocks import DualBlock
 from rsjax.tokenizer import lfq
 
 Cache = dict[str, KeyValues]
+
+MUP_WIDTH = 256  # the public code's base width
 
 
 class TokenEmbed(nn.Module):
@@ -51,47 +53,69 @@ class WorldModel(nn.Module):
         self,
         tokens: dict[str, Int[Array, "B T H W"]],
         mask: Bool[Array, "B T H W"],
-        actions: Float[Array, "B T A"],
+        actions: Float[Array, "B T A"] | None,
         start: Any = 0,
         cache: Cache | None = None,
+        drop_actions: Bool[Array, " B"] | None = None,
     ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
         """Logits of every cell of frames start … start + T - 1, by branch.
 
         Args:
             tokens: by branch ("rgb", and "depth" if the model has one); read where ``mask`` is False.
             mask: True where the token is hidden, in both branches.
-            actions: row t led into frame start + t.
+            actions: row t led into frame start + t; not read where ``config.action_dim`` is 0.
             start: position of the first given frame (may be traced).
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
+            drop_actions: True for clips that see the null action instead of theirs; needs ``config.action_dropout``.
 
         Returns:
             float32 logits by branch, and the cache with these frames written in (None where none was given).
+
+        Raises:
+            ValueError: the model reads actions and none are given, or they are to be dropped and it has no null action.
         """
         cfg = self.config
+        if drop_actions is not None and not cfg.action_dropout:
+            raise ValueError("drop_actions needs a model with a null action: model.action_dropout above 0")
         b, t = mask.shape[:2]
         cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
         init = nn.initializers.normal(cfg.position_std)
-        position = self.param("pos_embed", init, (cfg.frames, cfg.grid**2, cfg.width))
-        position = jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
-        action = Dense(cfg.width, name="action_encoder")(actions)[:, :, None]
+        rotary = cfg.positions == "rotary"  # then the blocks see to time
+        position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
+        position = position if rotary else jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
+        shared = position + self._action(actions, drop_actions) if cfg.action_dim else position
         x = {
-            branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), cells(mask)) + action + position
+            branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), cells(mask)) + shared
             for branch in branches(cfg)
         }
         blocks = nn.scan(
-            DualBlock,
+            # In a scan no common subexpression can undo the recomputation, so it needs no barriers against that.
+            nn.remat(DualBlock, prevent_cse=False) if cfg.remat else DualBlock,
             variable_axes={"params": 0},
             split_rngs={"params": True},
             in_axes=(0, nn.broadcast),
             length=cfg.blocks,
+            unroll=min(cfg.unroll, cfg.blocks),
         )
         x, cache = blocks(cfg, name="blocks")(x, cache, start)
         return {branch: self._head(branch, features) for branch, features in x.items()}, cache
+
+    def _action(self, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None) -> Float[Array, "B T 1 C"]:
+        cfg = self.config
+        if actions is None:
+            raise ValueError(f"no actions given to a model that reads them (model.action_dim is {cfg.action_dim})")
+        encoded = Dense(cfg.width, name="action_encoder")(actions)
+        if cfg.action_dropout:
+            null = self.param("null_action", nn.initializers.zeros, (cfg.width,))
+            encoded = encoded if drop is None else jnp.where(drop[:, None, None], null, encoded)
+        return encoded[:, :, None]
 
     def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
         if cfg.final_norm:
             x = layer_norm(f"{branch}_norm_out")(x)
+        if cfg.mup:
+            x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
         logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{branch}_head")(x)
         return logits.reshape(*x.shape[:-1], cfg.vocabularies, cfg.vocabulary_size)
@@ -109,8 +133,8 @@ def branches(config: ModelConfig) -> tuple[str, ...]:
     return ("rgb", "depth") if config.depth else ("rgb",)
 
 
-def empty_cache(config: ModelConfig, batch: int, frames: int) -> Cache:
-    """A cache of ``frames`` positions for every block and branch: zeros, never read before they are written."""
+def empty_cache(config: ModelConfig, batch: int, frames: int, dtype: Any = jnp.float32) -> Cache:
+    """A cache of ``frames`` slots for every block and branch: zeros, never read before they are written."""
     shape = (config.blocks, batch, frames, config.grid**2, config.width)
-    zeros = jnp.zeros(shape)
+    zeros = jnp.zeros(shape, dtype)
     return {branch: KeyValues(zeros, zeros) for branch in branches(config)}

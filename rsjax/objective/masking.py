@@ -55,6 +55,17 @@ def corrupt(
     return jax.vmap(one_clip)(index, tokens)
 
 
+def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Array, " B"]:
+    """Which clips are shown the null action instead of their own: each with probability ``rate``.
+
+    Args:
+        key: the step's key, as for :func:`corrupt`.
+        index: each clip's place in the global batch.
+    """
+    key = jax.random.fold_in(key, 2)  # 0 and 1 are the halves that corrupt splits it into
+    return jax.vmap(lambda place: jax.random.bernoulli(jax.random.fold_in(key, place), rate))(index)
+
+
 def _batch_plan(config: MaskConfig, key: Array, frames: int) -> tuple[Array, Array]:
     """Per-frame probability that a sub-token is replaced (T,), and f."""
     u_key, happens_key, f_key, keep_key, decay_key = jax.random.split(key, 5)

@@ -20,7 +20,9 @@ def world_model_terms(
     """
     clean = {branch: getattr(batch, branch) for branch in branches(model)}
     given = masking.corrupt(mask, model.code_bits, model.vocabularies, key, clean, batch.index)
-    logits, _ = WorldModel(model).apply({"params": params}, given.tokens, given.mask, batch.actions)
+    drop = masking.dropped_actions(model.action_dropout, key, batch.index) if model.action_dropout else None
+    inputs = (given.tokens, given.mask, batch.actions)
+    logits, _ = WorldModel(model).apply({"params": params}, *inputs, drop_actions=drop)
     entropy = {b: losses.token_cross_entropy(logits[b], clean[b], model.code_bits) for b in clean}
 
     terms = {"rgb": losses.rgb_term(entropy["rgb"], given.mask, batch.weight)}

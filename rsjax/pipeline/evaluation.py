@@ -112,7 +112,7 @@ def _generate(generator: Generator, held: HeldOut, actions: np.ndarray, depth: b
     for start in range(0, len(actions), cfg.eval.batch_size):
         rows = np.minimum(np.arange(start, start + cfg.eval.batch_size), len(actions) - 1)
         part = {name: grid[rows] for name, grid in prompt.items()}
-        parts.append(generator.generate(part, actions[rows], cfg.sample, depth))
+        parts.append(generator.generate(part, actions[rows], cfg.sample, depth, index=rows))
     join = lambda arrays: np.concatenate([np.asarray(a) for a in arrays])[: len(actions)]  # noqa: E731
     return Generated(
         {name: join(p.tokens[name] for p in parts) for name in parts[0].tokens},

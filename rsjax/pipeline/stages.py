@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rsjax.data import loader
@@ -9,12 +10,13 @@ from rsjax.data.store import Record, disk_guard, open_store, write_store
 from rsjax.pipeline import evaluation, transforms
 from rsjax.pipeline.run import STAGES, Run
 from rsjax.pipeline.summary import write_summary
-from rsjax.progress import Progress, duration, stage
+from rsjax.progress import Progress, duration, note, stage
 from rsjax.sample.generator import Codec, Generator, Units, load_tokenizer
 from rsjax.sim.collect import collect
 from rsjax.train.checkpoint import save_weights
 from rsjax.train.loop import fit
 from rsjax.train.objectives import TokenizerObjective, WorldModelObjective
+from rsjax.train.parts import start_tokenizer, start_world_model
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
@@ -63,18 +65,24 @@ def train_tokenizer(run: Run, resume: bool) -> None:
         count=train.frames_per_clip,
         depth_share=train.depth_share,
         scale=cfg.tokenizer.depth_scale,
+        size=cfg.tokenizer.image_size,
+        flip=train.flip,
     )
+    objective = TokenizerObjective(cfg.tokenizer, train)
+    if train.lpips_missing:
+        note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
     source = open_store(run.clips).source("train")
     state = fit(
-        TokenizerObjective(cfg.tokenizer, train),
+        objective,
         train,
         lambda data: loader.batches(source, transform, train.batch_size, train.seed, state=data),
         run.directory / "tokenizer",
         name="tokenizer",
         to_batch=transforms.image_batch,
+        start=partial(start_tokenizer, cfg.tokenizer, Path(train.start_from)) if train.start_from else None,
         resume=resume,
     )
-    save_weights(run.output("tokenizer"), state.weights)
+    save_weights(run.output("tokenizer"), objective.tokenizer_params(state.weights))
 
 
 def tokenize(run: Run) -> None:
@@ -123,6 +131,7 @@ def train_world_model(run: Run, resume: bool) -> None:
         run.directory / "world_model",
         name="world model",
         to_batch=transforms.token_batch,
+        start=partial(start_world_model, cfg.model, Path(train.start_from)) if train.start_from else None,
         resume=resume,
     )
     save_weights(run.output("world_model"), state.weights)

@@ -27,6 +27,8 @@ class Request:
         clips: numbers within the split, whose first frames are given; none: the first four.
         actions_from: a clip of the same split whose actions drive them all; None: each clip's own.
         actions: a .npy file of actions that drive them all, (T, A) in the data's units.
+        frames: how many to show, the given ones among them; actions that end before begin again. None: as many as there
+            are actions.
         sample: fields of :class:`rsjax.config.SampleConfig` in which decoding differs from the run's own.
     """
 
@@ -34,6 +36,7 @@ class Request:
     clips: tuple[int, ...]
     actions_from: int | None
     actions: Path | None
+    frames: int | None
     sample: dict[str, Any]
 
 
@@ -42,7 +45,7 @@ def write_videos(
 ) -> Iterator[Path]:
     """Generates and writes a video per clip: truth and prediction side by side, with depth where the model has it.
 
-    Under foreign actions there is no truth to show, only what was generated.
+    Under foreign actions, or beyond a clip's end, there is no truth to show, only what was generated.
 
     Yields:
         Each file's path, once it is written.
@@ -61,14 +64,17 @@ def write_videos(
                 raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
     if not fps > 0 or scale < 1:
         raise UserError(f"--fps is {fps} and --scale is {scale}; both must be positive")
+    sample.check(generator.config.model)
     foreign = _foreign_actions(request, source, generator.config)
     for number in clips:
         clip = source[number]
-        actions = clip["actions"] if foreign is None else foreign
-        made = _generate(generator, clip, actions, sample)
-        frames = _side_by_side(clip, made, number) if foreign is None else made.rgb[0]
-        path = out / f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}.{kind}"
-        (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, 1 if foreign is None else scale)
+        actions = _lasting(clip["actions"] if foreign is None else foreign, request, generator.config)
+        made = _generate(generator, clip, actions, sample, number)
+        alone = foreign is not None or len(actions) > len(clip["rgb"])
+        name = f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}"
+        path = out / f"{name}{'' if request.frames is None else f'_{request.frames}_frames'}.{kind}"
+        frames = made.rgb[0] if alone else _side_by_side(clip, made, number)
+        (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, scale if alone else 1)
         yield path
 
 
@@ -81,24 +87,35 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
         actions = np.load(request.actions, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
-    width, shortest, longest = config.sim.action_dim, config.mask.prompt_frames + 1, config.model.frames
-    if actions.ndim != 2 or actions.shape[1] != width or not shortest <= len(actions) <= longest:
-        fits = f"(T, {width}) with T from {shortest} to {longest}"
+    width, shortest = config.sim.action_dim, config.mask.prompt_frames + 1
+    if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
+        fits = f"(T, {width}) with T at least {shortest}"
         raise UserError(f"{request.actions}: shape {actions.shape}; this model takes {fits}")
     if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
         raise UserError(f"{request.actions}: {actions.dtype} with values that are not finite numbers; give floats")
     return actions
 
 
-def _generate(generator: Generator, clip: Record, actions: np.ndarray, sample: SampleConfig) -> Generated:
+def _lasting(actions: Float[np.ndarray, "T A"], request: Request, config: Config) -> Float[np.ndarray, "F A"]:
+    """Actions for the frames asked for: cut, or begun again after the last. Row 0 led nowhere and is not repeated."""
+    if request.frames is None:
+        return actions
+    if request.frames <= config.mask.prompt_frames:
+        raise UserError(f"--frames is {request.frames}, of which {config.mask.prompt_frames} are given; ask for more")
+    turns = 1 + np.arange(request.frames - 1) % (len(actions) - 1)
+    return actions[np.concatenate([[0], turns])]
+
+
+def _generate(generator: Generator, clip: Record, actions: np.ndarray, sample: SampleConfig, number: int) -> Generated:
     given = generator.config.mask.prompt_frames
     prompt = {
         "rgb": generator.codec.encode_rgb(clip["rgb"][None, :given]),
         "depth": generator.codec.encode_depth(clip["depth"][None, :given]),
     }
-    return generator.generate(prompt, actions[None], sample)
+    return generator.generate(prompt, actions[None], sample, index=np.array([number]))
 
 
 def _side_by_side(clip: Record, made: Generated, number: int) -> UInt8[np.ndarray, "T H W 3"]:
-    depth = {} if made.depth is None else {"true_depth": clip["depth"], "predicted_depth": made.depth[0]}
-    return animation(ClipFigure(title=f"clip {number}", truth=clip["rgb"], prediction=made.rgb[0], **depth))
+    shown = len(made.rgb[0])
+    depth = {} if made.depth is None else {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
+    return animation(ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth))

@@ -16,7 +16,7 @@ from rsjax.config import Config, SampleConfig, from_dict
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.model.world_model import WorldModel, branches
-from rsjax.sample.rollout import rollout
+from rsjax.sample.rollout import encode_prompt, rollout, rollout_from
 from rsjax.tokenizer.depth_color import color_to_depth, depth_to_color
 from rsjax.tokenizer.magvit2 import Tokenizer
 from rsjax.train.checkpoint import load_weights
@@ -138,20 +138,52 @@ class Generator:
         return cls(config, Codec(config, load_tokenizer(config, run), units), load_world_model(config, run))
 
     def generate(
-        self, prompt: Tokens, actions: Float[np.ndarray, "B T A"], sample: SampleConfig, depth: bool = True
+        self,
+        prompt: Tokens,
+        actions: Float[np.ndarray, "B T A"],
+        sample: SampleConfig,
+        depth: bool = True,
+        index: Int[np.ndarray, " B"] | None = None,
     ) -> Generated:
-        """The video that follows the prompt under these actions.
+        """The video that follows the prompt under these actions; T may exceed ``model.frames``.
 
         Args:
             prompt: tokens of the given frames by branch, (B, P, h, w).
             actions: in the data's units; row t leads into frame t, row 0 is not used.
             depth: decode depth too; it costs as much as the frames.
+            index: each clip's number, which with ``sample.seed`` decides its draws; 0, 1, … if not given.
         """
-        normalised = jnp.asarray(self.codec.units.action_inputs(actions, self.config.model.integrate_actions))
-        given = {name: jnp.asarray(prompt[name]) for name in branches(self.config.model)}
-        tokens = rollout(self.config.model, sample, self.params, given, normalised, jax.random.key(sample.seed))
+        inputs, key = self._action_inputs(actions), jax.random.key(sample.seed)
+        tokens = rollout(self.config.model, sample, self.params, self._given(prompt), inputs, key, index=index)
         metres = self.codec.decode_depth(tokens["depth"]) if depth and "depth" in tokens else None
         return Generated(tokens, self.codec.decode_rgb(tokens["rgb"]), metres)
+
+    def plan(self, prompt: Tokens, actions: Float[np.ndarray, "N T A"], sample: SampleConfig) -> Tokens:
+        """Tokens of the videos that follow one prompt under N action sequences; the prompt is encoded once.
+
+        All candidates draw alike: they differ by their actions alone. ``codec`` decodes those that are worth it.
+
+        Args:
+            prompt: tokens of the given frames by branch, (1, P, h, w).
+            actions: in the data's units; row t leads into frame t, row 0 is not used.
+
+        Raises:
+            ValueError: the candidates' actions into the prompt's frames differ.
+        """
+        given, n = self._given(prompt), len(actions)
+        past = given["rgb"].shape[1]
+        if np.any(actions[:, 1:past] != actions[:1, 1:past]):
+            raise ValueError(f"the candidates' actions differ in rows before {past}, which led into the one prompt")
+        inputs = self._action_inputs(actions)
+        start = encode_prompt(self.config.model, sample, self.params, given, inputs[:1, :past])
+        key, alike = jax.random.key(sample.seed), jnp.zeros(n, jnp.int32)
+        return rollout_from(self.config.model, sample, self.params, start, inputs[:, past:], key, alike)
+
+    def _given(self, prompt: Tokens) -> Tokens:
+        return {name: jnp.asarray(prompt[name]) for name in branches(self.config.model)}
+
+    def _action_inputs(self, actions: Float[np.ndarray, "B T A"]) -> Float32[Array, "B T A2"]:
+        return jnp.asarray(self.codec.units.action_inputs(actions, self.config.model.integrate_actions))
 
 
 def load_config(run: Path) -> Config:

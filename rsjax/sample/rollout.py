@@ -4,32 +4,49 @@ With the temporal cache a frame costs ``steps`` frame passes and its commit one:
 its final tokens) is fused with the first step of frame t, and the last commit is skipped. What a pass with masked cells
 writes into the cache is overwritten before anything reads it, so cached and uncached rollouts agree.
 
-Axes: B clips, T frames, H×W = S cells, A action dimensions.
+A rollout may be longer than ``model.frames``; :mod:`rsjax.sample.window` says what a frame then remembers. One program
+serves every length up to ``model.frames``, and one each further multiple of it; none grows with the length.
+
+Axes: B clips, T frames (P of them given), H×W = S cells, A action dimensions.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from flax import struct
+from jaxtyping import Float, Int, Key
 
+from rsjax.clip import Array
 from rsjax.config import ModelConfig, SampleConfig
-from rsjax.model.world_model import WorldModel, branches, empty_cache
-from rsjax.sample.maskgit import Frame, unmask_step
+from rsjax.model.world_model import Cache, branches
+from rsjax.sample.decode import Decoder
+from rsjax.sample.guidance import apply_guided, guided_cache, repeat_cache
+from rsjax.sample.window import cache_slots, room, stride, window_actions, window_start
 
 Tokens = dict[str, Int[Array, "B T H W"]]
 
 
-@partial(jax.jit, static_argnames=("model", "sample", "cached"))
+@struct.dataclass
+class Prompt:
+    """Given frames, encoded once, from which any number of rollouts may start. From :func:`encode_prompt`."""
+
+    tokens: Tokens
+    actions: Float[Array, "B P A"]
+    cache: Cache  # of all frames but the last, whose commit is fused with the next frame's first step
+
+
 def rollout(
     model: ModelConfig,
     sample: SampleConfig,
     params: Any,
     prompt: Tokens,
     actions: Float[Array, "B T A"],
-    key: Array,
+    key: Key[Array, ""],
     cached: bool = True,
+    index: Int[Array, " B"] | None = None,
 ) -> Tokens:
     """Generates the frames after the prompt.
 
@@ -37,86 +54,167 @@ def rollout(
         prompt: the given frames' tokens by branch, P of them.
         actions: of all T frames, normalised; row t led into frame t, row 0 is not read by anything that matters.
         key: of the draws; the same key with other actions draws alike.
-        cached: False recomputes all frames at every step, for comparison.
+        cached: False recomputes all frames of the window at every step, for comparison.
+        index: each clip's number, which with ``key`` decides its draws; 0, 1, … if not given.
 
     Returns:
         Tokens of all T frames by branch; the first P are the prompt's.
 
     Raises:
-        ValueError: T exceeds the positions that the model has, or leaves nothing to generate.
+        ConfigError: the model cannot be sampled like this.
+        ValueError: T leaves nothing to generate, or prompt and actions are of different numbers of clips.
     """
-    names = branches(model)
-    given, (b, frames, _) = prompt[names[0]].shape[1], actions.shape
-    if not given < frames <= model.frames:
-        raise ValueError(f"{frames} frames asked for with {given} given; the model holds positions for {model.frames}")
-    pad = ((0, 0), (0, frames - given), (0, 0), (0, 0))
-    tokens = {name: jnp.pad(prompt[name].astype(jnp.int32), pad).reshape(b, frames, -1) for name in names}
-    cells = tokens[names[0]].shape[-1]
-    apply = partial(_apply, model, params)
-    decode = _decode_cached if cached else _decode_uncached
-
-    cache = empty_cache(model, b, frames) if cached else None
-    if cached and given > 1:
-        start = {name: tokens[name][:, : given - 1] for name in names}
-        _, cache = apply(start, jnp.zeros((b, given - 1, cells), bool), actions[:, : given - 1], 0, cache)
-
-    def one_frame(t: Array, carry: tuple[dict[str, Array], Any]) -> tuple[dict[str, Array], Any]:
-        tokens, cache = carry
-        keys = jax.random.split(jax.random.fold_in(key, t), sample.steps)
-        return decode(apply, sample, model.code_bits, keys, tokens, actions, t, cache)
-
-    tokens, _ = jax.lax.fori_loop(given, frames, one_frame, (tokens, cache))
-    return {name: grid.reshape(b, frames, model.grid, model.grid) for name, grid in tokens.items()}
+    sample.check(model)
+    clips, given = prompt["rgb"].shape[:2]
+    _check_lengths(given, actions.shape[1])
+    if clips != len(actions):
+        raise ValueError(f"{clips} prompts and {len(actions)} action sequences; encode_prompt shares one among many")
+    start = {name: prompt[name] for name in branches(model)}
+    arguments = _arguments(model, sample, actions, key, index)
+    tokens = _rollout(model, replace(sample, seed=0), cached, params, start, *arguments)
+    return {name: grid[:, : actions.shape[1]] for name, grid in tokens.items()}
 
 
-def _apply(model: ModelConfig, params: Any, tokens: dict, mask: Array, actions: Array, start: Any, cache: Any) -> Any:
-    shape = (*mask.shape[:2], model.grid, model.grid)
-    grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
-    return WorldModel(model).apply({"params": params}, grids, mask.reshape(shape), actions, start, cache)
+def encode_prompt(
+    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, actions: Float[Array, "B P A"]
+) -> Prompt:
+    """Runs the prompt once, for :func:`rollout_from`.
+
+    Args:
+        prompt: the given frames' tokens by branch.
+        actions: that led into them, normalised.
+
+    Raises:
+        ConfigError: the model cannot be sampled like this.
+    """
+    sample.check(model)
+    start = {name: prompt[name] for name in branches(model)}
+    return _encode_jit(model, replace(sample, seed=0), params, start, actions)
 
 
-def _decode_cached(
-    apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: Any
-) -> Any:
-    """Frame t from the cache of frames before t-1: a pass over (t-1, t), then passes over t alone."""
-    b, _, cells = next(iter(tokens.values())).shape
-    pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
-    mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
-    logits, cache = apply(pair, mask, jax.lax.dynamic_slice_in_dim(actions, t - 1, 2, axis=1), t - 1, cache)
-    frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1])
-    frame = unmask_step(sample, code_bits, keys[0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
+def rollout_from(
+    model: ModelConfig,
+    sample: SampleConfig,
+    params: Any,
+    prompt: Prompt,
+    actions: Float[Array, "N F A"],
+    key: Key[Array, ""],
+    index: Int[Array, " N"] | None = None,
+) -> Tokens:
+    """Generates the F frames after an encoded prompt, under N action sequences.
 
-    action = jax.lax.dynamic_slice_in_dim(actions, t, 1, axis=1)
+    Args:
+        prompt: of N clips, or of one that all start from.
+        actions: that lead into the F frames, normalised.
+        key: as for :func:`rollout`.
+        index: as for :func:`rollout`; equal numbers draw alike, so that candidates differ in their actions alone.
 
-    def step(i: Array, frame: Frame) -> Frame:
-        one = {name: grid[:, None] for name, grid in frame.tokens.items()}
-        logits, _ = apply(one, frame.mask[:, None], action, t, cache)
-        return unmask_step(sample, code_bits, keys[i], i, frame, {name: x[:, 0] for name, x in logits.items()})
+    Returns:
+        Tokens of all P + F frames by branch, as :func:`rollout` gives with each prompt repeated.
 
-    frame = jax.lax.fori_loop(1, sample.steps, step, frame)
-    return _put(tokens, frame, t), cache
-
-
-def _decode_uncached(
-    apply: Any, sample: SampleConfig, code_bits: int, keys: Array, tokens: dict, actions: Array, t: Array, cache: None
-) -> Any:
-    """Frame t from a full pass over all frames at every step."""
-    b, frames, cells = next(iter(tokens.values())).shape
-    frame = Frame({name: grid[:, 0] for name, grid in tokens.items()}, jnp.ones((b, cells), bool))
-
-    def step(i: Array, frame: Frame) -> Frame:
-        here = jnp.arange(frames)[None, :, None] == t
-        logits, _ = apply(_put(tokens, frame, t), here & frame.mask[:, None], actions, 0, None)
-        at_t = {name: jax.lax.dynamic_index_in_dim(x, t, axis=1, keepdims=False) for name, x in logits.items()}
-        return unmask_step(sample, code_bits, keys[i], i, frame, at_t)
-
-    frame = jax.lax.fori_loop(0, sample.steps, step, frame)
-    return _put(tokens, frame, t), None
+    Raises:
+        ConfigError: the model cannot be sampled like this.
+        ValueError: F is 0, or the prompt is neither of one clip nor of N.
+    """
+    sample.check(model)
+    (clips, given), n = prompt.actions.shape[:2], len(actions)
+    _check_lengths(given, given + actions.shape[1])
+    if clips not in (1, n):
+        raise ValueError(f"a prompt of {clips} clips and {n} action sequences; give one prompt, or as many")
+    before = jnp.broadcast_to(prompt.actions, (n, *prompt.actions.shape[1:]))
+    arguments = _arguments(model, sample, jnp.concatenate([before, actions], axis=1), key, index)
+    tokens = _resume(model, replace(sample, seed=0), params, prompt, *arguments)
+    return {name: grid[:, : given + actions.shape[1]] for name, grid in tokens.items()}
 
 
-def _put(tokens: dict, frame: Frame, t: Array) -> dict:
-    """The frame's tokens at place t."""
-    return {
-        name: jax.lax.dynamic_update_slice_in_dim(grid, frame.tokens[name][:, None], t, axis=1)
-        for name, grid in tokens.items()
-    }
+def _check_lengths(given: int, frames: int) -> None:
+    if not 0 < given < frames:
+        raise ValueError(f"{frames} frames asked for with {given} given; at least one must be given and one left")
+
+
+def _arguments(model: ModelConfig, sample: SampleConfig, actions: Array, key: Array, index: Array | None) -> tuple:
+    """Actions with room to spare, the number of frames as a value instead of a shape, and a key per clip."""
+    b, frames, _ = actions.shape
+    index = jnp.arange(b) if index is None else jnp.asarray(index)
+    spare = room(model, sample, frames) - frames
+    keys = jax.vmap(partial(jax.random.fold_in, key))(index)
+    return jnp.pad(actions, ((0, 0), (0, spare), (0, 0))), jnp.asarray(frames), keys
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _rollout(
+    model: ModelConfig,
+    sample: SampleConfig,
+    cached: bool,
+    params: Any,
+    prompt: Tokens,
+    actions: Array,
+    frames: Array,
+    keys: Array,
+) -> Tokens:
+    given = prompt["rgb"].shape[1]
+    apply = partial(apply_guided, model, sample, params)
+    decoder = Decoder(model, sample, apply, actions, keys)
+    tokens = _tokens(prompt, actions)
+    if cached:
+        start = _encode(model, sample, params, prompt, actions[:, :given])
+        return _grids(model, _decode_cached(decoder, tokens, start.cache, given, frames))
+    tokens = jax.lax.fori_loop(given, frames, decoder.uncached, tokens)
+    return _grids(model, tokens)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _resume(
+    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Prompt, actions: Array, frames: Array, keys: Array
+) -> Tokens:
+    (clips, given), n = prompt.actions.shape[:2], len(actions)
+    decoder = Decoder(model, sample, partial(apply_guided, model, sample, params), actions, keys)
+    cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
+    return _grids(model, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, given, frames))
+
+
+def _encode(model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, actions: Array) -> Prompt:
+    b, given = prompt["rgb"].shape[:2]
+    cache: Any = guided_cache(model, sample, b, cache_slots(model, given))
+    base = int(window_start(model, sample, given))
+    if (known := given - 1 - base) > 0:
+        tokens = {name: grid[:, base : given - 1].reshape(b, known, -1) for name, grid in prompt.items()}
+        seen = window_actions(model, actions, base, base, known)
+        mask = jnp.zeros((b, known, model.grid**2), bool)
+        _, cache = apply_guided(model, sample, params, tokens, mask, seen, 0, cache)
+    return Prompt(prompt, actions, cache)
+
+
+_encode_jit = jax.jit(_encode, static_argnums=(0, 1))
+
+
+def _decode_cached(decoder: Decoder, tokens: dict, cache: Cache, given: int, frames: Array) -> dict:
+    """Frames ``given`` to ``frames`` - 1, window by window; the cache is that of the first of these windows."""
+    model, sample, length = decoder.model, decoder.sample, decoder.actions.shape[1]
+    if model.positions == "rotary" or length <= model.frames:
+        return jax.lax.fori_loop(given, frames, partial(decoder.cached, 0), (tokens, cache))[0]
+    by, first = stride(model, sample), window_start(model, sample, given)
+
+    def window(number: Array, carry: tuple[dict, Cache]) -> tuple[dict, Cache]:
+        base, later = number * by, number * by > first
+        carry = jax.lax.cond(later, partial(decoder.encode_anew, base), lambda kept: kept, carry)
+        begin = jnp.where(later, base + model.frames - by, given)
+        end = jnp.minimum(base + model.frames, frames)
+        return jax.lax.fori_loop(begin, end, partial(decoder.cached, base), carry)
+
+    last = window_start(model, sample, frames - 1)
+    return jax.lax.fori_loop(first // by, last // by + 1, window, (tokens, cache))[0]
+
+
+def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
+    """The prompt's tokens for every sequence of actions, and zeros for what is to come."""
+    (b, length), out = actions.shape[:2], {}
+    for name, grid in prompt.items():
+        cells = grid.astype(jnp.int32).reshape(*grid.shape[:2], -1)
+        cells = jnp.broadcast_to(cells, (b, *cells.shape[1:]))
+        out[name] = jnp.pad(cells, ((0, 0), (0, length - cells.shape[1]), (0, 0)))
+    return out
+
+
+def _grids(model: ModelConfig, tokens: dict[str, Int[Array, "B T S"]]) -> Tokens:
+    return {name: cells.reshape(*cells.shape[:2], model.grid, model.grid) for name, cells in tokens.items()}

@@ -6,6 +6,9 @@ A vocabulary of 2^D is factorised into n vocabularies of 2^(D/n): sub-token k ho
 Axes: … any leading axes, D code bits, n vocabularies, V = 2^(D/n) codes each, N tokens.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -57,12 +60,17 @@ def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
     return jnp.mean(jnp.square(latents - jax.lax.stop_gradient(quantize(latents))))
 
 
-def entropy_loss(latents: Float[Array, "*batch D"], temperature: float) -> Scalar:
+def entropy_loss(
+    latents: Float[Array, "*batch D"], temperature: float, total: Callable[[Any], Any] = lambda x: x
+) -> Scalar:
     """Mean entropy of a token's code less the entropy of the batch's average code, over all 2^D codes, in nats.
 
     Code c has probability ∝ exp(2·x·c/τ), so its bits are independent: p_d = σ(4·x_d/τ). Hence the first term is a
     sum of binary entropies, and the average over the batch is a product of two half-code tables of 2^(D/2) entries:
     no array of N × 2^D is made. float32.
+
+    Args:
+        total: adds arrays over devices. The average is that of all devices' tokens, the mean of this one's.
     """
     logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
     log_one, log_zero = jax.nn.log_sigmoid(logits), jax.nn.log_sigmoid(-logits)
@@ -70,7 +78,7 @@ def entropy_loss(latents: Float[Array, "*batch D"], temperature: float) -> Scala
 
     half = logits.shape[-1] // 2
     low, high = (_code_probabilities(log_one[:, s], log_zero[:, s]) for s in (slice(half), slice(half, None)))
-    average = high.T @ low / logits.shape[0]  # (2^(D-half), 2^half)
+    average = total(high.T @ low) / total(jnp.float32(logits.shape[0]))  # (2^(D-half), 2^half)
     of_average = -jnp.sum(average * jnp.log(jnp.maximum(average, 1e-20)))
     return jnp.mean(per_token) - of_average
 

@@ -53,9 +53,23 @@ class ResBlock(nn.Module):
         return x + h
 
 
-def _norm(groups: int, name: str) -> nn.GroupNorm:
+def _norm(groups: int, name: str, affine: bool = True) -> nn.GroupNorm:
     # E[x²] - E[x]² loses digits that parity with the public weights needs.
-    return nn.GroupNorm(groups, epsilon=1e-6, use_fast_variance=False, name=name)
+    return nn.GroupNorm(groups, epsilon=1e-6, use_bias=affine, use_scale=affine, use_fast_variance=False, name=name)
+
+
+class AdaptiveGroupNorm(nn.Module):
+    """GroupNorm whose scale and shift of each channel are linear in the codes' deviations and means over the cells."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B h w C"], codes: Float[Array, "B i j D"]) -> Float[Array, "B h w C"]:
+        # The unbiased variance: the public code leaves torch's default.
+        deviation = jnp.sqrt(jnp.var(codes, axis=(1, 2), ddof=1) + 1e-6)
+        scale = nn.Dense(x.shape[-1], name="gamma")(deviation)
+        shift = nn.Dense(x.shape[-1], name="beta")(jnp.mean(codes, axis=(1, 2)))
+        return scale[:, None, None] * _norm(self.groups, "norm", affine=False)(x) + shift[:, None, None]
 
 
 class Encoder(nn.Module):
@@ -92,6 +106,8 @@ class Decoder(nn.Module):
         for i in range(cfg.res_blocks):
             x = ResBlock(x.shape[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
         for level in reversed(range(len(cfg.channel_multipliers))):
+            if cfg.adaptive_norm:
+                x = AdaptiveGroupNorm(cfg.norm_groups, name=f"adaptive_{level}")(x, codes)
             for i in range(cfg.res_blocks):
                 features = cfg.channels * cfg.channel_multipliers[level]
                 x = ResBlock(features, cfg.norm_groups, name=f"up_{level}_block_{i}")(x)

@@ -32,6 +32,7 @@ def fit(
     *,
     name: str,
     to_batch: Callable[[dict[str, Any]], Any],
+    start: Callable[[Any], Any] | None = None,
     resume: bool = True,
     stop_at: int | None = None,
 ) -> TrainState:
@@ -42,6 +43,7 @@ def fit(
         directory: holds checkpoints and logs; made if it is not there.
         name: what is trained, for the progress line.
         to_batch: a loader's arrays to the objective's batch.
+        start: fresh parameters to those that training begins with; not asked where there is a checkpoint to resume.
         resume: False throws earlier checkpoints away.
         stop_at: stop (and save) after this step, as if interrupted.
 
@@ -57,19 +59,20 @@ def fit(
         shutil.rmtree(directory / "checkpoints", ignore_errors=True)
     checkpoints = Checkpoints(directory / "checkpoints")
     placement = Placement.create(loop)
-    state, data = create_state(objective, loop), None
-    if checkpoints.latest() is not None:
+    begun = checkpoints.latest() is not None
+    state, data = create_state(objective, loop, None if begun else start), None
+    if begun:
         state, data = checkpoints.restore(state)
-    start, last = int(state.step), min(stop_at or loop.steps, loop.steps)
+    first, last = int(state.step), min(stop_at or loop.steps, loop.steps)
     state, step_fn = placement.put_state(state), placement.compile(objective, loop)
     try:
         with (
             loader(data) as batches,
-            ScalarLog(directory, start) as log,
-            Progress(name, loop.steps, "steps", start=start) as progress,
+            ScalarLog(directory, first) as log,
+            Progress(name, loop.steps, "steps", start=first) as progress,
         ):
             clock = _Clock()
-            for step in range(start + 1, last + 1):
+            for step in range(first + 1, last + 1):
                 with clock.waiting():
                     batch = placement.put_batch(to_batch(next(batches)))
                 state, metrics = step_fn(state, batch)

@@ -1,5 +1,6 @@
 """The training state and its optimizer."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ class TrainState:
     params: Any
     opt_state: Any
     ema: Any  # averaged parameters, or None
+    extra: Any = None  # what else the objective carries from step to step, or None
 
     @property
     def weights(self) -> Any:
@@ -28,16 +30,21 @@ class TrainState:
 
 
 def learning_rate(loop: LoopConfig) -> optax.Schedule:
-    """Linear warm-up, then a cosine to ``final_share`` of the peak at the last step."""
+    """Linear warm-up, then a cosine to ``final_share`` of the peak at the last step, or falls to a tenth."""
     opt = loop.optimizer
     warmup = min(opt.warmup_steps, max(loop.steps - 1, 1))
+    if opt.schedule == "steps":
+        drops = optax.piecewise_constant_schedule(
+            opt.learning_rate, {round(share * loop.steps): 0.1 for share in opt.drop_at}
+        )
+        return lambda step: drops(step) * jnp.minimum(1.0, step / warmup if warmup else 1.0)
     return optax.warmup_cosine_decay_schedule(
         0.0, opt.learning_rate, warmup, max(loop.steps, warmup + 1), opt.learning_rate * opt.final_share
     )
 
 
 def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
-    """Clipping by the global norm, then AdamW or Muon."""
+    """Clipping by the global norm (where it is on), then AdamW or Muon."""
     opt = loop.optimizer
     if opt.kind == "muon":
         inner = optax.contrib.muon(
@@ -51,7 +58,7 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
         )
     else:
         inner = optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay)
-    return optax.chain(optax.clip_by_global_norm(opt.grad_clip), inner)
+    return optax.chain(optax.clip_by_global_norm(opt.grad_clip) if opt.grad_clip else optax.identity(), inner)
 
 
 def _block_matrices(params: Any) -> Any:
@@ -65,8 +72,14 @@ def _block_matrices(params: Any) -> Any:
     return jax.tree.map_with_path(axes, params)
 
 
-def create_state(objective: Objective, loop: LoopConfig) -> TrainState:
-    """The state before the first step; a function of the configuration alone."""
+def create_state(objective: Objective, loop: LoopConfig, start: Callable[[Any], Any] | None = None) -> TrainState:
+    """The state before the first step; a function of the configuration alone.
+
+    Args:
+        start: fresh parameters to those that training begins with; the fresh ones if not given.
+    """
     params = objective.init(jax.random.key(loop.seed))
+    if start is not None:
+        params = start(params)
     ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
-    return TrainState(jnp.int32(0), params, make_optimizer(loop).init(params), ema)
+    return TrainState(jnp.int32(0), params, make_optimizer(loop).init(params), ema, objective.init_extra())

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rsjax.config import LoopConfig
 from rsjax.objective import losses
-from rsjax.train.objectives import Objective
+from rsjax.train.objectives import Objective, Surroundings
 from rsjax.train.state import TrainState, learning_rate, make_optimizer
 
 Metrics = dict[str, Float[Array, ""]]
@@ -33,9 +33,10 @@ def train_step(
     # Keys follow from the step alone, so a resumed run draws what an uninterrupted one would have drawn.
     key = jax.random.fold_in(jax.random.key(loop.seed + 1), state.step)
     total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
+    around = Surroundings(state.step, state.extra, axis_name)
 
     def share_of_loss(params: Any) -> tuple[Float[Array, ""], Metrics]:
-        return losses.combine(objective.terms(params, batch, key), objective.weights, total)
+        return losses.combine(objective.terms(params, batch, key, around), objective.weights, total)
 
     (loss, terms), grads = jax.value_and_grad(share_of_loss, has_aux=True)(state.params)
     grads, metrics = total(grads), total({"loss": loss, **terms})
@@ -47,10 +48,11 @@ def train_step(
         # A young average would remember the initial weights: its decay grows with its age.
         decay = jnp.minimum(loop.ema, (1.0 + state.step) / (10.0 + state.step))
         ema = optax.incremental_update(params, ema, 1 - decay)
+    extra = objective.next_extra(state.extra, metrics)
     metrics |= {
         "grad_norm": optax.global_norm(grads),
         "param_norm": optax.global_norm(params),
         "update_norm": optax.global_norm(updates),
         "learning_rate": jnp.float32(learning_rate(loop)(state.step)),
     }
-    return TrainState(state.step + 1, params, opt_state, ema), metrics
+    return TrainState(state.step + 1, params, opt_state, ema, extra), metrics

@@ -13,6 +13,9 @@ from rsjax.model.world_model import WorldModel, branches, empty_cache
 DUAL = ModelConfig(frames=5, grid=2, code_bits=4, action_dim=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, depth=False)
 NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
+QK_NORM = replace(DUAL, qk_norm=True, mup=True)
+GENIE = replace(RGB, action_dim=0)
+GUIDED = replace(DUAL, action_dropout=0.5)
 BATCH = 2
 
 
@@ -23,9 +26,16 @@ def forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.nda
 
 
 def _apply_plain(
-    config: ModelConfig, params: Any, tokens: Any, mask: Any, actions: Any, start: Any = 0, cache: Any = None
+    config: ModelConfig,
+    params: Any,
+    tokens: Any,
+    mask: Any,
+    actions: Any,
+    start: Any = 0,
+    cache: Any = None,
+    drop_actions: Any = None,
 ):
-    return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache)
+    return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache, drop_actions)
 
 
 _apply = jax.jit(_apply_plain, static_argnums=0)
@@ -66,15 +76,19 @@ def layer_norm(x: np.ndarray, p: dict) -> np.ndarray:
     return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * p["scale"] + p["bias"]
 
 
-def sequence_attention(x: np.ndarray, p: dict, heads: int, causal: bool) -> np.ndarray:
+def sequence_attention(x: np.ndarray, p: dict, config: ModelConfig, causal: bool) -> np.ndarray:
     """Attention over one sequence (L, C)."""
     length, width = x.shape
+    heads = config.heads
     qkv = (x @ p["qkv"]["kernel"]).reshape(length, 3, heads, width // heads)
+    if config.qk_norm:
+        qkv[:, :2] = layer_norm(qkv[:, :2], p["norm"])
+    scale = 8 / (width // heads) if config.mup else 1 / math.sqrt(width // heads)
     out = np.zeros((length, heads, width // heads))
     for head in range(heads):
         for i in range(length):
             last = i + 1 if causal else length
-            scores = qkv[:last, 1, head] @ qkv[i, 0, head] / math.sqrt(width // heads)
+            scores = qkv[:last, 1, head] @ qkv[i, 0, head] * scale
             out[i, head] = softmax(scores) @ qkv[:last, 2, head]
     return out.reshape(length, width) @ p["proj"]["kernel"] + p["proj"]["bias"]
 
@@ -82,15 +96,14 @@ def sequence_attention(x: np.ndarray, p: dict, heads: int, causal: bool) -> np.n
 def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
     x = x.copy()
     b, t, s, _ = x.shape
-    normed = layer_norm(x, p["norm1"])
-    x += [
-        [sequence_attention(normed[i, j], p["spatial_attn"], config.heads, False) for j in range(t)] for i in range(b)
-    ]
+    normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
+    x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
     before = layer_norm(x, p["norm_temporal"]) if config.temporal_norm else x.copy()
     for i in range(b):
         for cell in range(s):
-            x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config.heads, True)
-    hidden = gelu(layer_norm(x, p["norm2"]) @ p["fc1"]["kernel"] + p["fc1"]["bias"])
+            x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
+    normed = x if config.qk_norm else layer_norm(x, p["norm2"])
+    hidden = gelu(normed @ p["fc1"]["kernel"] + p["fc1"]["bias"])
     return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
 
 
@@ -107,8 +120,9 @@ def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, 
             for k in range(config.vocabularies)
         )
         x[mask.reshape(b, t, -1)] = embed["mask_token_embed"]
-        action = actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"]
-        h[name] = x + action[:, :, None] + p["pos_embed"][:t]
+        h[name] = x + p["pos_embed"][:t]
+        if config.action_dim:
+            h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
     for block in range(config.blocks):
         own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
@@ -116,11 +130,16 @@ def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, 
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
     if config.final_norm:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
+    if config.mup:
+        h = {name: x * 256 / config.width for name, x in h.items()}
     logits = {name: x @ p[f"{name}_head"]["kernel"] + p[f"{name}_head"]["bias"] for name, x in h.items()}
     return {name: x.reshape(*x.shape[:3], config.vocabularies, config.vocabulary_size) for name, x in logits.items()}
 
 
-@pytest.mark.parametrize("config", [DUAL, RGB, NORMED], ids=["dual", "rgb", "normed"])
+CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "genie": GENIE}
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_logits_are_those_of_the_plain_computation(config: ModelConfig) -> None:
     params, inputs = random_params(config), random_inputs(config)
     logits, expected = forward(config, params, inputs), plain_forward(config, params, inputs)
@@ -135,13 +154,56 @@ def count(params: Any) -> int:
 
 @pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
 def test_one_branch_without_actions_has_the_published_size(width: int, published: int) -> None:
-    config = ModelConfig(width=width, depth=False)
+    config = ModelConfig(width=width, depth=False, action_dim=0)
     params = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
-    assert count(params) - count(params["action_encoder"]) == published
+    assert count(params) == published
 
     dual = jax.eval_shape(WorldModel(replace(config, depth=True)).init_params, jax.random.key(0))
-    shared = count(params["pos_embed"]) + count(params["action_encoder"])
-    assert count(dual) == 2 * count(params) - shared + config.blocks * (width + 1) * width
+    assert count(dual) == 2 * published - count(params["pos_embed"]) + config.blocks * (width + 1) * width
+
+
+def test_qk_norm_trades_two_norms_of_the_width_for_two_of_a_head() -> None:
+    block = jax.eval_shape(WorldModel(QK_NORM).init_params, jax.random.key(0))["blocks"]["rgb"]
+    assert not {"norm1", "norm2"} & block.keys()
+    for attention in ("spatial_attn", "temporal_attn"):
+        assert block[attention]["norm"]["scale"].shape == (QK_NORM.blocks, QK_NORM.width // QK_NORM.heads)
+
+
+def test_without_an_action_encoder_actions_are_not_read() -> None:
+    params, (tokens, mask, actions) = random_params(GENIE), random_inputs(GENIE)
+    assert actions.shape[-1] == 0
+    expected = forward(GENIE, params, (tokens, mask, actions))["rgb"]
+    for other in (None, random_inputs(DUAL)[2]):
+        np.testing.assert_array_equal(forward(GENIE, params, (tokens, mask, other))["rgb"], expected)
+
+
+def test_a_dropped_clip_sees_the_null_action_in_every_frame_and_the_others_their_own() -> None:
+    params, (tokens, mask, actions) = random_params(GUIDED), random_inputs(GUIDED)
+    drop = np.array([True, False])
+    dropped, _ = _apply(GUIDED, params, tokens, mask, actions, 0, None, drop)
+    own = forward(GUIDED, params, (tokens, mask, actions))
+    null = dict(params, action_encoder={"kernel": np.zeros((3, 8), np.float32), "bias": params["null_action"]})
+    without = forward(GUIDED, null, (tokens, mask, actions))
+    for name in own:
+        np.testing.assert_allclose(dropped[name][0], without[name][0], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(dropped[name][1], own[name][1], rtol=1e-4, atol=1e-4)
+        assert not np.allclose(own[name][0], without[name][0], atol=0.1)
+
+
+def test_actions_cannot_be_dropped_without_a_null_action() -> None:
+    with pytest.raises(ValueError, match="model.action_dropout"):
+        _apply_plain(DUAL, random_params(DUAL), *random_inputs(DUAL), drop_actions=np.array([True, False]))
+
+
+def test_remat_changes_neither_parameters_nor_gradients() -> None:
+    params, inputs = random_params(DUAL), random_inputs(DUAL)
+
+    def gradients(config: ModelConfig) -> Any:
+        loss = lambda params: sum(jnp.mean(jnp.square(x)) for x in _apply_plain(config, params, *inputs)[0].values())  # noqa: E731
+        return jax.jit(jax.grad(loss))(params)
+
+    plain, again = gradients(DUAL), gradients(replace(DUAL, remat=True))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), plain, again)
 
 
 def test_without_depth_nothing_of_it_exists() -> None:
@@ -229,7 +291,7 @@ def test_depth_never_reads_rgb() -> None:
     assert not np.allclose(before["rgb"], after["rgb"])
 
 
-@pytest.mark.parametrize("config", [DUAL, RGB], ids=["dual", "rgb"])
+@pytest.mark.parametrize("config", [DUAL, RGB, QK_NORM], ids=["dual", "rgb", "qk-norm"])
 @pytest.mark.parametrize("pieces", [(5,), (1, 1, 1, 1, 1), (2, 3)], ids=str)
 def test_pieces_through_the_cache_are_the_whole(config: ModelConfig, pieces: tuple[int, ...]) -> None:
     params, (tokens, mask, actions) = random_params(config), random_inputs(config)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import MaskConfig
-from rsjax.objective.masking import Masked, corrupt
+from rsjax.objective.masking import Masked, corrupt, dropped_actions
 
 T, GRID, BITS, VOCABULARIES = 10, 8, 18, 2
 BATCHES, CLIPS = 64, 16
@@ -20,6 +20,9 @@ STEP_2 = MaskConfig(random_token_rate=0.0, prompt_frames=4)
 @partial(jax.jit, static_argnums=0)
 def corrupt_one(config: MaskConfig, key: jax.Array, tokens: Any, index: Any) -> Masked:
     return corrupt(config, BITS, VOCABULARIES, key, tokens, index)
+
+
+dropped = jax.jit(dropped_actions, static_argnums=0)
 
 
 def clean(clips: int, branches: tuple[str, ...] = ("rgb", "depth")) -> dict[str, np.ndarray]:
@@ -122,3 +125,16 @@ def test_a_clips_draws_follow_its_place_in_the_global_batch_not_its_device(seed:
     ]
     jax.tree.map(lambda a, *b: np.testing.assert_array_equal(a, np.concatenate(b)), whole, *parts)
     assert not np.array_equal(whole.mask[0], whole.mask[1])
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_dropped_actions_follow_a_clips_place_too(seed: int) -> None:
+    key = jax.random.key(seed)
+    whole = dropped(0.5, key, jnp.arange(8))
+    np.testing.assert_array_equal(dropped(0.5, key, jnp.array([6, 1])), whole[jnp.array([6, 1])])
+
+
+def test_the_given_share_of_actions_is_dropped() -> None:
+    drop = dropped(0.2, jax.random.key(0), jnp.arange(4000))
+    assert np.mean(drop) == pytest.approx(0.2, abs=0.02)

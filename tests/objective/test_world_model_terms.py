@@ -39,7 +39,7 @@ def random_batch(clips: int = 3) -> Batch:
         "actions": rng.normal(size=(clips, 4, 3)).astype(np.float32),
         "tracks": rng.random((clips, 7, 4, 2)).astype(np.float32),
         "visible": rng.random((clips, 7, 4)) < 0.7,
-        "weight": np.array([1, 1, 0], np.float32)[:clips],
+        "weight": np.array([1, 1, 0] + [1] * (clips - 3), np.float32)[:clips],
         "index": np.arange(clips, dtype=np.int32),
     }
     return Batch(**fields)
@@ -108,3 +108,15 @@ def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
         assert reaches(term, "depth")  # through the projection of Eq. 3
     assert reaches("depth", "depth")
     assert not reaches("depth", "rgb")
+
+
+def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:
+    model, loss = replace(MODEL, action_dropout=0.5), LossConfig(keypoints=False)
+    params, batch = random_params(model), random_batch(8)
+    drop = masking.dropped_actions(0.5, KEY, batch.index)
+    assert {False, True} == set(np.asarray(drop).tolist())
+    gradient = jax.jit(jax.grad(lambda params: terms_of(model, loss, params, batch)["rgb"][0]))(params)
+    assert np.any(gradient["null_action"])
+    assert np.any(gradient["action_encoder"]["kernel"])
+    plain = terms_of(MODEL, loss, {k: x for k, x in params.items() if k != "null_action"}, batch)
+    assert plain["rgb"][0] != terms_of(model, loss, params, batch)["rgb"][0]

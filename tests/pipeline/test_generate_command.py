@@ -59,6 +59,15 @@ def test_under_other_actions_the_prediction_alone(debug: Path, command: Commands
     assert taken["train_002_other_actions.mp4"].shape == (FRAMES, 128, 128, 3)
 
 
+def test_more_frames_than_the_model_was_trained_on(debug: Path, command: Commands, tmp_path: Path) -> None:
+    """Of more frames than the clip has, the prediction alone; of fewer, both."""
+    long = generate(command, debug, tmp_path / "long", "--clips", 0, "--frames", 2 * FRAMES + 1, "--top-k", 3)
+    assert long[f"test_000_{2 * FRAMES + 1}_frames.mp4"].shape == (2 * FRAMES + 1, 256, 256, 3)
+    short = generate(command, debug, tmp_path / "short", "--clips", 0, "--frames", 3)["test_000_3_frames.mp4"]
+    assert len(short) == 3
+    assert short.shape[2] > 2 * 64
+
+
 def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
     debug: Path, command: Commands, tmp_path: Path
 ) -> None:
@@ -69,10 +78,12 @@ def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
         (("--clips", 0, "--actions-from", 9), "--actions-from: no clip 9"),
         (
             ("--clips", 0, "--actions", tmp_path / "wide.npy"),
-            "wide.npy: shape (4, 5); this model takes (T, 28) with T from 2 to 6",
+            "wide.npy: shape (4, 5); this model takes (T, 28) with T at least 2",
         ),
         (("--clips", 0, "--actions", tmp_path / "text.npy"), "text.npy: not a readable .npy file"),
         (("--clips", 0, "--fps", 0), "--fps is 0.0"),
+        (("--clips", 0, "--frames", 1), "--frames is 1, of which 1 are given"),
+        (("--clips", 0, "--guidance", 2), "sample.guidance is 2.0 but the model never saw clips without actions"),
     ):
         assert words in command.refused(PROGRAM, debug, "--out", tmp_path / "out", *arguments)
     assert "is not a run directory" in command.refused(PROGRAM, tmp_path)

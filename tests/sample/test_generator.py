@@ -106,6 +106,21 @@ def test_generate_is_a_rollout_decoded(codec: Codec, depth_branch: bool) -> None
     np.testing.assert_array_equal(generator.generate(prompt, unread, CONFIG.sample).rgb, made.rgb)
 
 
+def test_a_plan_is_what_generate_makes_of_each_candidate(codec: Codec) -> None:
+    rng, shapes = np.random.default_rng(0), jax.eval_shape(WorldModel(CONFIG.model).init_params, jax.random.key(1))
+    params = jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
+    generator = Generator(CONFIG, codec, params)
+    prompt = {name: rng.integers(0, 256, (1, 3, 8, 8), np.int32) for name in ("rgb", "depth")}
+    actions = rng.normal(size=(2, 7, WIDTH)).astype(np.float32)
+    with pytest.raises(ValueError, match="differ in rows before 3"):
+        generator.plan(prompt, actions, CONFIG.sample)
+    actions[1, 1:3] = actions[0, 1:3]  # row 0 is not used
+    repeated = {name: grid.repeat(2, 0) for name, grid in prompt.items()}
+    made = generator.generate(repeated, actions, CONFIG.sample, depth=False, index=np.zeros(2, int))
+    jax.tree.map(np.testing.assert_array_equal, generator.plan(prompt, actions, CONFIG.sample), made.tokens)
+    assert not np.array_equal(made.tokens["rgb"][0], made.tokens["rgb"][1])
+
+
 def test_a_runs_configuration_comes_back_or_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a run directory"):
         load_config(tmp_path)

@@ -1,33 +1,15 @@
-from collections import Counter
 from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rsjax.config import ModelConfig, SampleConfig
-from rsjax.model.world_model import WorldModel, branches
+from rsjax.model.world_model import WorldModel
 from rsjax.sample import rollout as module
 from rsjax.sample.rollout import rollout
-
-DUAL = ModelConfig(frames=6, grid=3, code_bits=6, action_dim=3, width=16, blocks=2, heads=2)
-RGB = replace(DUAL, depth=False)
-BATCH, KEY = 2, jax.random.key(5)
-
-
-def random_params(model: ModelConfig) -> Any:
-    rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(model).init_params, KEY)
-    return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
-
-
-def given(model: ModelConfig, prompt: int, frames: int = 6) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    rng = np.random.default_rng(1)
-    shape = (BATCH, prompt, model.grid, model.grid)
-    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in branches(model)}
-    return tokens, rng.normal(size=(BATCH, frames, model.action_dim)).astype(np.float32)
+from tests.sample.toy import BATCH, DUAL, KEY, RGB, count_model, given, random_params
 
 
 @pytest.mark.parametrize(
@@ -84,11 +66,37 @@ def test_the_key_decides_the_draws_and_actions_the_video() -> None:
     assert not np.array_equal(first, make(later, KEY))
 
 
-@pytest.mark.parametrize(("prompt", "frames"), [(1, 7), (3, 3), (4, 3)])
-def test_more_frames_than_positions_or_none_to_make_are_refused(prompt: int, frames: int) -> None:
+@pytest.mark.parametrize(("prompt", "frames"), [(3, 3), (4, 3)])
+def test_a_rollout_without_a_frame_to_make_is_refused(prompt: int, frames: int) -> None:
     tokens, actions = given(RGB, prompt, frames)
-    with pytest.raises(ValueError, match=f"{frames} frames asked for with {prompt} given.*positions for 6"):
+    with pytest.raises(ValueError, match=f"{frames} frames asked for with {prompt} given"):
         rollout(RGB, SampleConfig(), random_params(RGB), tokens, actions, KEY)
+    with pytest.raises(ValueError, match="2 prompts and 3 action sequences; encode_prompt"):
+        rollout(RGB, SampleConfig(), random_params(RGB), tokens, np.zeros((3, 6, 3)), KEY)
+
+
+def test_a_clips_draws_follow_its_number_and_not_its_place() -> None:
+    sample, params, (tokens, actions) = SampleConfig(steps=2, temperature=1.0), random_params(RGB), given(RGB, 1)
+    both = rollout(RGB, sample, params, tokens, actions, KEY, index=np.array([4, 7]))["rgb"]
+    turned = rollout(RGB, sample, params, {"rgb": tokens["rgb"][::-1]}, actions[::-1], KEY, index=np.array([7, 4]))
+    np.testing.assert_array_equal(both[::-1], turned["rgb"])
+    alone = rollout(RGB, sample, params, {"rgb": tokens["rgb"][1:]}, actions[1:], KEY, index=np.array([7]))["rgb"]
+    np.testing.assert_array_equal(both[1:], alone)
+    other = rollout(RGB, sample, params, tokens, actions, KEY, index=np.array([4, 8]))["rgb"]
+    np.testing.assert_array_equal(both[0], other[0])
+    assert not np.array_equal(both[1], other[1])
+
+
+def test_all_lengths_within_the_window_are_one_program() -> None:
+    model, params = replace(RGB, width=20), random_params(replace(RGB, width=20))  # a model of this test alone
+    tokens, actions = given(model, 1, 6)
+    compiled: Any = module._rollout
+    before = compiled._cache_size()
+    whole = rollout(model, SampleConfig(), params, tokens, actions, KEY)["rgb"]
+    for frames in (2, 4, 5):
+        short = rollout(model, SampleConfig(seed=frames), params, tokens, actions[:, :frames], KEY)["rgb"]
+        np.testing.assert_array_equal(short, whole[:, :frames])
+    assert compiled._cache_size() == before + 1
 
 
 # Frame passes of one rollout: a pass over f frames counts f.
@@ -99,19 +107,11 @@ PUBLISHED = [(1, 16, 30), (2, 16, 45), (8, 16, 135), (2, 48, 141)]
 def test_a_rollout_costs_the_frame_passes_that_it_should(
     steps: int, frames: int, cached_passes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = replace(RGB, frames=frames, grid=1)
-    passes: Counter[str] = Counter()
-
-    def count(name: str) -> Any:
-        def apply(model: Any, params: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any) -> Any:
-            passes[name] += mask.shape[1]
-            return {"rgb": jnp.zeros((*mask.shape, 2, 8))}, cache
-
-        return apply
-
-    tokens = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}
+    model, seen = replace(RGB, frames=frames, grid=1), count_model(monkeypatch)
+    tokens, costs = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}, []
     with jax.disable_jit():
-        for name, cached in (("cached", True), ("uncached", False)):
-            monkeypatch.setattr(module, "_apply", count(name))
+        for cached in (True, False):
+            seen.clear()
             rollout(model, SampleConfig(steps=steps), {}, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
-    assert passes == {"cached": cached_passes, "uncached": steps * (frames - 1) * frames}
+            costs.append(seen["frames"])
+    assert costs == [cached_passes, steps * (frames - 1) * frames]

@@ -102,6 +102,21 @@ def test_factorised_entropy_is_the_sum_over_all_codes(code_bits: int, scale: flo
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-5)
 
 
+def test_the_entropy_of_the_average_is_that_of_all_devices_tokens() -> None:
+    latents = (
+        jax.random.normal(jax.random.key(0), (4, 6, 5)) * 0.01
+    )  # four devices' parts, of which each uses few codes
+
+    def on_each(latents: jax.Array) -> jax.Array:
+        return lfq.entropy_loss(latents, 0.01, lambda x: jax.lax.psum(x, "devices"))
+
+    whole = jax.jit(lfq.entropy_loss)(latents, 0.01)
+    parts = jax.jit(jax.vmap(on_each, axis_name="devices"))(latents)
+    apart = jax.jit(jax.vmap(lfq.entropy_loss, (0, None)))(latents, 0.01)
+    np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-5)
+    assert abs(np.mean(apart) - whole) > 0.1
+
+
 def test_entropy_is_lowest_where_every_code_is_used_with_certainty() -> None:
     every_code = lfq.tokens_to_codes(jnp.arange(16), 4)
     np.testing.assert_allclose(lfq.entropy_loss(every_code, 0.01), -math.log(16), rtol=1e-5)

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,7 +10,16 @@ import pytest
 
 from rsjax.config import TokenizerConfig
 from rsjax.presets import PRESETS
-from rsjax.tokenizer.magvit2 import Encoder, ResBlock, Tokenizer, depth_to_space, space_to_depth, to_pixels, to_unit
+from rsjax.tokenizer.magvit2 import (
+    Decoder,
+    Encoder,
+    ResBlock,
+    Tokenizer,
+    depth_to_space,
+    space_to_depth,
+    to_pixels,
+    to_unit,
+)
 
 SMALL = TokenizerConfig(
     image_size=16, patch_size=2, channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6
@@ -60,9 +70,21 @@ def swish(x: np.ndarray) -> np.ndarray:
     return x / (1 + np.exp(-x))
 
 
-def test_the_full_preset_has_the_published_encoder_and_decoder() -> None:
-    shapes = jax.eval_shape(Tokenizer(TokenizerConfig()).init_params, jax.random.key(0))
-    published = {"encoder": (87, 24_964_498), "decoder": (88, 40_526_211)}
+@pytest.mark.parametrize(
+    ("config", "published"),
+    [
+        (TokenizerConfig(), {"encoder": (87, 24_964_498), "decoder": (88, 40_526_211)}),
+        (
+            TokenizerConfig(res_blocks=4, adaptive_norm=True),
+            {"encoder": (159, 49_751_442), "decoder": (180, 65_376_387)},
+        ),
+    ],
+    ids=["256_B", "256_L"],
+)
+def test_both_generations_have_the_published_encoder_and_decoder(
+    config: TokenizerConfig, published: dict[str, tuple[int, int]]
+) -> None:
+    shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
     counted = {part: (len(jax.tree.leaves(x)), sum(p.size for p in jax.tree.leaves(x))) for part, x in shapes.items()}
     assert counted == published
 
@@ -116,6 +138,30 @@ def test_downsampling_pads_all_four_sides(params: Any) -> None:
     p = jax.tree.map(np.asarray, params["encoder"]["down_0_downsample"])
     by_hand = conv3(seen["down_0_block_0"], p["kernel"], stride=2) + p["bias"]
     np.testing.assert_allclose(seen["down_0_downsample"], by_hand, rtol=1e-4, atol=1e-5)
+
+
+def test_adaptive_norm_scales_and_shifts_each_level_by_the_codes_statistics() -> None:
+    config = replace(SMALL, adaptive_norm=True)
+    p = random_params(Tokenizer(config).init_params)["decoder"]
+    codes = np.sign(np.random.default_rng(2).normal(size=(2, 4, 4, 6))).astype(np.float32)
+    apply = jax.jit(partial(Decoder(config).apply, capture_intermediates=True))
+    _, state = apply({"params": p}, codes)
+    seen = {name: np.asarray(value["__call__"][0]) for name, value in state["intermediates"].items() if name[0] != "_"}
+    before = {
+        "adaptive_1": seen["mid_block_0"],
+        "adaptive_0": np.asarray(depth_to_space(jnp.array(seen["up_1_upsample"]), 2)),
+    }
+    mean = codes.mean((1, 2))
+    deviation = np.sqrt(((codes - mean[:, None, None]) ** 2).sum((1, 2)) / (4 * 4 - 1) + 1e-6)
+    for name, x in before.items():
+        gamma, beta = (
+            statistic @ p[name][part]["kernel"] + p[name][part]["bias"]
+            for part, statistic in (("gamma", deviation), ("beta", mean))
+        )
+        by_hand = (
+            gamma[:, None, None] * group_norm(x, 4, np.ones(x.shape[-1]), np.zeros(x.shape[-1])) + beta[:, None, None]
+        )
+        np.testing.assert_allclose(seen[name], by_hand, rtol=1e-3, atol=1e-4, err_msg=name)
 
 
 def test_tokens_spell_the_signs_of_the_latents(params: Any, images: np.ndarray) -> None:

@@ -96,8 +96,8 @@ def test_without_resume_a_run_starts_again(tmp_path: Path) -> None:
 class Exploding(Regression):
     """From some step on the loss, or only its gradient, is not a number."""
 
-    def terms(self, params: Any, batch: Any, key: Any) -> Any:
-        total, weight = super().terms(params, batch, key)["error"]
+    def terms(self, params: Any, batch: Any, key: Any, around: Any) -> Any:
+        total, weight = super().terms(params, batch, key, around)["error"]
         return {"error": (total + self.poison(params), weight)}
 
     def poison(self, params: Any) -> Any:

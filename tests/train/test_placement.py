@@ -28,6 +28,9 @@ def test_every_placement_gives_the_same_parameters_on_uneven_batches() -> None:
         assert apart[placement]["largest"] < 1e-5, apart
         assert apart[placement]["share"] < 1e-5, apart
     assert apart["mean of ratios"]["share"] > 0.1, "the batches are too even to tell the right loss from the wrong one"
+    assert apart["tokenizer"].keys() == {"generator", "discriminator", "averages"}
+    assert max(apart["tokenizer"].values()) < 1e-5, apart
+    assert min(apart["tokenizer apart"].values()) > 0.1, "the images are too even to tell the placements apart"
 
 
 @pytest.mark.parametrize(

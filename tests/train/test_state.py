@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 
-from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.config import ConfigError, LoopConfig, OptimizerConfig
 from rsjax.train.state import create_state, learning_rate, make_optimizer
 from rsjax.train.step import train_step
 from tests.train.toy import Regression, records
@@ -21,6 +21,31 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_to_its_final_share() -> N
     np.testing.assert_allclose(rates[[0, 2, 4, 12, 20]], [0.0, 0.05, 0.1, 0.1 * (0.2 + 0.8 / 2), 0.02], atol=1e-8)
     assert np.all(np.diff(rates[:5]) > 0)
     assert np.all(np.diff(rates[4:]) < 0)
+
+
+def test_the_learning_rate_of_steps_falls_to_a_tenth_at_each_share_of_the_run() -> None:
+    optimizer = OptimizerConfig(learning_rate=0.1, warmup_steps=2, schedule="steps", drop_at=(200 / 270, 250 / 270))
+    rate = learning_rate(LoopConfig(steps=27, optimizer=optimizer))
+    np.testing.assert_allclose([rate(step) for step in (0, 1, 2, 19)], [0.0, 0.05, 0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose([rate(step) for step in (20, 24, 25, 27)], [0.01, 0.01, 0.001, 0.001], rtol=1e-6)
+    assert learning_rate(LoopConfig(steps=27, optimizer=replace(optimizer, warmup_steps=0)))(0) == np.float32(0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 200.0])
+def test_drops_outside_the_run_are_refused(share: float) -> None:
+    with pytest.raises(ConfigError, match="optimizer.drop_at is .*shares of the run"):
+        OptimizerConfig(schedule="steps", drop_at=(0.5, share))
+
+
+def test_without_clipping_a_large_gradient_counts_in_full() -> None:
+    params = {"w": jax.numpy.zeros(2)}
+    moments = {}
+    for clip in (0.0, 0.5):
+        tx = make_optimizer(replace(LOOP, optimizer=replace(OPTIMIZER, grad_clip=clip)))
+        _, state = tx.update({"w": jax.numpy.array([30.0, 40.0])}, tx.init(params), params)
+        moments[clip] = optax.tree_utils.tree_get(state, "mu")["w"]
+    np.testing.assert_allclose(moments[0.0], 0.1 * np.array([30.0, 40.0]), rtol=1e-5)
+    np.testing.assert_allclose(moments[0.5], 0.1 * np.array([0.3, 0.4]), rtol=1e-5)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
@@ -73,6 +98,7 @@ def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
 def test_without_an_average_later_stages_use_the_parameters() -> None:
     state = create_state(Regression(), LOOP)
     assert state.ema is None
+    assert state.extra is None
     assert state.weights is state.params
 
 

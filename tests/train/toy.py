@@ -13,11 +13,12 @@ from rsjax.config import LoopConfig
 from rsjax.data.loader import Loader, batches
 from rsjax.objective.losses import Term
 from rsjax.train.loop import fit
+from rsjax.train.objectives import Objective, Surroundings
 from rsjax.train.state import TrainState
 
 
 @dataclass(frozen=True)
-class Regression:
+class Regression(Objective):
     """Predicts y from x, both noisy."""
 
     inputs: int = 3
@@ -29,7 +30,7 @@ class Regression:
     def init(self, key: Array) -> Any:
         return {"w": jax.random.normal(key, (self.inputs,)), "b": jnp.zeros(())}
 
-    def terms(self, params: Any, batch: Any, key: Array) -> dict[str, Term]:
+    def terms(self, params: Any, batch: Any, key: Array, around: Surroundings) -> dict[str, Term]:
         noise = 0.1 * jax.random.normal(key)
         error = batch["x"][:, : self.inputs] @ params["w"] + params["b"] + noise - batch["y"]
         return {"error": (jnp.sum(jnp.square(error)), jnp.float32(error.size))}

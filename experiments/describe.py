@@ -1,0 +1,36 @@
+"""What a preset comes to: modules, parameters, operations, memory. ``python -m experiments.describe roboscape_s``"""
+
+import json
+import sys
+from dataclasses import dataclass
+
+from experiments.cli import main_errors, parse
+
+PROG = "python -m experiments.describe"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of this command."""
+
+    json: bool = False
+    """Print the figures as one JSON object instead."""
+
+
+@main_errors()
+def main() -> None:
+    """Prints the description."""
+    config, options = parse(sys.argv[1:], PROG, "Counts parameters, operations and memory, from shapes.", Options())
+    from rich.console import Console
+
+    from rsjax.describe import describe, render
+
+    description = describe(config)
+    if options.json:
+        print(json.dumps({"preset": description.name} | description.figures, indent=1))
+    else:
+        Console().print(render(description))
+
+
+if __name__ == "__main__":
+    main()

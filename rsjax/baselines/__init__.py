@@ -1,0 +1,1 @@
+"""What rsjax is compared with."""

@@ -1,0 +1,57 @@
+"""Public checkpoints in and out. ``python -m rsjax.convert tokenizer IN OUT``"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rsjax.errors import UserError
+
+PROG = "python -m rsjax.convert"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(PROG, description="Reads public PyTorch and safetensors files, and writes them.")
+    kinds = top.add_subparsers(dest="kind", required=True, metavar="tokenizer|genie|lpips")
+    helps = {
+        "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
+        "genie": "1xgpt's Genie (STMaskGIT); its config.json is read where it lies beside IN",
+        "lpips": "the perceptual distance: torchvision's backbone and the published heads",
+    }
+    for kind, text in helps.items():
+        command = kinds.add_parser(kind, help=text, description=text)
+        command.add_argument("source", metavar="IN", type=Path, help="a public file, or a directory made here")
+        command.add_argument("out", metavar="OUT", type=Path, help="a directory, or a .safetensors file")
+        if kind == "tokenizer":
+            command.add_argument("--weights", choices=("raw", "ema"), default="raw", help="the last, or their average")
+        if kind == "genie":
+            command.add_argument("--heads", type=int, help="attention heads, where no config.json tells")
+        if kind == "lpips":
+            command.add_argument("--heads-file", type=Path, help="where IN is the backbone alone")
+    return top
+
+
+def main(argv: Sequence[str]) -> None:
+    """Converts; prints what was written. Errors that the user can cure are one line, with exit status 2."""
+    options = parser().parse_args(argv)
+    # JAX is loaded only now, after arguments are known to be good.
+    from rsjax.convert import commands
+
+    try:
+        if options.kind == "tokenizer":
+            lines = commands.convert_tokenizer(options.source, options.out, options.weights)
+        elif options.kind == "genie":
+            lines = commands.convert_genie(options.source, options.out, options.heads)
+        else:
+            sources = [options.source] + ([options.heads_file] if options.heads_file else [])
+            lines = commands.convert_lpips(sources, options.out)
+    except UserError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from None
+    for line in lines:
+        print(line)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

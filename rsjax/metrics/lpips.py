@@ -1,0 +1,157 @@
+"""LPIPS, the learned perceptual distance of images (Zhang et al. 2018, version 0.1), with AlexNet or VGG16.
+
+Its weights are not part of this project: they are read from one safetensors file, which
+``python -m rsjax.convert lpips`` writes from the public ones:
+
+    backbone.{i}.weight, .bias   torchvision's ``features.{i}``: (out, in, kernel, kernel), (out,)
+    head.{k}.weight              of tap k: (1, channels, 1, 1)
+    metadata                     {"net": "alexnet" | "vgg16"}
+
+Without that file there is no LPIPS.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from safetensors import SafetensorError, safe_open
+
+from rsjax.errors import UserError
+
+
+class LpipsError(UserError):
+    """LPIPS weights that are missing or are not what their file claims."""
+
+
+class _Conv(NamedTuple):
+    """One convolution with its ReLU, as torchvision numbers and shapes it."""
+
+    number: int
+    channels: int
+    kernel: int = 3
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0  # side of the max pooling before it, of stride 2; 0: none
+    tap: bool = False  # its output is compared
+
+
+NETS: dict[str, tuple[_Conv, ...]] = {
+    "alexnet": (
+        _Conv(0, 64, kernel=11, stride=4, padding=2, tap=True),
+        _Conv(3, 192, kernel=5, padding=2, pool=3, tap=True),
+        _Conv(6, 384, pool=3, tap=True),
+        _Conv(8, 256, tap=True),
+        _Conv(10, 256, tap=True),
+    ),
+    "vgg16": (
+        _Conv(0, 64),
+        _Conv(2, 64, tap=True),
+        _Conv(5, 128, pool=2),
+        _Conv(7, 128, tap=True),
+        _Conv(10, 256, pool=2),
+        _Conv(12, 256),
+        _Conv(14, 256, tap=True),
+        _Conv(17, 512, pool=2),
+        _Conv(19, 512),
+        _Conv(21, 512, tap=True),
+        _Conv(24, 512, pool=2),
+        _Conv(26, 512),
+        _Conv(28, 512, tap=True),
+    ),
+}
+
+_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
+_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
+
+
+def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Array, "*B H W 3"]) -> Float[Array, "*B"]:
+    """The distance of each pair of images; 0 where they are the same.
+
+    Args:
+        params: as :func:`load_lpips` gives them; their numbering tells the network. Any width will do.
+        one: values in [-1, 1].
+        other: the same shape.
+    """
+    batch = one.shape[:-3]
+    pair = jnp.stack([one, other]).astype(jnp.float32)
+    taps = _features(params["backbone"], pair.reshape(-1, *one.shape[-3:]))
+    distance = jnp.float32(0)
+    for k, features in enumerate(taps):
+        first, second = jnp.split(_unit(features), 2)
+        weight = params["head"][str(k)]["weight"][0, :, 0, 0]
+        distance += jnp.mean(jnp.square(first - second) @ weight, axis=(1, 2))
+    return distance.reshape(batch)
+
+
+def load_lpips(path: str | Path) -> dict[str, Any]:
+    """The weights in a file, as a nested dict by the parts of their names: ``["backbone"]["0"]["weight"]``.
+
+    Raises:
+        LpipsError: there is no such file, it is damaged, or a tensor is missing, left over or misshapen.
+    """
+    if not Path(path).is_file():
+        raise LpipsError(f"{path}: no such LPIPS weights; make them with python -m rsjax.convert lpips")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            net = (file.metadata() or {}).get("net")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dict
+    except SafetensorError as error:
+        raise LpipsError(f"{path}: not a safetensors file, or damaged ({error}); make it again") from error
+    if net not in NETS:
+        raise LpipsError(f"{path}: its metadata name the net {net!r}, not one of {', '.join(NETS)}; make it again")
+    wanted = lpips_shapes(net)
+    for name in sorted(wanted.keys() | tensors.keys()):
+        found = tensors[name].shape if name in tensors else "missing"
+        if found != wanted.get(name, "none"):
+            raise LpipsError(f"{path}: {name} is {found}, {net} needs {wanted.get(name, 'none')}; make it again")
+    nested: dict[str, Any] = {"backbone": {}, "head": {}}
+    for name, tensor in tensors.items():
+        part, index, kind = name.split(".")
+        nested[part].setdefault(index, {})[kind] = tensor.astype(np.float32)
+    return nested
+
+
+def lpips_shapes(net: str) -> dict[str, tuple[int, ...]]:
+    """The shape of every tensor of a file, by name."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    width, taps = 3, 0
+    for conv in NETS[net]:
+        shapes[f"backbone.{conv.number}.weight"] = (conv.channels, width, conv.kernel, conv.kernel)
+        shapes[f"backbone.{conv.number}.bias"] = (conv.channels,)
+        if conv.tap:
+            shapes[f"head.{taps}.weight"] = (1, conv.channels, 1, 1)
+            taps += 1
+        width = conv.channels
+    return shapes
+
+
+def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list[Float[Array, "B h w C"]]:
+    """The tapped outputs, from the first to the last."""
+    net = next(convs for convs in NETS.values() if {str(conv.number) for conv in convs} == backbone.keys())
+    x, taps = (images - _SHIFT) / _SCALE, []
+    for conv in net:
+        if conv.pool:
+            x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, conv.pool, conv.pool, 1), (1, 2, 2, 1), "VALID")
+        layer = backbone[str(conv.number)]
+        x = jax.lax.conv_general_dilated(
+            x,
+            layer["weight"],
+            (conv.stride, conv.stride),
+            [(conv.padding, conv.padding)] * 2,
+            dimension_numbers=("NHWC", "OIHW", "NHWC"),
+        )
+        x = jax.nn.relu(x + layer["bias"])
+        if conv.tap:
+            taps.append(x)
+    return taps
+
+
+def _unit(features: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
+    """Each position's features at length 1."""
+    square = jnp.sum(jnp.square(features), axis=-1, keepdims=True)
+    # The root has no gradient where every feature is 0; the public code's is not a number there.
+    length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return features / (length + 1e-10)

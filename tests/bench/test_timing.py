@@ -1,0 +1,33 @@
+import resource
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsjax.bench.timing import median_seconds, peak_memory_bytes
+
+
+@pytest.mark.parametrize(
+    ("most", "budget", "runs"), [(7, 1e9, 7), (7, 0.0, 3)], ids=["as many as allowed", "three where time is short"]
+)
+def test_one_run_warms_up_and_repetitions_end_with_their_number_or_the_time(
+    most: int, budget: float, runs: int
+) -> None:
+    calls = []
+    assert median_seconds(lambda: calls.append(0), budget, most) >= 0
+    assert len(calls) == 1 + runs
+
+
+def test_the_median_leaves_out_warm_up_and_one_slow_run() -> None:
+    seconds = iter([0.3, 0.02, 0.3, 0.02])
+    assert 0.02 <= median_seconds(lambda: time.sleep(next(seconds)), 1.0, most=3) < 0.2
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_peak_memory_grows_by_what_is_touched_and_stays() -> None:
+    before = peak_memory_bytes()
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    np.ones((before - resident + 2**25) // 8)
+    assert before + 2**24 <= peak_memory_bytes() < before + 2**27

@@ -1,0 +1,122 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import ModelConfig
+from rsjax.convert.files import ConvertError
+from rsjax.convert.genie import from_public, infer_config, read_settings, settings_of, table
+from rsjax.convert.table import public_shapes, to_tensors
+from rsjax.model.world_model import WorldModel
+from tests.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
+
+LAYERS, WIDTH, HEADS, FRAMES, CELLS, CODES = 3, 16, 2, 3, 4, 8
+SETTINGS = {"num_layers": LAYERS, "num_heads": HEADS, "d_model": WIDTH, "image_vocab_size": CODES**2, "S": CELLS}
+
+
+def tensors(qk_norm: bool = False) -> Tensors:
+    return random_tensors(genie_shapes(LAYERS, WIDTH, HEADS, FRAMES, CELLS, CODES, qk_norm))
+
+
+def source(tmp_path: Path) -> Path:
+    return tmp_path / "model.safetensors"
+
+
+@pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
+@pytest.mark.parametrize("qk_norm", [False, True])
+def test_the_published_sizes_have_the_published_names_and_shapes(width: int, published: int, qk_norm: bool) -> None:
+    config = ModelConfig(width=width, depth=False, action_dim=0, qk_norm=qk_norm)
+    shapes = public_shapes(table(config), jax.eval_shape(WorldModel(config).init_params, jax.random.key(0)))
+    assert shapes == genie_shapes(32, width, 8, 16, 256, 512, qk_norm)
+    if not qk_norm:
+        assert sum(int(np.prod(shape)) for shape in shapes.values()) == published
+
+
+@pytest.mark.parametrize(("qk_norm", "mup"), [(False, False), (True, True)], ids=["plain", "qk-norm and muP"])
+def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool, mup: bool) -> None:
+    public, rng = tensors(qk_norm), np.random.default_rng(0)
+    config, params = from_public(Path("file"), public, SETTINGS | {"use_mup": mup, "qk_norm": qk_norm})
+    assert (config.mup, config.qk_norm, config.action_dim, config.depth) == (mup, qk_norm, 0, False)
+    tokens = rng.integers(0, CODES**2, (2, FRAMES, 2, 2), np.int32)
+    mask = rng.random(tokens.shape) < 0.4
+    logits, _ = jax.jit(lambda *x: WorldModel(config).apply({"params": params}, *x))({"rgb": tokens}, mask, None)
+    flat = (2, FRAMES, CELLS)
+    expected = GenieNet(public, LAYERS, HEADS, mup).logits(tokens.reshape(flat), mask.reshape(flat))
+    np.testing.assert_allclose(logits["rgb"], expected, rtol=1e-4, atol=1e-4)
+    assert expected.std() > 0.1
+
+
+@pytest.mark.parametrize("qk_norm", [False, True])
+def test_out_again_is_what_came_in(qk_norm: bool) -> None:
+    public = tensors(qk_norm)
+    config, params = from_public(Path("file"), public, SETTINGS)
+    again = to_tensors(params, table(config))
+    assert again.keys() == public.keys()
+    for name in public:
+        assert again[name].dtype == public[name].dtype
+        np.testing.assert_array_equal(again[name], public[name], err_msg=name)
+    settings = settings_of(config)
+    assert infer_config(Path("file"), again, settings) == config
+    assert settings.items() >= SETTINGS.items()
+
+
+def test_qk_norm_tells_the_number_of_heads_and_nothing_else_does() -> None:
+    assert infer_config(Path("file"), tensors(qk_norm=True), {}).heads == HEADS
+    with pytest.raises(ConvertError, match="--heads"):
+        infer_config(Path("file"), tensors(), {})
+    assert infer_config(Path("file"), tensors(), {}, heads=4).heads == 4
+    with pytest.raises(ConvertError, match="heads is -2"):
+        infer_config(Path("file"), tensors(), {}, heads=-2)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("num_layers", 4), ("qk_norm", True), ("T", 9), ("qkv_bias", True), ("mlp_ratio", 2.0)]
+)
+def test_settings_that_contradict_the_weights_are_named(field: str, value: Any) -> None:
+    with pytest.raises(ConvertError, match=f"config.json.*{field} is {value}, not"):
+        infer_config(Path("file"), tensors(), SETTINGS | {field: value})
+
+
+def test_settings_on_training_are_not_read() -> None:
+    told = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None}
+    assert infer_config(Path("file"), tensors(), told) == infer_config(Path("file"), tensors(), SETTINGS)
+
+
+def test_settings_lie_beside_the_weights(tmp_path: Path) -> None:
+    assert read_settings(source(tmp_path)) == {}
+    beside = tmp_path / "config.json"
+    beside.write_text(json.dumps(SETTINGS))
+    assert read_settings(source(tmp_path)) == SETTINGS
+    for damaged in ("{", "[1]"):
+        beside.write_text(damaged)
+        with pytest.raises(ConvertError, match="config.json"):
+            read_settings(source(tmp_path))
+
+
+def test_all_misfits_are_named_in_one_error() -> None:
+    public = tensors()
+    del public["decoder.layers.1.norm2.bias"]
+    public["decoder.layers.0.spatial_attn.qkv.bias"] = np.zeros(48, np.float32)
+    public["out_x_proj.bias"] = np.zeros(3, np.float32)
+    with pytest.raises(ConvertError) as caught:
+        from_public(Path("file"), public, SETTINGS)
+    message = str(caught.value)
+    assert "missing: decoder.layers.1.norm2.bias" in message
+    assert "left over: decoder.layers.0.spatial_attn.qkv.bias" in message
+    assert "misshapen: out_x_proj.bias is (3,), not (16,)" in message
+
+
+def test_tensors_of_something_else_are_refused() -> None:
+    with pytest.raises(ConvertError, match="no weights of a Genie"):
+        infer_config(Path("file"), {"encoder.conv_in.weight": np.zeros((4, 3, 3, 3))}, SETTINGS)
+
+
+@pytest.mark.parametrize("fields", [{"depth": True}, {"final_norm": True}, {"action_dim": 7}], ids=str)
+def test_what_the_public_format_has_no_name_for_does_not_go_out(fields: dict[str, Any]) -> None:
+    config = ModelConfig(**{"width": 16, "blocks": 2, "heads": 2, "depth": False, "action_dim": 0} | fields)
+    params = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    with pytest.raises(ConvertError, match="no name for these parts"):
+        to_tensors(params, table(config))

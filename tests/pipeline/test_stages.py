@@ -1,0 +1,52 @@
+"""The tokenizer's stage around its training, which is left out."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import LoopConfig, TokenizerTrainConfig
+from rsjax.pipeline import stages
+from rsjax.pipeline.run import Run
+from rsjax.sample.generator import load_tokenizer
+from rsjax.train.objectives import TokenizerObjective
+from rsjax.train.state import TrainState, create_state
+from tests.pipeline import toy
+
+WHOLE = TokenizerTrainConfig(steps=2, perceptual=1.0, adversarial=0.1)
+
+
+def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Run, TrainState]:
+    """A run whose tokenizer is the untrained one that the stage would begin with."""
+    run = Run(replace(toy.config(), tokenizer_train=train), tmp_path / "run", tmp_path / "data")
+    toy.store(run.clips)
+    states = []
+
+    def untrained(objective: TokenizerObjective, loop: LoopConfig, *_: Any, **__: Any) -> TrainState:
+        states.append(create_state(objective, loop))
+        return states[0]
+
+    monkeypatch.setattr(stages, "fit", untrained)
+    (run.directory / "tokenizer").mkdir(parents=True)
+    stages.train_tokenizer(run, resume=True)
+    return run, states[0]
+
+
+def test_the_discriminator_stays_behind_and_the_missing_term_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, state = staged(WHOLE, tmp_path, monkeypatch)
+    assert "discriminator" in state.params
+    jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params["generator"])
+    assert capsys.readouterr().out.count("the LPIPS term is off: tokenizer_train.lpips_weights is empty") == 1
+
+
+def test_what_is_not_asked_for_is_not_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, state = staged(replace(WHOLE, perceptual=0.0, adversarial=0.0), tmp_path, monkeypatch)
+    jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params)
+    assert "LPIPS" not in capsys.readouterr().out

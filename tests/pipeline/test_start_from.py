@@ -1,0 +1,46 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import ModelConfig, TokenizerConfig
+from rsjax.data.store import write_store
+from rsjax.model.world_model import WorldModel
+from rsjax.pipeline.run import Run
+from rsjax.pipeline.stages import train_tokenizer, train_world_model
+from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.train.parts import load_part, save_part
+from tests.pipeline import toy
+
+
+def random_params(init: Any) -> Any:
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(init, jax.random.key(0))
+    return jax.tree.map(lambda x: rng.normal(scale=0.1, size=x.shape).astype(np.float32), shapes)
+
+
+def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path) -> None:
+    cfg, public = toy.config(), tmp_path / "public"
+    tokenizer = random_params(Tokenizer(cfg.tokenizer).init_params)
+    alone = replace(cfg.model, depth=False, action_dim=0)
+    model = random_params(WorldModel(alone).init_params)
+    save_part(public, cfg.tokenizer, tokenizer)
+    save_part(public, alone, model)
+    cfg = replace(
+        cfg,
+        tokenizer_train=replace(cfg.tokenizer_train, start_from=str(public), steps=0),
+        train=replace(cfg.train, start_from=str(public), steps=0),
+    )
+    run = Run(cfg, tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    toy.store(run.clips)
+    train_tokenizer(run, resume=True)
+    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, {"key": "toy"})
+    train_world_model(run, resume=True)
+    # A run directory is laid out as the converted one.
+    jax.tree.map(np.testing.assert_array_equal, load_part(run.directory, TokenizerConfig)[1], tokenizer)
+    begun = load_part(run.directory, ModelConfig)[1]
+    jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], model["blocks"]["rgb"])
+    assert not np.any(begun["action_encoder"]["kernel"])
