@@ -117,7 +117,7 @@ def roboscape_l() -> Config:
 
 
 def genie_35m() -> Config:
-    """The public Genie (1xgpt's GENIE_35M), the paper's baseline: RGB alone, and no actions."""
+    """The public Genie (1xgpt's GENIE_35M): RGB alone, no actions. The paper's baseline of that name reads actions."""
     return _genie("genie_35m", ModelConfig())
 
 

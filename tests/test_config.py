@@ -83,6 +83,15 @@ def test_a_stored_configuration_with_an_unknown_field_is_refused_by_name() -> No
         c.from_dict(c.Config, plain)
 
 
+def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
+    plain = c.to_dict(BASE)
+    del plain["train"]["seed"]
+    assert c.from_dict(c.Config, plain) == BASE
+    for damaged in ([], [["width", 3]], 3):
+        with pytest.raises(c.ConfigError, match="ModelConfig is to be fields by name"):
+            c.from_dict(c.Config, plain | {"model": damaged})
+
+
 @pytest.mark.parametrize(
     ("section", "changes", "names"),
     [

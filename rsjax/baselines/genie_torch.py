@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rsjax.baselines.plain import check_plain
 from rsjax.config import ModelConfig, OptimizerConfig
 
 
@@ -67,14 +68,12 @@ class GenieTorch(nn.Module):
     """Logits (B, T, S, n, V) of tokens (B, T, S); no actions, as in the public Genie.
 
     Raises:
-        ValueError: the model has something that the public code has not (other norms, muP, …).
+        ConfigError: the model has something that the public code has not (other norms, rotary positions, …).
     """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        for name in ("temporal_norm", "final_norm", "qk_norm", "mup"):
-            if getattr(config, name):
-                raise ValueError(f"model.{name} is on; the PyTorch baseline is the plain Genie, without it")
+        check_plain(config)
         self.config = config
         self.pos_embed_TSC = nn.Parameter(torch.zeros(1, config.frames, config.grid**2, config.width))
         self.factored_embeds = nn.ModuleList(
@@ -120,12 +119,13 @@ def make_adamw(model: GenieTorch, optimizer: OptimizerConfig) -> Any:
 def train_step(
     model: GenieTorch, adamw: Any, tokens: Tensor, mask: Tensor, bf16: bool, grad_clip: float = 1.0
 ) -> Tensor:
-    """One step; ``bf16`` runs it under autocast. Returns the loss before it."""
+    """One step; ``bf16`` runs it under autocast; ``grad_clip`` 0 clips nothing. Returns the loss before it."""
     with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
         loss = masked_loss(model, tokens, mask)
     adamw.zero_grad()
     loss.backward()
-    nn.utils.clip_grad_norm_(model.parameters(), grad_clip)
+    if grad_clip > 0:
+        nn.utils.clip_grad_norm_(model.parameters(), grad_clip)
     adamw.step()
     return loss.detach()
 

@@ -22,27 +22,31 @@ BUDGET_SECONDS = 20.0  # for each quantity, if three runs take no longer
 
 def bench(
     config: Config,
-    batch: int,
+    batch: int = 1,
     only: Sequence[str] = PARTS,
     horizons: tuple[int, ...] = (),
     torch: bool = False,
     budget: float = BUDGET_SECONDS,
     say: Callable[[str], None] = lambda line: None,
+    keep: Callable[[dict[str, Any]], None] = lambda numbers: None,
 ) -> dict[str, Any]:
     """Measures the parts named in ``only``, one after the other, in this process.
 
     Args:
         batch: clips in a training step, a rollout and a loader's batch; the tokenizer gets their frames.
-        horizons: frames of the rollouts, prompt included; the model's own number and three times that if empty.
+        horizons: frames of the rollouts, their one prompt frame included; the model's own number and three times that
+            if empty. PyTorch decodes in a window of the first.
         torch: time the PyTorch baseline too.
         budget: seconds after which a quantity's repetitions end, once there are three.
         say: told what is measured, before it is.
+        keep: given after each part all numbers so far, as they would be returned: the next part may run out of memory.
 
     Returns:
         Flat and JSON-ready: what was measured, and on what. Peak memory is the high-water mark up to each part's end.
 
     Raises:
-        UserError: a part is unknown, the batch is not positive, or torch is asked for and not there.
+        UserError: a part is unknown, the batch is not positive, a rollout has nothing to generate, or torch is asked
+            for and is not there or cannot be this model.
     """
     check_request(config, batch, only, horizons, torch)
     horizons = horizons or (config.model.frames, 3 * config.model.frames)
@@ -52,15 +56,17 @@ def bench(
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
         "loader": lambda: parts.load(config, batch, budget),
+        "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),
     }
     numbers = facts(config, batch)
-    for name in (part for part in PARTS if part in only):
+    for name in [part for part in PARTS if part in only] + ["torch"] * torch:
         say(f"measuring {name}")
-        numbers |= works[name]() | {f"{name}_peak_memory_bytes": peak_memory_bytes()}
-    if torch:
-        say("measuring PyTorch")
-        numbers |= torch_baseline(config, batch, budget, config.sim.frames)
-    return numbers | {"peak_memory_bytes": peak_memory_bytes()} | ratios(numbers, config.model.depth)
+        numbers |= works[name]() | {"peak_memory_bytes": peak_memory_bytes()}
+        if name != "torch":  # whose memory on an accelerator jax does not see
+            numbers[f"{name}_peak_memory_bytes"] = numbers["peak_memory_bytes"]
+        numbers |= ratios(numbers, config.model.depth)
+        keep(dict(numbers))
+    return numbers
 
 
 def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int], torch: bool) -> None:
@@ -71,10 +77,12 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
     if batch < 1:
         raise ConfigError(f"--batch is {batch}; at least 1 clip is needed")
     for frames in horizons:
-        if frames <= config.mask.prompt_frames:
-            raise ConfigError(f"--horizons has {frames}; the prompt alone is {config.mask.prompt_frames} frames")
+        if frames <= parts.PROMPT_FRAMES:
+            raise ConfigError(
+                f"--horizons has {frames}; the prompt is {parts.PROMPT_FRAMES} frame, and one must follow"
+            )
     if torch:
-        check_torch()
+        check_torch(config.model)
 
 
 def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, float]:
@@ -83,7 +91,8 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, float]:
         "train_share_of_ceiling": ("train_flops", "matmul_ceiling_flops"),
         "sample_cache_speedup": ("sample_s_per_frame_uncached", "sample_s_per_frame_cached"),
     }
-    if not dual:  # the PyTorch baseline is one branch: only then do both do the same work
+    same_device = (numbers.get("torch_device") == "cpu") == (numbers.get("platform") == "cpu")
+    if same_device and not dual:  # the PyTorch baseline is one branch: only then do both do the same work
         for dtype in ("float32", "bfloat16"):
             over[f"train_speedup_over_torch_{dtype}"] = (f"torch_train_step_s_{dtype}", "train_step_s")
             over[f"sample_speedup_over_torch_{dtype}"] = (

@@ -33,11 +33,14 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(kind: type[T], values: dict[str, Any]) -> T:
-    """The inverse of :func:`to_dict`.
+    """The inverse of :func:`to_dict`. Fields that are missing take their defaults.
 
     Raises:
-        ConfigError: a field is unknown or missing, as in a file written by another version.
+        ConfigError: ``values`` or a part of it holds no fields by name; a field is unknown, as in a file written by
+            another version; or the values cannot run.
+        TypeError: a field without a default is missing.
     """
+    require(isinstance(values, dict), f"{kind.__name__} is to be fields by name; it is {values!r:.40}")
     hints = typing.get_type_hints(kind)
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")

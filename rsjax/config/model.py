@@ -39,11 +39,15 @@ class ModelConfig:
     mup: bool = False  # attention scale 8/head width instead of its root; the heads' input ÷ (width/256)
     embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 is torch's default and so the public code's
     position_std: float = 0.0  # position and mask embeddings likewise; the public code starts them at zero
+    # bfloat16: operands of the linear layers' products (accumulated in float32) and, in frames of many cells or on an
+    # accelerator, of the attention within frames. Parameters, norms and softmaxes stay float32.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per turn of the scan over them: more are faster on a CPU, and compile longer
     remat: bool = runtime(False)  # recompute each block in the backward pass instead of keeping its activations
 
     def __post_init__(self) -> None:
+        for name in ("frames", "grid", "width", "blocks", "heads", "mlp_ratio", "unroll"):
+            require(getattr(self, name) >= 1, f"model.{name} is {getattr(self, name)}; it must be at least 1")
         require(
             self.width % self.heads == 0,
             f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
@@ -58,7 +62,6 @@ class ModelConfig:
             f"model.positions is 'rotary', which turns pairs of channels, but a head has {self.head_width} "
             f"(model.width / model.heads); change one of them",
         )
-        require(self.unroll >= 1, f"model.unroll is {self.unroll}; it must be at least 1")
         require(self.action_dim >= 0, f"model.action_dim is {self.action_dim}; it cannot be negative")
         require(
             self.action_dim > 0 or not (self.integrate_actions or self.action_dropout),

@@ -66,7 +66,7 @@ class TokenizerTrainConfig(LoopConfig):
 
     frames_per_clip: int = 4
     depth_share: float = 0.25  # of the drawn frames: their colourised depth map is taken instead
-    flip: bool = False  # mirror half of the images; those larger than tokenizer.image_size are always cropped at random
+    flip: bool = False  # mirror half of the images
     l1: float = 1.0
     l2: float = 0.0  # not in the reference, which has LPIPS; small models reach a higher PSNR with it
     perceptual: float = 0.0  # LPIPS, 1.0 in the reference; off where lpips_weights is empty

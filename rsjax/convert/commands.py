@@ -53,8 +53,8 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
     config, params = genie.from_public(source, tensors, settings, heads)
     save_part(out, config, params)
     lines = [f"{out}: a world model out of {len(tensors)} tensors, {config}"]
-    if not settings:
-        lines.append(f"no {genie.CONFIG} beside {source.name}: {config.heads} heads and no muP are taken for granted")
+    if settings.get("use_mup") is None:
+        lines.append(f"no use_mup in a {genie.CONFIG} beside {source.name}: taken for a model without muP")
     return lines
 
 

@@ -79,7 +79,8 @@ def _read_torch(path: Path) -> Tensors:
     if not isinstance(state, dict) or not all(isinstance(x, torch.Tensor) for x in state.values()):
         raise ConvertError(f"{path}: neither holds tensors by name nor has a state_dict that does")
     # numpy has no bfloat16; float32 holds every one of its numbers.
-    return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy() for name, x in state.items()}
+    values = {name: x.detach() for name, x in state.items()}  # parameters that want a gradient refuse numpy()
+    return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy() for name, x in values.items()}
 
 
 def _first_line(error: Exception) -> str:

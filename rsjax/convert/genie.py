@@ -22,7 +22,16 @@ FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
 
 
 def table(config: ModelConfig) -> Table:
-    """Every public tensor of the network."""
+    """Every public tensor of the network.
+
+    Raises:
+        ConvertError: positions are not learned, which no public tensor tells.
+    """
+    if config.positions != "learned":
+        raise ConvertError(
+            f"the public format has no name for these parts of the network: model.positions {config.positions!r}; "
+            f"only learned positions can go out"
+        )
     entries: list[Entry] = [
         Entry("pos_embed_TSC", "pos_embed", "lead"),
         Entry("token_embed.mask_token_embed", "rgb_embed/mask_token_embed", "lead"),
@@ -51,7 +60,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The GenieConfig beside a file of weights; empty where there is none.
 
     Raises:
-        ConvertError: it is damaged.
+        ConvertError: it is damaged, or settings of something else.
     """
     beside = path.parent / CONFIG
     if not beside.exists():
@@ -62,6 +71,11 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise ConvertError(f"{beside}: not JSON ({error})") from error
     if not isinstance(settings, dict):
         raise ConvertError(f"{beside}: not a GenieConfig; it holds no settings by name")
+    if not settings.keys() & {"num_layers", "num_heads"}:
+        raise ConvertError(
+            f"{beside}: not a GenieConfig; it has neither num_layers nor num_heads; put the published one beside "
+            f"{path.name}, or nothing of that name"
+        )
     return settings
 
 
@@ -73,7 +87,8 @@ def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads
         heads: overrides the settings' num_heads.
 
     Raises:
-        ConvertError: they are no Genie's, contradict the settings, or leave the number of heads open.
+        ConvertError: they are no Genie's, contradict the settings, or leave the number of heads open; or the settings
+            are of a network that this project does not have.
     """
     position, first = tensors.get("pos_embed_TSC"), tensors.get("token_embed.factored_embeds.0.weight")
     hidden = tensors.get("decoder.layers.0.mlp.fc1.weight")
@@ -96,7 +111,6 @@ def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads
         "factored_vocab_size": len(first),
         "qk_norm": shared is not None,
         "mlp_ratio": len(hidden) / width,
-        **FIXED,
     }
     _check_settings(source, settings, found)
     if heads is None:
@@ -123,11 +137,16 @@ def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads
 
 
 def _check_settings(source: Path, settings: dict[str, Any], found: dict[str, Any]) -> None:
+    config = source.parent / CONFIG
+    for name, only in FIXED.items():
+        if settings.get(name) not in (None, only):
+            given, known = (json.dumps(value) for value in (settings[name], only))
+            raise ConvertError(f"{config}: {name} {given} is not supported, only {known}")
     # Older configurations leave factored_vocab_size out or null: it follows from the others.
     told = {name: settings[name] for name in found if settings.get(name) is not None}
     wrong = [f"{name} is {told[name]}, not {found[name]}" for name in told if told[name] != found[name]]
     if wrong:
-        raise ConvertError(f"{source.parent / CONFIG}: does not fit the weights beside it: {'; '.join(wrong)}")
+        raise ConvertError(f"{config}: does not fit the weights beside it: {'; '.join(wrong)}")
 
 
 def settings_of(config: ModelConfig) -> dict[str, Any]:

@@ -45,6 +45,8 @@ def from_public(source: object, tensors: Tensors) -> tuple[str, Tensors]:
             f"{source}: convolutions features.{{i}} of no network that LPIPS uses ({', '.join(NETS)}); "
             f"give torchvision's weights, and the heads with --heads-file"
         )
+    if not any(name.startswith("head.") for name in found):
+        raise ConvertError(f"{source}: the backbone alone, {nets[0]}; give the published heads with --heads-file")
     check(source, {name: x.shape for name, x in found.items()}, lpips_shapes(nets[0]))
     return nets[0], found
 

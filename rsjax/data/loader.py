@@ -1,7 +1,7 @@
 """Records in batches, read with Grain: an endless seeded order that resumes exactly, or one pass in order.
 
 A transform turns one record into arrays that stack: ``transform(record, rng) -> dict of arrays``. Its generator depends
-only on the loader's seed and the record's place in the order, so random crops resume too. With worker processes it has
+only on the loader's seed and the record's place in the order, so random draws resume too. With worker processes it has
 to be picklable: a module's function or a ``functools.partial`` of one.
 """
 

@@ -63,6 +63,9 @@ NETS: dict[str, tuple[_Conv, ...]] = {
     ),
 }
 
+# Pixels along a side that leave one position in the last tap.
+MIN_SIZES: dict[str, int] = {"alexnet": 31, "vgg16": 16}
+
 _SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 _SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 
@@ -72,7 +75,7 @@ def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Ar
 
     Args:
         params: as :func:`load_lpips` gives them; their numbering tells the network. Any width will do.
-        one: values in [-1, 1].
+        one: values in [-1, 1]; both sides at least :func:`min_size` pixels, below which the distance is not a number.
         other: the same shape.
     """
     batch = one.shape[:-3]
@@ -114,6 +117,11 @@ def load_lpips(path: str | Path) -> dict[str, Any]:
     return nested
 
 
+def min_size(params: dict[str, Any]) -> int:
+    """Pixels that an image's sides must have at least."""
+    return MIN_SIZES[_net(params["backbone"])]
+
+
 def lpips_shapes(net: str) -> dict[str, tuple[int, ...]]:
     """The shape of every tensor of a file, by name."""
     shapes: dict[str, tuple[int, ...]] = {}
@@ -128,11 +136,14 @@ def lpips_shapes(net: str) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def _net(backbone: dict[str, Any]) -> str:
+    return next(net for net, convs in NETS.items() if {str(conv.number) for conv in convs} == backbone.keys())
+
+
 def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list[Float[Array, "B h w C"]]:
     """The tapped outputs, from the first to the last."""
-    net = next(convs for convs in NETS.values() if {str(conv.number) for conv in convs} == backbone.keys())
     x, taps = (images - _SHIFT) / _SCALE, []
-    for conv in net:
+    for conv in NETS[_net(backbone)]:
         if conv.pool:
             x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, conv.pool, conv.pool, 1), (1, 2, 2, 1), "VALID")
         layer = backbone[str(conv.number)]

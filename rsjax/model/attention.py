@@ -3,11 +3,13 @@
 Axes: B clips, T frames, S cells of a frame, C width, h heads, e = C/h head width, q queries, k keys.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
@@ -58,21 +60,36 @@ def attend(
     mask: Bool[Array, "q k"] | None,
 ) -> Float[Array, "*N q h e"]:
     """softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax in float32."""
-    scores = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
-    if mask is not None:
-        scores = jnp.where(mask, scores, jnp.finfo(jnp.float32).min)
-    weights = jax.nn.softmax(scores, axis=-1).astype(v.dtype)
-    return jnp.einsum("...hqk,...khe->...qhe", weights, v)
+    return attend_parts(q, [(k, v, mask)])
+
+
+def attend_parts(
+    q: Float[Array, "*N q h e"], parts: Sequence[tuple[Array, Array, Bool[Array, "q k"] | None]]
+) -> Float[Array, "*N q h e"]:
+    """:func:`attend` over keys and values that lie in several arrays, each with its mask, as if they were one."""
+    scores = []
+    for k, _, mask in parts:
+        product = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+        scores.append(product if mask is None else jnp.where(mask, product, jnp.finfo(jnp.float32).min))
+    weights = jax.nn.softmax(jnp.concatenate(scores, axis=-1), axis=-1)
+    ends = np.cumsum([k.shape[-3] for k, _, _ in parts])[:-1]
+    shares = zip(jnp.split(weights, ends, axis=-1), parts, strict=True)
+    outs = [jnp.einsum("...hqk,...khe->...qhe", share.astype(v.dtype), v) for share, (_, v, _) in shares]
+    return sum(outs[1:], start=outs[0])
 
 
 def attend_cells(
     q: Float[Array, "B T S h e"], k: Float[Array, "B T S h e"], v: Float[Array, "B T S h e"], bf16: bool
 ) -> Float[Array, "B T S h e"]:
     """:func:`attend` within each frame, in the form that is fastest on this platform."""
-    if not (bf16 and jax.default_backend() == "cpu" and q.shape[-3] >= LARGE_FRAME):
-        return attend(q, k, v, None)
-    frames = (x.reshape(-1, *x.shape[2:]) for x in (q, k, v))
-    return attend_in_frames(*frames).reshape(q.shape)
+    frames = [x.reshape(-1, *x.shape[2:]) for x in (q, k, v)]
+    if bf16 and jax.default_backend() != "cpu":
+        out = jax.nn.dot_product_attention(*(x.astype(jnp.bfloat16) for x in frames)).astype(q.dtype)
+    elif bf16 and q.shape[-3] >= LARGE_FRAME:
+        out = attend_in_frames(*frames)
+    else:
+        out = attend(frames[0], frames[1], frames[2], None)
+    return out.reshape(q.shape)
 
 
 def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[Array, "B T S h e"]:
@@ -92,15 +109,23 @@ def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
     return last - (last - jnp.arange(slots)) % slots
 
 
-def _put(held: Float[Array, "B N S C"], new: Float[Array, "B T S C"], start: Any) -> Float[Array, "B N S C"]:
-    return jax.lax.dynamic_update_slice_in_dim(held, new.astype(held.dtype), start, axis=1)
+def put_frames(cache: KeyValues, new: KeyValues, start: Any, ring: bool) -> KeyValues:
+    """A cache with the frames from ``start`` on written in; both with a leading axis over blocks, frames on axis 2.
 
+    Args:
+        ring: slots are taken over where positions pass their number.
+    """
 
-def _put_ring(held: Float[Array, "B N S C"], new: Float[Array, "B T S C"], start: Any) -> Float[Array, "B N S C"]:
-    """Frame by frame, for the slots may go around the end."""
-    for i in range(new.shape[1]):
-        held = _put(held, new[:, i : i + 1], (start + i) % held.shape[1])
-    return held
+    def put(held: Float[Array, "L B N S C"], fresh: Float[Array, "L B T S C"]) -> Float[Array, "L B N S C"]:
+        fresh = fresh.astype(held.dtype)
+        if not ring:
+            return jax.lax.dynamic_update_slice_in_dim(held, fresh, start, axis=2)
+        for i in range(fresh.shape[2]):  # frame by frame, for the slots may go around the end
+            slot = (start + i) % held.shape[2]
+            held = jax.lax.dynamic_update_slice_in_dim(held, fresh[:, :, i : i + 1], slot, axis=2)
+        return held
+
+    return jax.tree.map(put, cache, new)
 
 
 class Attention(nn.Module):
@@ -130,32 +155,36 @@ class Attention(nn.Module):
             x: frames start … start + T - 1.
             start: position of x's first frame (may be traced).
             cache: keys and values of frames before ``start``, frame f in slot f mod N of N; what it holds from
-                ``start`` on is replaced by x's. Where positions pass N, slots are taken over, and a frame must still
-                find all that it attends to: N ≥ config.frames + T - 1.
+                ``start`` on is not read. Where positions pass N, slots are taken over, and a frame must still find
+                all that it attends to: N ≥ config.frames + T - 1.
 
         Returns:
-            The output, and the cache with x's keys and values written in (None where none was given).
+            The output, and x's own keys and values, for :func:`put_frames` (None where no cache was given). Writing
+            them here would copy the cache in every block of every pass.
 
         Raises:
             ValueError: x has more frames than the cache.
         """
         cfg = self.config
         q, k, v = self._project(x)
-        positions = held = start + jnp.arange(x.shape[1])
+        positions = start + jnp.arange(x.shape[1])
         if cfg.positions == "rotary":
             q, k = (rotate(self._heads(y), positions).reshape(y.shape) for y in (q, k))
+        sources = [(KeyValues(k, v), positions)]
         if cache is not None:
-            if x.shape[1] > cache.k.shape[-3]:
-                raise ValueError(f"{x.shape[1]} frames do not fit a cache of {cache.k.shape[-3]}")
-            put = _put_ring if cfg.positions == "rotary" else _put
-            cache = KeyValues(put(cache.k, k, start), put(cache.v, v, start))
-            k, v = cache.k, cache.v
-            held = frames_held(k.shape[1], positions[-1])
+            if x.shape[1] > cache.k.shape[1]:
+                raise ValueError(f"{x.shape[1]} frames do not fit a cache of {cache.k.shape[1]}")
+            sources.insert(0, (cache, frames_held(cache.k.shape[1], start - 1)))
+        parts = [(self._over_time(held.k), self._over_time(held.v), self._sees(positions, at)) for held, at in sources]
+        out = attend_parts(self._over_time(q), parts).swapaxes(1, 2)
+        return self.proj(out.reshape(x.shape)), None if cache is None else KeyValues(k, v)
+
+    def _over_time(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S T h e"]:
+        return self._heads(x.swapaxes(1, 2))
+
+    def _sees(self, positions: Int[Array, " q"], held: Int[Array, " k"]) -> Bool[Array, "q k"]:
         age = positions[:, None] - held[None, :]
-        mask = (age >= 0) & (age < cfg.frames) & (held >= 0)
-        q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))  # B S T h e
-        out = attend(q, k, v, mask).swapaxes(1, 2)
-        return self.proj(out.reshape(x.shape)), cache
+        return (age >= 0) & (age < self.config.frames) & (held >= 0)
 
     def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
         q, k, v = jnp.split(self.qkv(x), 3, axis=-1)

@@ -24,6 +24,8 @@ def _forward(x: Array, w: Array) -> tuple[Array, tuple[Array, Array]]:
 def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
     x, w = saved
     cotangent = cotangent.astype(jnp.bfloat16)
+    if jax.default_backend() != "cpu":
+        return _product(cotangent, w, 1), _product(x.T, cotangent, 0)
     if x.shape[1] <= cotangent.shape[1]:  # the narrower operand is less to move
         return _product(cotangent, w, 1), _product(transposed_in_memory(x), cotangent, 0)
     # Behind a barrier, or XLA turns the product around again to a form that it has no bf16 kernel for.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import Dense, KeyValues, layer_norm
+from rsjax.model.attention import Dense, KeyValues, layer_norm, put_frames
 from rsjax.model.blocks import DualBlock
 from rsjax.tokenizer import lfq
 
@@ -64,7 +64,8 @@ class WorldModel(nn.Module):
             tokens: by branch ("rgb", and "depth" if the model has one); read where ``mask`` is False.
             mask: True where the token is hidden, in both branches.
             actions: row t led into frame start + t; not read where ``config.action_dim`` is 0.
-            start: position of the first given frame (may be traced).
+            start: position of the first given frame. It may be traced; start + T must then not pass ``config.frames``
+                where positions are learned.
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
             drop_actions: True for clips that see the null action instead of theirs; needs ``config.action_dropout``.
 
@@ -72,7 +73,8 @@ class WorldModel(nn.Module):
             float32 logits by branch, and the cache with these frames written in (None where none was given).
 
         Raises:
-            ValueError: the model reads actions and none are given, or they are to be dropped and it has no null action.
+            ValueError: the model reads actions and none are given, or they are to be dropped and it has no null action;
+                or it has no positions for that many frames.
         """
         cfg = self.config
         if drop_actions is not None and not cfg.action_dropout:
@@ -81,6 +83,8 @@ class WorldModel(nn.Module):
         cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
         init = nn.initializers.normal(cfg.position_std)
         rotary = cfg.positions == "rotary"  # then the blocks see to time
+        if not rotary and t + (start if isinstance(start, int) else 0) > cfg.frames:
+            raise ValueError(f"{t} frames from {start} on; the model has learned positions for {cfg.frames}")
         position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
         position = position if rotary else jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
         shared = position + self._action(actions, drop_actions) if cfg.action_dim else position
@@ -89,15 +93,18 @@ class WorldModel(nn.Module):
             for branch in branches(cfg)
         }
         blocks = nn.scan(
-            # In a scan no common subexpression can undo the recomputation, so it needs no barriers against that.
-            nn.remat(DualBlock, prevent_cse=False) if cfg.remat else DualBlock,
+            # Common subexpressions could undo the recomputation within a turn of the scan, not from turn to turn.
+            nn.remat(DualBlock, prevent_cse=cfg.unroll > 1) if cfg.remat else DualBlock,
             variable_axes={"params": 0},
             split_rngs={"params": True},
             in_axes=(0, nn.broadcast),
             length=cfg.blocks,
             unroll=min(cfg.unroll, cfg.blocks),
         )
-        x, cache = blocks(cfg, name="blocks")(x, cache, start)
+        new: Any
+        x, new = blocks(cfg, name="blocks")(x, cache, start)
+        if cache is not None:
+            cache = {branch: put_frames(held, new[branch], start, rotary) for branch, held in cache.items()}
         return {branch: self._head(branch, features) for branch, features in x.items()}, cache
 
     def _action(self, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None) -> Float[Array, "B T 1 C"]:

@@ -65,7 +65,6 @@ def train_tokenizer(run: Run, resume: bool) -> None:
         count=train.frames_per_clip,
         depth_share=train.depth_share,
         scale=cfg.tokenizer.depth_scale,
-        size=cfg.tokenizer.image_size,
         flip=train.flip,
     )
     objective = TokenizerObjective(cfg.tokenizer, train)
@@ -123,6 +122,11 @@ def _token_record(codec: Codec, clip: Record) -> Record:
 def train_world_model(run: Run, resume: bool) -> None:
     """Stage 4."""
     cfg, train = run.config, run.config.train
+    if train.start_from and train.start_from != cfg.tokenizer_train.start_from:
+        note(
+            f"train.start_from {train.start_from} is not tokenizer_train.start_from; "
+            f"its model has to know the tokens of this run's tokenizer"
+        )
     source = open_store(run.output("tokens")).source("train")
     state = fit(
         WorldModelObjective.create(cfg),

@@ -4,8 +4,9 @@ With the temporal cache a frame costs ``steps`` frame passes and its commit one:
 its final tokens) is fused with the first step of frame t, and the last commit is skipped. What a pass with masked cells
 writes into the cache is overwritten before anything reads it, so cached and uncached rollouts agree.
 
-A rollout may be longer than ``model.frames``; :mod:`rsjax.sample.window` says what a frame then remembers. One program
-serves every length up to ``model.frames``, and one each further multiple of it; none grows with the length.
+A rollout may be longer than ``model.frames``; :mod:`rsjax.sample.window` says what a frame then remembers. For a number
+of clips and of prompt frames, one program serves all lengths up to ``model.frames``, and another one those up to each
+further multiple of it: one compilation per multiple. Their arrays grow with the multiple, the programs do not.
 
 Axes: B clips, T frames (P of them given), H×W = S cells, A action dimensions.
 """
@@ -36,6 +37,18 @@ class Prompt:
     tokens: Tokens
     actions: Float[Array, "B P A"]
     cache: Cache  # of all frames but the last, whose commit is fused with the next frame's first step
+    # What the cache was made with, as SampleConfig has it; the stride resolved. Rollouts from here must agree.
+    guided: bool = struct.field(pytree_node=False)
+    window_stride: int = struct.field(pytree_node=False)
+    cache_dtype: str = struct.field(pytree_node=False)
+
+    def check(self, model: ModelConfig, sample: SampleConfig) -> None:
+        """Raises :class:`ValueError` where a rollout with ``sample`` could not go on from this cache."""
+        for name, wanted in _made_with(model, sample).items():
+            if (made := getattr(self, name)) != wanted:
+                raise ValueError(
+                    f"the prompt was encoded with {name} = {made!r}, the rollout has {wanted!r}; encode anew"
+                )
 
 
 def rollout(
@@ -114,9 +127,11 @@ def rollout_from(
 
     Raises:
         ConfigError: the model cannot be sampled like this.
-        ValueError: F is 0, or the prompt is neither of one clip nor of N.
+        ValueError: F is 0, the prompt is neither of one clip nor of N, or it was encoded with guidance where there is
+            none now (or the other way about), with another window stride or another type of cache.
     """
     sample.check(model)
+    prompt.check(model, sample)
     (clips, given), n = prompt.actions.shape[:2], len(actions)
     _check_lengths(given, given + actions.shape[1])
     if clips not in (1, n):
@@ -125,6 +140,15 @@ def rollout_from(
     arguments = _arguments(model, sample, jnp.concatenate([before, actions], axis=1), key, index)
     tokens = _resume(model, replace(sample, seed=0), params, prompt, *arguments)
     return {name: grid[:, : given + actions.shape[1]] for name, grid in tokens.items()}
+
+
+def _made_with(model: ModelConfig, sample: SampleConfig) -> dict[str, Any]:
+    """What decides the shape, the type and the frames of a prompt's cache."""
+    return {
+        "guided": sample.guidance != 1,
+        "window_stride": stride(model, sample),
+        "cache_dtype": sample.cache_dtype,
+    }
 
 
 def _check_lengths(given: int, frames: int) -> None:
@@ -182,7 +206,7 @@ def _encode(model: ModelConfig, sample: SampleConfig, params: Any, prompt: Token
         seen = window_actions(model, actions, base, base, known)
         mask = jnp.zeros((b, known, model.grid**2), bool)
         _, cache = apply_guided(model, sample, params, tokens, mask, seen, 0, cache)
-    return Prompt(prompt, actions, cache)
+    return Prompt(prompt, actions, cache, **_made_with(model, sample))
 
 
 _encode_jit = jax.jit(_encode, static_argnums=(0, 1))

@@ -67,7 +67,7 @@ def entropy_loss(
 
     Code c has probability ∝ exp(2·x·c/τ), so its bits are independent: p_d = σ(4·x_d/τ). Hence the first term is a
     sum of binary entropies, and the average over the batch is a product of two half-code tables of 2^(D/2) entries:
-    no array of N × 2^D is made. float32.
+    no array of N × 2^D is made. float32, also in its products.
 
     Args:
         total: adds arrays over devices. The average is that of all devices' tokens, the mean of this one's.
@@ -78,11 +78,16 @@ def entropy_loss(
 
     half = logits.shape[-1] // 2
     low, high = (_code_probabilities(log_one[:, s], log_zero[:, s]) for s in (slice(half), slice(half, None)))
-    average = total(high.T @ low) / total(jnp.float32(logits.shape[0]))  # (2^(D-half), 2^half)
+    average = total(_product(high.T, low)) / total(jnp.float32(logits.shape[0]))  # (2^(D-half), 2^half)
     of_average = -jnp.sum(average * jnp.log(jnp.maximum(average, 1e-20)))
     return jnp.mean(per_token) - of_average
 
 
 def _code_probabilities(log_one: Float[Array, "N d"], log_zero: Float[Array, "N d"]) -> Float[Array, "N V"]:
     ones = (vocabulary_codes(log_one.shape[-1], 1) + 1) / 2  # (V, d) in {0, 1}
-    return jnp.exp(log_one @ ones.T + log_zero @ (1 - ones).T)
+    return jnp.exp(_product(log_one, ones.T) + _product(log_zero, (1 - ones).T))
+
+
+def _product(left: Float[Array, "a b"], right: Float[Array, "b c"]) -> Float[Array, "a c"]:
+    # Accelerators round the operands by default.
+    return jnp.matmul(left, right, precision=jax.lax.Precision.HIGHEST)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rsjax.config import Config, LossConfig, MaskConfig, ModelConfig, TokenizerConfig, TokenizerTrainConfig, require
-from rsjax.metrics.lpips import load_lpips
+from rsjax.metrics.lpips import load_lpips, min_size
 from rsjax.model.world_model import WorldModel
 from rsjax.objective.losses import Term
 from rsjax.objective.world_model_terms import world_model_terms
@@ -86,10 +86,17 @@ class TokenizerObjective(Objective):
 
         Raises:
             LpipsError: ``train.lpips_weights`` names no sound file.
+            ConfigError: images are too small for its network.
         """
         extra: dict[str, Any] = {}
         if "perceptual" in self.weights:
-            extra["lpips"] = jax.tree.map(jnp.array, load_lpips(self.train.lpips_weights))
+            weights = load_lpips(self.train.lpips_weights)
+            require(
+                self.tokenizer.image_size >= min_size(weights),
+                f"tokenizer.image_size is {self.tokenizer.image_size}; the LPIPS network of "
+                f"{self.train.lpips_weights} needs at least {min_size(weights)}, or tokenizer_train.perceptual 0",
+            )
+            extra["lpips"] = jax.tree.map(jnp.array, weights)
         if "lecam" in self.weights:
             extra["lecam"] = initial_averages()
         return extra or None

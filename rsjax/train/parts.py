@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from rsjax.config import ModelConfig, TokenizerConfig, from_dict, to_dict
+from rsjax.config import ConfigError, ModelConfig, TokenizerConfig, from_dict, to_dict
 from rsjax.data.store import disk_guard, write_atomically
 from rsjax.errors import UserError
 from rsjax.model.world_model import WorldModel
@@ -67,8 +67,11 @@ def save_part(directory: Path, config: TokenizerConfig | ModelConfig, params: An
         raise PartError(f"{directory}: is a run directory; choose another one")
     with disk_guard(directory):
         (directory / kind.weights).parent.mkdir(parents=True, exist_ok=True)
+        # Stopped in between, there is no such part rather than one network's settings beside another's weights.
+        if sections.pop(kind.section, None) is not None:
+            write_atomically(path, _text(sections))
         save_weights(directory / kind.weights, params)
-        write_atomically(path, json.dumps(sections | {kind.section: to_dict(config)}, indent=1).encode())
+        write_atomically(path, _text(sections | {kind.section: to_dict(config)}))
 
 
 def has_part(directory: Path, kind: type) -> bool:
@@ -80,8 +83,7 @@ def load_part(directory: Path, kind: type[C]) -> tuple[C, Any]:
     """The configuration and parameters of the directory's tokenizer or world model.
 
     Raises:
-        PartError: the directory has none.
-        ConfigError: its configuration is of another version.
+        PartError: the directory has none, or its settings are damaged or of another version.
         CheckpointError: its weights are damaged.
     """
     known = KINDS[kind]
@@ -89,7 +91,10 @@ def load_part(directory: Path, kind: type[C]) -> tuple[C, Any]:
     sections = _read(path)
     if known.section not in sections or not has_part(directory, kind):
         raise PartError(f"{directory}: holds no {known.weights} with its settings in {path.name}")
-    config = from_dict(kind, sections[known.section])
+    try:
+        config = from_dict(kind, sections[known.section])
+    except ConfigError as error:
+        raise PartError(f"{path}: {known.section} cannot be read ({error}); make it again") from error
     return config, load_weights(directory / known.weights, jax.eval_shape(known.init(config), jax.random.key(0)))
 
 
@@ -110,7 +115,8 @@ def start_world_model(config: ModelConfig, directory: Path, fresh: Any) -> Any:
     """The parameters that training begins with: the directory's world model, to the letter where it has them.
 
     What it lacks stays fresh (the depth branch) or begins at zero (the depth → RGB projection, the action encoder), so
-    that the logits of RGB are those of the directory's model until training changes them.
+    that the logits of RGB are those of the directory's model until training changes them. An action encoder that it has
+    is taken as it is: it sees actions in the units of the data at hand.
 
     Args:
         fresh: parameters as the objective makes them.
@@ -137,6 +143,8 @@ def _joins_rgb(path: str) -> bool:
 def _load_same(config: TokenizerConfig | ModelConfig, directory: Path) -> Any:
     there, params = load_part(directory, type(config))
     free = KINDS[type(config)].free
+    if isinstance(there, ModelConfig) and there.action_dim:
+        free -= {"integrate_actions"}  # what its action encoder was trained to see
     names = [field.name for field in fields(config) if field.name not in free]
     differing = [n for n in names if getattr(there, n) != getattr(config, n)]
     if differing:
@@ -144,6 +152,10 @@ def _load_same(config: TokenizerConfig | ModelConfig, directory: Path) -> Any:
         section = KINDS[type(config)].section
         raise PartError(f"{directory}: holds another network ({told}); set these fields of {section} alike")
     return params
+
+
+def _text(sections: dict[str, Any]) -> bytes:
+    return json.dumps(sections, indent=1).encode()
 
 
 def _read(path: Path) -> dict[str, Any]:

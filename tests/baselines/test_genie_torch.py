@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, OptimizerConfig
+from rsjax.config import ConfigError, ModelConfig, OptimizerConfig
 from rsjax.model.world_model import WorldModel
 
 torch = pytest.importorskip("torch")
@@ -75,6 +75,20 @@ def test_steps_lower_the_loss_of_the_same_clip(params: Any, bf16: bool) -> None:
     assert losses[-1] < 0.8 * losses[0]
 
 
+def test_a_clip_of_zero_clips_nothing(params: Any) -> None:
+    from rsjax.baselines.genie_torch import make_adamw, train_step
+
+    torch.manual_seed(0)
+    tokens, mask = torch.randint(0, 256, (1, 3, 16)), torch.rand(1, 3, 16) < 0.5
+    norms = []
+    for grad_clip in (0.0, 1e9, 1e-3):
+        model = copied(params)
+        train_step(model, make_adamw(model, OptimizerConfig()), tokens, mask, False, grad_clip)
+        norms.append(torch.stack([p.grad.norm() for p in model.parameters()]).norm().item())
+    assert norms[0] == pytest.approx(norms[1], rel=1e-4) and norms[0] > 0.1
+    assert norms[2] == pytest.approx(1e-3, rel=1e-2)
+
+
 def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(params: Any) -> None:
     from rsjax.baselines.genie_torch import decode_frame
 
@@ -91,5 +105,5 @@ def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(par
 def test_what_the_public_code_has_not_is_refused() -> None:
     from rsjax.baselines.genie_torch import GenieTorch
 
-    with pytest.raises(ValueError, match="model.final_norm is on"):
+    with pytest.raises(ConfigError, match="model.final_norm is on"):
         GenieTorch(dataclasses.replace(TOY, final_norm=True))

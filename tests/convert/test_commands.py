@@ -83,6 +83,19 @@ def test_it_tells_what_was_made_and_what_was_left_aside(tmp_path: Path, capsys: 
     assert aside == "left aside: 1 tensors of loss.discriminator"
 
 
+@pytest.mark.parametrize(
+    ("settings", "told"), [(None, True), ({"num_heads": 2}, True), ({"num_heads": 2, "use_mup": False}, False)]
+)
+def test_it_tells_where_a_genie_is_taken_for_one_without_mup(
+    settings: dict[str, Any] | None, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_safetensors(tmp_path / "in.safetensors", GENIE, {})
+    if settings:
+        (tmp_path / "config.json").write_text(json.dumps(settings))
+    convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
+    assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == told
+
+
 def test_lpips_in_two_files_makes_the_file_that_is_loaded(tmp_path: Path) -> None:
     write_safetensors(tmp_path / "net.safetensors", backbone("alexnet"), {})
     write_safetensors(tmp_path / "heads.safetensors", heads("alexnet"), {})

@@ -2,6 +2,8 @@ import os
 import pickle
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import ml_dtypes
 import numpy as np
@@ -34,8 +36,70 @@ def test_safetensors_come_back_as_they_were_written(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read[name], tensors[name])
 
 
+class FakeTensor:
+    """Like torch's: one that wants a gradient does not turn into an array."""
+
+    dtype = "float32"
+
+    def __init__(self, values: np.ndarray, wants_gradient: bool = True) -> None:
+        self.values, self.wants_gradient = values, wants_gradient
+
+    def detach(self) -> "FakeTensor":
+        return FakeTensor(self.values, wants_gradient=False)
+
+    def numpy(self) -> np.ndarray:
+        if self.wants_gradient:
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad")
+        return self.values
+
+
+@pytest.fixture
+def fake_torch(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """In PyTorch's place, so that what is asked of it is tested without it too. Tests give it its ``load``."""
+    fake = ModuleType("torch")
+    monkeypatch.setattr(fake, "Tensor", FakeTensor, raising=False)
+    monkeypatch.setattr(fake, "bfloat16", "bfloat16", raising=False)
+    monkeypatch.setitem(sys.modules, "torch", fake)
+    return fake
+
+
+@pytest.mark.parametrize("suffix", PICKLED)
+def test_pytorch_is_asked_for_tensors_alone(
+    tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    asked: list[tuple[Any, dict[str, Any]]] = []
+
+    def load(file: Any, **options: Any) -> Any:
+        asked.append((file, options))
+        return {"state_dict": {"a": FakeTensor(np.arange(3.0))}}
+
+    monkeypatch.setattr(fake_torch, "load", load, raising=False)
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(b"anything")
+    tensors, _ = read_tensors(path)
+    [(file, options)] = asked
+    assert file == path
+    assert options["weights_only"] is True
+    np.testing.assert_array_equal(tensors["a"], np.arange(3.0))
+
+
+def test_what_pytorch_refuses_is_refused_with_the_cure(
+    tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(*_: Any, **__: Any) -> Any:
+        raise pickle.UnpicklingError("Weights only load failed.\nmany more lines")
+
+    monkeypatch.setattr(fake_torch, "load", load, raising=False)
+    path = tmp_path / "x.pt"
+    path.write_bytes(b"anything")
+    with pytest.raises(ConvertError, match=r"refused.*\(Weights only load failed\.\).*\.safetensors") as caught:
+        read_tensors(path)
+    assert str(path) in str(caught.value)
+
+
 @pytest.mark.parametrize("suffix", PICKLED)
 def test_a_pickle_that_would_run_a_command_is_refused_and_does_not_run(tmp_path: Path, suffix: str) -> None:
+    pytest.importorskip("torch")
     path, marker = tmp_path / f"x{suffix}", tmp_path / "ran"
     path.write_bytes(pickle.dumps({"state_dict": {"a": Evil(marker)}}, protocol=2))
     with pytest.raises(ConvertError, match=r"\.safetensors") as caught:
@@ -72,12 +136,18 @@ def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path) -> None:
 
 def test_pytorchs_tensors_are_read_bare_or_as_a_state_dict(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    state = {"a.weight": torch.arange(6.0).reshape(2, 3).T, "half": torch.tensor([0.1, 3.0], dtype=torch.bfloat16)}
+    parameter = torch.nn.Parameter(torch.arange(2.0))
+    state = {
+        "p": parameter,
+        "a.weight": torch.arange(6.0).reshape(2, 3).T,
+        "half": torch.tensor([0.1, 3.0], dtype=torch.bfloat16),
+    }
     for name, content in (("bare.pt", state), ("whole.ckpt", {"state_dict": state, "epoch": 3})):
         torch.save(content, tmp_path / name)
         read, metadata = read_tensors(tmp_path / name)
         assert metadata == {}
         np.testing.assert_array_equal(read["a.weight"], np.arange(6.0, dtype=np.float32).reshape(2, 3).T)
+        np.testing.assert_array_equal(read["p"], [0.0, 1.0])
         np.testing.assert_array_equal(read["half"], np.array([0.1, 3.0], ml_dtypes.bfloat16).astype(np.float32))
     for other in ([state], {"state_dict": [1]}, {"state_dict": {"a": 3}}):
         torch.save(other, tmp_path / "other.pt")

@@ -72,16 +72,20 @@ def test_qk_norm_tells_the_number_of_heads_and_nothing_else_does() -> None:
         infer_config(Path("file"), tensors(), {}, heads=-2)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("num_layers", 4), ("qk_norm", True), ("T", 9), ("qkv_bias", True), ("mlp_ratio", 2.0)]
-)
+@pytest.mark.parametrize(("field", "value"), [("num_layers", 4), ("qk_norm", True), ("T", 9), ("mlp_ratio", 2.0)])
 def test_settings_that_contradict_the_weights_are_named(field: str, value: Any) -> None:
     with pytest.raises(ConvertError, match=f"config.json.*{field} is {value}, not"):
         infer_config(Path("file"), tensors(), SETTINGS | {field: value})
 
 
+@pytest.mark.parametrize(("field", "value"), [("qkv_bias", True), ("proj_bias", False), ("mlp_bias", False)])
+def test_settings_that_no_model_here_can_have_are_refused(field: str, value: bool) -> None:
+    with pytest.raises(ConvertError, match=f"config.json: {field} {str(value).lower()} is not supported"):
+        infer_config(Path("file"), tensors(), SETTINGS | {field: value})
+
+
 def test_settings_on_training_are_not_read() -> None:
-    told = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None}
+    told = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None, "qkv_bias": None}
     assert infer_config(Path("file"), tensors(), told) == infer_config(Path("file"), tensors(), SETTINGS)
 
 
@@ -93,6 +97,17 @@ def test_settings_lie_beside_the_weights(tmp_path: Path) -> None:
     for damaged in ("{", "[1]"):
         beside.write_text(damaged)
         with pytest.raises(ConvertError, match="config.json"):
+            read_settings(source(tmp_path))
+
+
+def test_settings_of_something_else_are_refused(tmp_path: Path) -> None:
+    beside = tmp_path / "config.json"
+    for name in ("num_layers", "num_heads"):
+        beside.write_text(json.dumps({name: 2}))
+        assert read_settings(source(tmp_path)) == {name: 2}
+    for other in ({}, {"model_type": "llama", "d_model": WIDTH}):
+        beside.write_text(json.dumps(other))
+        with pytest.raises(ConvertError, match="config.json: not a GenieConfig"):
             read_settings(source(tmp_path))
 
 
@@ -114,7 +129,9 @@ def test_tensors_of_something_else_are_refused() -> None:
         infer_config(Path("file"), {"encoder.conv_in.weight": np.zeros((4, 3, 3, 3))}, SETTINGS)
 
 
-@pytest.mark.parametrize("fields", [{"depth": True}, {"final_norm": True}, {"action_dim": 7}], ids=str)
+@pytest.mark.parametrize(
+    "fields", [{"depth": True}, {"final_norm": True}, {"action_dim": 7}, {"positions": "rotary"}], ids=str
+)
 def test_what_the_public_format_has_no_name_for_does_not_go_out(fields: dict[str, Any]) -> None:
     config = ModelConfig(**{"width": 16, "blocks": 2, "heads": 2, "depth": False, "action_dim": 0} | fields)
     params = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))

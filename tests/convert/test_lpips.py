@@ -59,9 +59,16 @@ def test_a_tokenizers_training_checkpoint_holds_them_too() -> None:
     assert (net, tensors.keys()) == ("vgg16", expected("vgg16"))
 
 
-def test_a_backbone_alone_is_refused_with_the_missing_heads_named() -> None:
-    with pytest.raises(ConvertError, match="missing: head.0.weight.*head.4.weight"):
+def test_a_backbone_alone_is_refused_with_the_cure() -> None:
+    with pytest.raises(ConvertError, match="file: the backbone alone, vgg16; .*--heads-file"):
         from_public("file", backbone("vgg16"))
+
+
+def test_a_missing_head_is_named() -> None:
+    public = backbone("vgg16") | heads("vgg16")
+    del public["lin3.model.1.weight"]
+    with pytest.raises(ConvertError, match="missing: head.3.weight"):
+        from_public("file", public)
 
 
 def test_heads_of_the_other_network_are_refused() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from rsjax.metrics.lpips import NETS, LpipsError, load_lpips, lpips, lpips_shapes
+from rsjax.metrics.lpips import NETS, LpipsError, load_lpips, lpips, lpips_shapes, min_size
 
 TAPS = {"alexnet": (0, 3, 6, 8, 10), "vgg16": (2, 7, 14, 21, 28)}
 POOLED = {"alexnet": {3: 3, 6: 3}, "vgg16": {5: 2, 10: 2, 17: 2, 24: 2}}  # max pooling before these, of this side
@@ -89,6 +89,15 @@ def test_gradients_are_finite_also_where_no_feature_answers(net: str) -> None:
     alive = gradient(params, *pair())
     assert np.all(np.isfinite(alive))
     assert np.any(alive != 0)
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_the_least_size_is_the_first_with_a_distance(net: str) -> None:
+    params = narrow(net)
+    least = min_size(params)
+    for size, defined in ((least, True), (least - 1, False)):
+        one, other = pair()[0][:, :size, :size], pair()[1][:, :size, :size]
+        assert np.all(np.isfinite(distance(params, one, other))) == defined
 
 
 def random_file(path: Path, **changes: Any) -> Path:

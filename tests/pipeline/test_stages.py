@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import LoopConfig, TokenizerTrainConfig
+from rsjax.data.store import write_store
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
 from rsjax.sample.generator import load_tokenizer
@@ -50,3 +52,26 @@ def test_what_is_not_asked_for_is_not_missed(
     run, state = staged(replace(WHOLE, perceptual=0.0, adversarial=0.0), tmp_path, monkeypatch)
     jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params)
     assert "LPIPS" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("start", "reminded"), [(("", ""), 0), (("a", "a"), 0), (("a", ""), 1), (("a", "b"), 1)])
+def test_weights_from_elsewhere_bring_the_reminder_of_their_tokens(
+    start: tuple[str, str],
+    reminded: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    cfg = toy.config()
+    model_start, tokenizer_start = start
+    cfg = replace(
+        cfg,
+        train=replace(cfg.train, start_from=model_start),
+        tokenizer_train=replace(cfg.tokenizer_train, start_from=tokenizer_start),
+    )
+    run = Run(cfg, tmp_path / "run", tmp_path / "data")
+    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, {"key": "toy"})
+    monkeypatch.setattr(stages, "fit", lambda *_, **__: SimpleNamespace(weights={}))
+    monkeypatch.setattr(stages, "save_weights", lambda *_: None)
+    stages.train_world_model(run, resume=True)
+    assert capsys.readouterr().out.count("the tokens of this run's tokenizer") == reminded

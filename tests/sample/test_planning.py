@@ -55,6 +55,34 @@ def test_a_shared_prompt_is_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen["frames"] == CANDIDATES * (FRAMES - PROMPT) * 3
 
 
+@pytest.mark.parametrize(
+    ("field", "plain", "other"),
+    [
+        ("guided", SampleConfig(), SampleConfig(guidance=2.0)),
+        ("window_stride", SampleConfig(), SampleConfig(window_stride=2)),
+        ("cache_dtype", SampleConfig(), SampleConfig(cache_dtype="bfloat16")),
+    ],
+)
+def test_a_prompt_encoded_for_other_sampling_is_refused(field: str, plain: SampleConfig, other: SampleConfig) -> None:
+    model = replace(RGB, action_dropout=0.1)
+    params, (tokens, actions) = random_params(model), given(model, 2, 4, 1)
+    for before, after in ((plain, other), (other, plain)):
+        prompt = jax.eval_shape(lambda s=before: encode_prompt(model, s, params, tokens, actions[:, :2]))
+        with pytest.raises(ValueError, match=f"the prompt was encoded with {field} = "):
+            rollout_from(model, after, params, prompt, actions[:, 2:], KEY)
+
+
+def test_what_does_not_touch_the_prompts_cache_may_change_after_it() -> None:
+    model = replace(RGB, action_dropout=0.1)
+    params, (tokens, actions) = random_params(model), given(model, 2, FRAMES, 1)
+    sample, alike = SampleConfig(guidance=2.0, temperature=1.0), SampleConfig(guidance=0.5, steps=4, window_stride=3)
+    made = []
+    for encoded in (sample, alike):  # a stride of 0 is half the window: 3
+        prompt = encode_prompt(model, encoded, params, tokens, actions[:, :2])
+        made.append(rollout_from(model, sample, params, prompt, actions[:, 2:], KEY)["rgb"])
+    np.testing.assert_array_equal(made[0], made[1])
+
+
 def test_a_prompt_of_neither_one_clip_nor_as_many_is_refused() -> None:
     params, (tokens, actions) = random_params(RGB), given(RGB, 1, 2, 2)
     prompt = encode_prompt(RGB, SampleConfig(), params, tokens, actions[:, :1])

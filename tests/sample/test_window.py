@@ -1,7 +1,7 @@
 """Rollouts longer than the window."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -10,6 +10,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from rsjax.config import ModelConfig, SampleConfig
+from rsjax.sample import rollout as module
 from rsjax.sample.generator import Units
 from rsjax.sample.rollout import rollout
 from rsjax.sample.window import room, window_actions, window_start
@@ -107,6 +108,17 @@ def test_a_longer_rollout_is_no_larger_a_program(
         calls[frames], sizes[frames] = seen["calls"], str(program).count("\n")
     assert calls == {16: 2, 48: beyond, 96: beyond}
     assert sizes[48] == sizes[96]
+
+
+def test_lengths_up_to_one_multiple_of_the_window_are_one_program_and_the_next_is_another() -> None:
+    model = replace(RGB, frames=16, grid=1, blocks=1, width=12)  # a model of this test alone
+    params, (tokens, actions) = random_params(model), given(model, 1, 49)
+    compiled: Any = module._rollout
+    before, programs = compiled._cache_size(), {}
+    for frames in (*range(33, 49), 49):
+        rollout(model, SampleConfig(steps=1), params, tokens, actions[:, :frames], KEY)
+        programs[frames] = compiled._cache_size() - before
+    assert programs == dict.fromkeys(range(33, 49), 1) | {49: 2}
 
 
 @pytest.mark.parametrize(("positions", "passes"), [("learned", 141 + 4 * 7), ("rotary", 141)])

@@ -12,14 +12,17 @@ from safetensors.numpy import save_file
 from rsjax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from rsjax.metrics.lpips import LpipsError, lpips_shapes
 from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.train import objectives
 from rsjax.train.checkpoint import Checkpoints
 from rsjax.train.objectives import TokenizerObjective
 from rsjax.train.state import TrainState, create_state
 from rsjax.train.step import train_step
+from tests.metrics.test_lpips import narrow
 
 CONFIG = TokenizerConfig(
     image_size=24, patch_size=4, channels=8, channel_multipliers=(1,), res_blocks=1, norm_groups=4, code_bits=4
 )
+LARGER = replace(CONFIG, image_size=32)
 PLAIN = TokenizerTrainConfig(steps=4, ema=0.9)
 WHOLE = replace(PLAIN, adversarial=0.1, perceptual=1.0, lecam_decay=0.5)
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3), np.uint8)
@@ -91,13 +94,32 @@ def test_lpips_weights_ride_along_unchanged(tmp_path: Path) -> None:
     tensors = {n: np.full(s, 0.01, np.float32) for n, s in lpips_shapes("alexnet").items()}
     path = tmp_path / "alexnet.safetensors"
     save_file(tensors, path, metadata={"net": "alexnet"})
-    objective = TokenizerObjective(CONFIG, replace(PLAIN, perceptual=1.0, lpips_weights=str(path)))
+    objective = TokenizerObjective(LARGER, replace(PLAIN, perceptual=1.0, lpips_weights=str(path)))
     extra = objective.init_extra()
     np.testing.assert_array_equal(extra["lpips"]["head"]["4"]["weight"], tensors["head.4.weight"])
     assert objective.next_extra(extra, {}) is extra
     assert hash(objective) == hash(replace(objective))
     with pytest.raises(LpipsError, match="no such LPIPS weights"):
         TokenizerObjective(CONFIG, replace(PLAIN, perceptual=1.0, lpips_weights=str(tmp_path / "other"))).init_extra()
+    small = TokenizerObjective(CONFIG, objective.train)
+    with pytest.raises(ConfigError, match="tokenizer.image_size is 24; the LPIPS network of .* needs at least 31"):
+        small.init_extra()
+
+
+def test_a_step_with_lpips_survives_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = narrow("alexnet")
+    monkeypatch.setattr(objectives, "load_lpips", lambda path: weights)
+    objective = TokenizerObjective(LARGER, replace(PLAIN, perceptual=1.0, lpips_weights="narrow"))
+    images = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
+    begun = fresh(objective)
+    stepped, metrics = jax.jit(partial(train_step, objective, objective.train))(begun, images)
+    assert metrics["perceptual"] > 0
+    same(stepped.extra, {"lpips": weights})
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(stepped, {})
+    restored, _ = checkpoints.restore(begun)
+    checkpoints.close()
+    same(restored, stepped)
 
 
 def test_images_too_small_for_the_discriminator_are_refused() -> None:

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from rsjax.config import LoopConfig, ModelConfig, TokenizerConfig
+from rsjax.convert.genie import from_public
 from rsjax.model.world_model import WorldModel
 from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.train import parts
 from rsjax.train.parts import PartError, load_part, save_part, start_tokenizer, start_world_model
+from tests.convert.public import genie_shapes, random_tensors
 from tests.train.toy import train
 
 ALONE = ModelConfig(frames=3, grid=2, code_bits=4, action_dim=0, width=8, blocks=2, heads=2, depth=False)
@@ -53,13 +56,25 @@ def test_parts_come_back_as_they_were_saved(public: Path) -> None:
         jax.tree.map(np.testing.assert_array_equal, params, random_params(init))
 
 
-def test_a_dual_model_begins_with_the_very_logits_of_the_model_it_starts_from(public: Path) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"qk_norm": True, "mup": True}, {"compute_dtype": "bfloat16"}],
+    ids=["plain", "qk-norm and muP", "bfloat16"],
+)
+def test_a_dual_model_begins_with_the_very_logits_of_the_genie_it_starts_from(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    settings = {"num_heads": ALONE.heads, "use_mup": options.get("mup", False)}
+    tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, options.get("qk_norm", False)))
+    config, params = from_public(Path("file"), tensors, settings)
+    save_part(tmp_path, config, params)
+    alone, dual = replace(config, **options), replace(DUAL, **options)
     # None of the fresh parameters is zero, so that what has to be is made so here.
-    fresh = random_params(WorldModel(DUAL).init_params, seed=1)
-    begun = start_world_model(DUAL, public, fresh)
-    expected = rgb_logits(ALONE, load_part(public, ModelConfig)[1])
-    np.testing.assert_allclose(rgb_logits(DUAL, begun), expected, rtol=1e-5, atol=1e-5)
-    assert not np.allclose(rgb_logits(DUAL, fresh), expected, atol=0.1)
+    fresh = random_params(WorldModel(dual).init_params, seed=1)
+    begun = start_world_model(dual, tmp_path, fresh)
+    expected = rgb_logits(alone, params)
+    np.testing.assert_array_equal(rgb_logits(dual, begun), expected)
+    assert expected.std() > 0.1
     assert jax.tree.map(jnp.shape, begun) == jax.tree.map(jnp.shape, fresh)
     for path in ("depth_embed", "depth_head"):
         jax.tree.map(np.testing.assert_array_equal, begun[path], fresh[path])
@@ -76,6 +91,15 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
     wider = replace(DUAL, action_dim=6)
     with pytest.raises(PartError, match=r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"):
         start_world_model(wider, tmp_path, random_params(WorldModel(wider).init_params))
+    integrated = replace(DUAL, integrate_actions=True)
+    with pytest.raises(PartError, match="integrate_actions is False there, True here"):
+        start_world_model(integrated, tmp_path, saved)
+
+
+def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Path) -> None:
+    integrated = replace(DUAL, integrate_actions=True)
+    fresh = random_params(WorldModel(integrated).init_params)
+    assert not np.any(start_world_model(integrated, public, fresh)["action_encoder"]["kernel"])
 
 
 @pytest.mark.parametrize(("field", "value"), [("heads", 4), ("mup", True), ("blocks", 3), ("frames", 5)])
@@ -103,6 +127,32 @@ def test_what_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
         (tmp_path / "config.json").write_text(text)
         with pytest.raises(PartError, match=str(tmp_path)):
             load_part(tmp_path, ModelConfig)
+
+
+@pytest.mark.parametrize(
+    ("section", "told"), [([], "fields by name"), ("x", "fields by name"), ({"odd": 3}, "no field odd")]
+)
+def test_settings_that_are_none_are_refused_beside_sound_weights(section: Any, told: str, tmp_path: Path) -> None:
+    save_part(tmp_path, TOKENIZER, random_params(Tokenizer(TOKENIZER).init_params))
+    (tmp_path / "config.json").write_text(json.dumps({"tokenizer": section}))
+    with pytest.raises(PartError, match=f"config.json: tokenizer cannot be read .*{told}"):
+        load_part(tmp_path, TokenizerConfig)
+
+
+def test_a_part_whose_replacement_stopped_half_way_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokenizer = random_params(Tokenizer(TOKENIZER).init_params)
+    save_part(tmp_path, TOKENIZER, tokenizer)
+    save_part(tmp_path, ALONE, random_params(WorldModel(ALONE).init_params))
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(parts, "save_weights", stop)
+    with pytest.raises(KeyboardInterrupt):
+        save_part(tmp_path, replace(ALONE, heads=4), {})
+    with pytest.raises(PartError, match="holds no world_model/weights with its settings"):
+        load_part(tmp_path, ModelConfig)
+    jax.tree.map(np.testing.assert_array_equal, load_part(tmp_path, TokenizerConfig)[1], tokenizer)
 
 
 def test_training_begins_with_the_start_and_resumes_without_it(tmp_path: Path) -> None:
