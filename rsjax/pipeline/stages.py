@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data import loader
 from rsjax.data.store import Record, disk_guard, open_store, write_store
 from rsjax.pipeline import evaluation, transforms
@@ -16,7 +17,7 @@ from rsjax.sim.collect import collect
 from rsjax.train.checkpoint import save_weights
 from rsjax.train.loop import fit
 from rsjax.train.objectives import TokenizerObjective, WorldModelObjective
-from rsjax.train.parts import start_tokenizer, start_world_model
+from rsjax.train.parts import check_part, start_tokenizer, start_world_model
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
@@ -26,6 +27,7 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         resume: False starts an unfinished training stage over instead of going on from its checkpoint.
         command: how to repeat the run, for the report.
     """
+    _check_starts(run)
     works: dict[str, Callable[[Run], None]] = {
         "collect": collect_clips,
         "tokenizer": partial(train_tokenizer, resume=resume),
@@ -49,6 +51,15 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         stage(number, len(STAGES), name, notes[name])
         with run.stage(name):
             works[name](run)
+
+
+def _check_starts(run: Run) -> None:
+    """A mistyped path is told before hours of work, not after."""
+    cfg = run.config
+    starts = {"tokenizer": (cfg.tokenizer_train, TokenizerConfig), "world_model": (cfg.train, ModelConfig)}
+    for name, (loop, kind) in starts.items():
+        if loop.start_from and not run.finished(name):
+            check_part(Path(loop.start_from), kind)
 
 
 def collect_clips(run: Run) -> None:

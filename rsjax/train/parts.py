@@ -79,6 +79,13 @@ def has_part(directory: Path, kind: type) -> bool:
     return (directory / KINDS[kind].weights).exists()
 
 
+def check_part(directory: Path, kind: type) -> None:
+    """Raises :class:`PartError` where the directory does not hold weights of this kind with their settings."""
+    known = KINDS[kind]
+    if known.section not in _read(directory / "config.json") or not has_part(directory, kind):
+        raise PartError(f"{directory}: holds no {known.weights} with its settings in config.json")
+
+
 def load_part(directory: Path, kind: type[C]) -> tuple[C, Any]:
     """The configuration and parameters of the directory's tokenizer or world model.
 
@@ -88,11 +95,9 @@ def load_part(directory: Path, kind: type[C]) -> tuple[C, Any]:
     """
     known = KINDS[kind]
     path = directory / "config.json"
-    sections = _read(path)
-    if known.section not in sections or not has_part(directory, kind):
-        raise PartError(f"{directory}: holds no {known.weights} with its settings in {path.name}")
+    check_part(directory, kind)
     try:
-        config = from_dict(kind, sections[known.section])
+        config = from_dict(kind, _read(path)[known.section])
     except ConfigError as error:
         raise PartError(f"{path}: {known.section} cannot be read ({error}); make it again") from error
     return config, load_weights(directory / known.weights, jax.eval_shape(known.init(config), jax.random.key(0)))

@@ -4,14 +4,15 @@ from typing import Any
 
 import jax
 import numpy as np
+import pytest
 
 from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.store import write_store
 from rsjax.model.world_model import WorldModel
 from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import train_tokenizer, train_world_model
+from rsjax.pipeline.stages import run_all, train_tokenizer, train_world_model
 from rsjax.tokenizer.magvit2 import Tokenizer
-from rsjax.train.parts import load_part, save_part
+from rsjax.train.parts import PartError, load_part, save_part
 from tests.pipeline import toy
 
 
@@ -44,3 +45,13 @@ def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path)
     begun = load_part(run.directory, ModelConfig)[1]
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], model["blocks"]["rgb"])
     assert not np.any(begun["action_encoder"]["kernel"])
+
+
+@pytest.mark.parametrize("section", ["tokenizer_train", "train"])
+def test_a_path_without_weights_is_told_before_anything_is_simulated(tmp_path: Path, section: str) -> None:
+    cfg = toy.config()
+    loop = replace(getattr(cfg, section), start_from=str(tmp_path / "nowhere"))
+    run = Run(replace(cfg, **{section: loop}), tmp_path / "run", tmp_path / "data")
+    with pytest.raises(PartError, match="nowhere"):
+        run_all(run)
+    assert not run.clips.exists() and not run.mark("collect")
