@@ -18,9 +18,10 @@ class Options:
     """Options of this command."""
 
     batch: int = 1
-    """Clips in a training step, a rollout and a loader's batch."""
+    """Clips in a training step, a rollout and a loader's batch; feed trains with the preset's own."""
     only: str = ""
-    """Parts to measure, with commas between them: matmul,train,sample,tokenizer,loader; all if not given."""
+    """Parts to measure, with commas between them: matmul,train,sample,tokenizer,loader,feed; all if not
+    given."""
     horizons: tuple[int, ...] = ()
     """Frames of the rollouts, their one prompt frame included; the model's own number and three times that if not
     given."""

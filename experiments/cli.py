@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import errno
 import io
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -12,10 +13,28 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from rsjax import presets
-from rsjax.config import Config, ConfigError
-from rsjax.errors import UserError, did_you_mean
+from rsjax.config import Config, ConfigError, StageConfig
+from rsjax.config.stages import GRAMMAR, format_stage, parse_stage
+from rsjax.errors import Preempted, UserError, did_you_mean
+from rsjax.runtime import sigterm_stops
 
 Options = TypeVar("Options")
+
+CONSTRUCTORS = tyro.constructors.ConstructorRegistry()
+
+
+@CONSTRUCTORS.primitive_rule
+def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """A curriculum's stage is one word, such as ``difficult:3:restart``."""
+    if info.type is not StageConfig:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=GRAMMAR,
+        instance_from_str=lambda words: parse_stage(words[0]),
+        is_instance=lambda value: isinstance(value, StageConfig),
+        str_from_instance=lambda stage: [format_stage(stage)],
+    )
 
 
 def parse(argv: Sequence[str], prog: str, description: str, options: Options) -> tuple[Config, Options]:
@@ -63,12 +82,16 @@ def main_errors() -> Iterator[None]:
     """Turns errors that the user can cure into one line on standard error and an exit status, without a traceback.
 
     Around a command's main function, as a decorator or in a ``with``. Exits with 2 for a :class:`UserError`, a full
-    disk or a missing permission, and with 130 for an interrupt. Any other exception is a bug and keeps its traceback.
+    disk or a missing permission, with 130 for an interrupt, and with 75 (to be started again) for SIGTERM. Any other
+    exception is a bug and keeps its traceback.
     """
     try:
-        yield
+        with sigterm_stops():
+            yield
     except KeyboardInterrupt:
         _exit("interrupted; the same command resumes", 130)
+    except Preempted as stop:
+        _exit(str(stop), os.EX_TEMPFAIL)
     except UserError as error:
         _exit(f"error: {error}", 2)
     except Exception as error:
@@ -98,7 +121,13 @@ def _parse(kind: Any, default: Any, argv: Sequence[str], prog: str, description:
     try:
         with contextlib.redirect_stderr(captured):
             parsed, unknown = tyro.cli(
-                kind, args=argv, default=default, prog=prog, description=description, return_unknown_args=True
+                kind,
+                args=argv,
+                default=default,
+                prog=prog,
+                description=description,
+                return_unknown_args=True,
+                registry=CONSTRUCTORS,
             )
     except SystemExit as stop:
         if not stop.code:

@@ -84,7 +84,7 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
     - ``bytes_train_state``: of the world model's parameters, optimizer, averages and gradients. Once a device.
     - ``bytes_activations_per_clip``: what the backward pass keeps of the forward pass, that and the loss as autodiff
       sees them; the compiler may keep less. ``…_remat``: each block's input, and all of the one block that is being
-      recomputed. ``model.remat`` says which of the two applies.
+      recomputed. ``model.remat`` says what applies: none or blocks; products lies between.
     - ``bytes_cache_…``: temporal keys and values of one rollout of ``model.frames`` frames.
     """
     model, world, tokenizer = config.model, modules["world_model"], modules["tokenizer"]
@@ -128,7 +128,7 @@ def _train_state_bytes(config: Config, params: Shapes) -> int:
 
 def activation_bytes(config: Config) -> dict[bool, int]:
     """Bytes per clip that training keeps for the backward pass, without remat (False) and with it (True)."""
-    plain, remat = (_kept(config, replace(config.model, remat=on)) for on in (False, True))
+    plain, remat = (_kept(config, replace(config.model, remat=on)) for on in ("none", "blocks"))
     blocks = config.model.blocks
     one_block = sum(_bytes(x) for x in plain if x.shape[0] == blocks) // blocks
     return {False: sum(map(_bytes, plain)) // _CLIPS, True: (sum(map(_bytes, remat)) + one_block) // _CLIPS}

@@ -24,3 +24,7 @@ def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
     choices = list(choices)
     near = [c for c in choices if c.rpartition(".")[2] == word] or difflib.get_close_matches(word, choices, n=1)
     return f"; did you mean {' or '.join(repr(prefix + c) for c in near)}?" if near else ""
+
+
+class Preempted(Exception):
+    """The process was told to stop (SIGTERM) and did, with its work saved. The message says what goes on with it."""

@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Self, SupportsFloat
+from typing import Self, SupportsFloat
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
@@ -12,6 +12,7 @@ from rich.progress import Progress as RichProgress
 TERMINAL_SECONDS = 0.25
 PLAIN_SECONDS = 10.0
 RATE_WINDOW_SECONDS = 30.0  # short enough to forget the first step, which compiles
+_BAR_COLUMNS = 30  # taken by the bar and the space around it
 
 
 def stage(number: int, of: int, name: str, note: str, console: Console | None = None) -> None:
@@ -46,6 +47,7 @@ class Progress:
         start: units that an earlier run had already done.
         console: where to show; standard output by default.
         clock: seconds, monotonic.
+        per_unit: what each unit consists of and how many, such as ``("tokens", 16384)``: a second rate.
     """
 
     def __init__(
@@ -56,8 +58,9 @@ class Progress:
         start: int = 0,
         console: Console | None = None,
         clock: Callable[[], float] = time.monotonic,
+        per_unit: tuple[str, float] | None = None,
     ) -> None:
-        self.stage, self.total, self.unit = stage, total, unit
+        self.stage, self.total, self.unit, self.per_unit = stage, total, unit, per_unit
         self._console = console or Console()
         self._clock = clock
         self._first = self._done = start
@@ -88,32 +91,45 @@ class Progress:
         if now - self._shown < (PLAIN_SECONDS if self._bar is None else TERMINAL_SECONDS):
             return
         self._shown = now
-        text = self._text(scalars)
+        parts, values = self._parts(), [f"{name}={float(value):.4g}" for name, value in scalars.items()]
+        line = ", ".join(parts + values)
         if self._bar is None:
-            _say(self._console, f"  {self.stage}: {text}")
-        else:
-            self._bar.update(self._task, completed=done, text=text)
+            _say(self._console, f"  {self.stage}: {line}")
+            return
+        if len(self.stage) + _BAR_COLUMNS + len(line) > self._console.width:
+            line = f"{', '.join(parts)}\n{', '.join(values)}"
+        self._bar.update(self._task, completed=done, text=line)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
         if kind is None:
             seconds, done = self._clock() - self._began, self._done - self._first
-            rate = f" ({_rate(done / seconds, self.unit)})" if seconds > 0 and done else ""
+            rate = f" ({', '.join(self._rates(done / seconds))})" if seconds > 0 and done else ""
             _say(self._console, f"  {self.stage}: {self._done} {self.unit} in {duration(seconds)}{rate}")
 
-    def _text(self, scalars: dict[str, Any]) -> str:
+    def _parts(self) -> list[str]:
         (then, before), (now, done) = self._samples[0], self._samples[-1]
         parts = [f"{done}/{self.total} {self.unit}"]
         if now > then and done > before:
             rate = (done - before) / (now - then)
-            parts += [_rate(rate, self.unit), f"{duration((self.total - done) / rate)} left"]
-        parts += [f"{name}={float(value):.4g}" for name, value in scalars.items()]
-        return ", ".join(parts)
+            parts += [*self._rates(rate), f"{duration((self.total - done) / rate)} left"]
+        return parts
+
+    def _rates(self, per_second: float) -> list[str]:
+        rates = [f"{per_second:.3g} {self.unit}/s"]
+        if self.per_unit is not None:
+            what, count = self.per_unit
+            rates.append(f"{_thousands(per_second * count)} {what}/s")
+        return rates
 
 
-def _rate(per_second: float, unit: str) -> str:
-    return f"{per_second:.3g} {unit}/s"
+def _thousands(number: float) -> str:
+    """Three digits: ``950``, ``16.4k``, ``2.03M``."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= 0.9995 * size:
+            return f"{number / size:#.3g}".rstrip(".") + letter
+    return f"{number:.3g}"
 
 
 def _say(console: Console, line: str) -> None:

@@ -1,7 +1,14 @@
 """What has to be settled about the process before JAX is loaded."""
 
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from rsjax.errors import Preempted
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
@@ -19,3 +26,24 @@ def tune_process() -> None:
     sys.stdout.flush()
     tuned = os.environ | {"GLIBC_TUNABLES": f"{tunables}:{HUGE_PAGES}".lstrip(":")}
     os.execve(sys.executable, sys.orig_argv, tuned)
+
+
+@contextmanager
+def sigterm_stops() -> Iterator[None]:
+    """Around a command: SIGTERM, by which schedulers say that a process has to go, raises :class:`Preempted`.
+
+    Such a command ends with the exit status 75 (EX_TEMPFAIL), on which a scheduler is to start it again. Training loops
+    save first (:mod:`rsjax.train.preemption`). Does nothing off the main thread, which alone may handle signals.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Preempted("stopped by SIGTERM; the same command resumes")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

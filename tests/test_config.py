@@ -141,6 +141,13 @@ def test_more_keypoints_than_tracks_are_fine_when_keypoints_are_off() -> None:
     assert dataclasses.replace(BASE, loss=loss).loss.terms(depth_branch=True) == {"rgb": 1.0, "depth": 1.0}
 
 
+def test_both_training_loops_are_set_alike_and_nothing_else_changes() -> None:
+    before = presets.debug()
+    after = before.with_loops(profile=3, wandb="robots")
+    assert (after.train.profile, after.tokenizer_train.wandb) == (3, "robots")
+    assert after.with_loops(profile=0, wandb="") == before
+
+
 def test_the_paper_s_loss_weights() -> None:
     loss = c.LossConfig()
     assert loss.terms(depth_branch=True) == {"rgb": 1.0, "depth": 1.0, "keypoint": 0.01, "attention": 1.0}

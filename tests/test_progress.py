@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from rsjax.progress import PLAIN_SECONDS, RATE_WINDOW_SECONDS, Progress, duration, stage
+from rsjax.progress import PLAIN_SECONDS, RATE_WINDOW_SECONDS, Progress, _thousands, duration, stage
 
 
 class Clock:
@@ -104,3 +104,33 @@ def test_headlines_are_printed_as_they_are() -> None:
 )
 def test_duration(seconds: float, words: str) -> None:
     assert duration(seconds) == words
+
+
+def test_a_second_rate_counts_what_a_unit_consists_of() -> None:
+    shown, clock = io.StringIO(), Clock()
+    with Progress("train", 400, "steps", console=Console(file=shown), clock=clock, per_unit=("tokens", 8192)) as bar:
+        clock.now += 20.0
+        bar.update(40, loss=0.25, rgb=3.0)
+    assert shown.getvalue().splitlines() == [
+        "  train: 40/400 steps, 2 steps/s, 16.4k tokens/s, 3 min 00 s left, loss=0.25, rgb=3",
+        "  train: 40 steps in 20 s (2 steps/s, 16.4k tokens/s)",
+    ]
+
+
+@given(st.floats(1e-3, 1e12))
+def test_a_short_number_is_the_number_to_three_digits(number: float) -> None:
+    short = _thousands(number)
+    factor = {"k": 1e3, "M": 1e6, "G": 1e9}.get(short[-1], 1.0)
+    assert float(short.rstrip("kMG")) * factor == pytest.approx(number, rel=0.005)
+    assert len(short) <= 5 or number < 1 or number >= 1e12 * 0.9995
+
+
+def test_a_narrow_terminal_shows_all_scalars_on_a_second_line() -> None:
+    shown, clock = io.StringIO(), Clock()
+    console = Console(file=shown, force_terminal=True, width=80)
+    terms = dict.fromkeys(("loss", "rgb", "depth", "attention", "keypoint"), 0.25)
+    with Progress("world model", 400, "steps", 0, console, clock, ("tokens", 8192)) as progress:
+        clock.now += 20.0
+        progress.update(40, **terms)
+    lines = [line for line in shown.getvalue().splitlines() if "loss=" in line]
+    assert lines and all("loss=0.25, rgb=0.25, depth=0.25, attention=0.25, keypoint=0.25" in line for line in lines)

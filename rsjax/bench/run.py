@@ -11,12 +11,13 @@ import jax
 from rich.table import Table
 
 from rsjax.bench import parts
+from rsjax.bench.feed import feed
 from rsjax.bench.timing import peak_memory_bytes
 from rsjax.bench.torch_part import check_torch, torch_baseline
 from rsjax.config import Config, ConfigError
 from rsjax.errors import did_you_mean
 
-PARTS = ("matmul", "train", "sample", "tokenizer", "loader")
+PARTS = ("matmul", "train", "sample", "tokenizer", "loader", "feed")
 BUDGET_SECONDS = 20.0  # for each quantity, if three runs take no longer
 
 
@@ -33,7 +34,8 @@ def bench(
     """Measures the parts named in ``only``, one after the other, in this process.
 
     Args:
-        batch: clips in a training step, a rollout and a loader's batch; the tokenizer gets their frames.
+        batch: clips in a training step, a rollout and a loader's batch; the tokenizer gets their frames. The part
+            ``feed`` trains with the preset's own.
         horizons: frames of the rollouts, their one prompt frame included; the model's own number and three times that
             if empty. PyTorch decodes in a window of the first.
         torch: time the PyTorch baseline too.
@@ -56,6 +58,7 @@ def bench(
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
         "loader": lambda: parts.load(config, batch, budget),
+        "feed": lambda: feed(config, budget),
         "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),
     }
     numbers = facts(config, batch)
@@ -142,6 +145,8 @@ def _shown(name: str, value: Any) -> str:
         return f"{value / 2**20:,.0f} MiB"
     if not isinstance(value, float):
         return str(value)
+    if name.endswith("_share"):
+        return f"{value:.2%}"
     if "_flops" in name:
         return f"{value / 1e9:,.1f} GFLOP/s"
     if name.endswith("_per_s"):

@@ -12,7 +12,7 @@ from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
 from rsjax.config.run import Config, EvalConfig, SampleConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.config.train import LoopConfig, OptimizerConfig, PartConfig, StageConfig
 
 __all__ = [
     "Config",
@@ -23,8 +23,10 @@ __all__ = [
     "MaskConfig",
     "ModelConfig",
     "OptimizerConfig",
+    "PartConfig",
     "SampleConfig",
     "SimConfig",
+    "StageConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",
     "content_key",

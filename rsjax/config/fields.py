@@ -44,12 +44,17 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
     hints = typing.get_type_hints(kind)
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
-    fields = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
-            value = from_dict(hints[name], value)
-        fields[name] = tuple(value) if isinstance(value, list) else value
-    return kind(**fields)
+    return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})
+
+
+def _read(name: str, hint: Any, value: Any) -> Any:
+    """A field's value out of JSON's: dataclasses out of objects and tuples out of lists, also within one another."""
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value)
+    if typing.get_origin(hint) is tuple:
+        require(isinstance(value, list), f"{name} is to be a list; it is {value!r:.40}")
+        return tuple(_read(name, typing.get_args(hint)[0], item) for item in value)
+    return value
 
 
 def content_key(*parts: Any) -> str:
@@ -62,6 +67,8 @@ def content_key(*parts: Any) -> str:
 
 
 def _content(part: Any) -> Any:
+    if isinstance(part, tuple):
+        return [_content(item) for item in part]
     if not dataclasses.is_dataclass(part):
         return part
     kept = [f.name for f in dataclasses.fields(part) if not f.metadata.get("runtime")]

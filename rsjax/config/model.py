@@ -43,7 +43,9 @@ class ModelConfig:
     # accelerator, of the attention within frames. Parameters, norms and softmaxes stay float32.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per turn of the scan over them: more are faster on a CPU, and compile longer
-    remat: bool = runtime(False)  # recompute each block in the backward pass instead of keeping its activations
+    # What the backward pass finds kept: none recomputes nothing, blocks keeps each block's input alone, products the
+    # linear layers' outputs as well (less to compute again, more memory).
+    remat: Literal["none", "products", "blocks"] = runtime("none")
 
     def __post_init__(self) -> None:
         for name in ("frames", "grid", "width", "blocks", "heads", "mlp_ratio", "unroll"):

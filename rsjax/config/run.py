@@ -1,7 +1,7 @@
 """Settings of sampling and evaluation, and the whole of a run."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from rsjax.config.fields import require
 from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
@@ -108,6 +108,11 @@ class Config:
             not self.loss.keypoints or self.loss.num_keypoints <= self.sim.tracks,
             f"loss.num_keypoints is {self.loss.num_keypoints} but only sim.tracks = {self.sim.tracks} are tracked",
         )
+
+    def with_loops(self, **changes: Any) -> "Config":
+        """This configuration with fields of both training loops set."""
+        tokenizer_train = replace(self.tokenizer_train, **changes)
+        return replace(self, train=replace(self.train, **changes), tokenizer_train=tokenizer_train)
 
     @property
     def action_inputs(self) -> int:

@@ -1,84 +1,113 @@
 """Records in batches, read with Grain: an endless seeded order that resumes exactly, or one pass in order.
 
-A transform turns one record into arrays that stack: ``transform(record, rng) -> dict of arrays``. Its generator depends
-only on the loader's seed and the record's place in the order, so random draws resume too. With worker processes it has
-to be picklable: a module's function or a ``functools.partial`` of one.
+A batch's arrays are the transform's, stacked, and three more of shape (batch,) that say which clips they are: ``part``
+int32 and ``record`` int64, what :meth:`Loader.identify` reads, and ``index`` int32, the place in the batch over all
+processes of a multi-host run.
 """
 
 import logging
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol, Self
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
 
 import absl.flags
 import grain
 import numpy as np
-from grain.experimental import ElasticIterator
 
-from rsjax.data.store import Record, StoreError
+from rsjax.config import ConfigError
+from rsjax.data.order import Arrays, Part, Stage, Transform, ordered
+from rsjax.data.quarantine import MAX_DAMAGED, Quarantine
+from rsjax.data.records import RecordSource, place_of
+from rsjax.data.store import StoreError
 
-MAX_DAMAGED = 0.01  # share of the records that training goes on without
-
-Arrays = dict[str, np.ndarray]
-Transform = Callable[[Record, np.random.Generator], Arrays]
+MAX_RESTARTS = 3  # of worker processes that die before they give a batch
+PLACE = "global_next_index"  # as grain's ElasticIterator calls it
 
 _log = logging.getLogger(__name__)
 
 
-class RecordSource(Protocol):
-    """Random access to records, such as :class:`rsjax.data.store.Source`."""
+class Loader:
+    """An endless iterator of batches. Made by :func:`batches`; close it, or use it as a context manager.
 
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int, /) -> Record: ...
-
-
-class Substituting:
-    """A source that gives the next readable record in place of a damaged one, and logs each once.
+    Cuts and batches as grain's ``ElasticIterator`` does, whose workers cannot be told what to do at their start: the
+    order of the batches is the same for any number of processes and workers.
 
     Args:
-        source: what is read.
+        dataset: one element per record, as :func:`rsjax.data.order.ordered` makes them; endless.
+        sources: what a batch's ``part`` counts.
+        batch_size: over all processes.
+        workers: processes that read and transform; 0: threads of this one.
+        shard: which share of each batch this process gets.
+        quarantine: where damaged records are listed.
+        state: an earlier loader's :meth:`state`.
 
     Raises:
-        StoreError: on reading, when more than ``MAX_DAMAGED`` of the records (and more than one) have been damaged.
+        ConfigError: the batch does not divide over the processes.
     """
 
-    def __init__(self, source: RecordSource) -> None:
-        self._source = source
-        self._most = max(1, int(MAX_DAMAGED * len(source)))
-        self._damaged: set[int] = set()  # those that this process met
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def __getitem__(self, index: int) -> Record:
-        while True:
-            try:
-                return self._source[index]
-            except StoreError as error:
-                self._note(index, error)
-                index = (index + 1) % len(self)
-
-    def _note(self, index: int, error: StoreError) -> None:
-        new = index not in self._damaged
-        self._damaged.add(index)
-        count = f"{len(self._damaged)} of {len(self)} records are damaged"
-        if len(self._damaged) > self._most:
-            raise StoreError(f"{error} ({count}; training goes on without at most {self._most})") from error
-        if new:
-            _log.warning("%s; the next record is used instead (%s)", error, count)
-
-
-class Loader:
-    """An endless iterator of batches. Made by :func:`batches`; close it, or use it as a context manager."""
-
-    def __init__(self, iterator: ElasticIterator) -> None:
-        self._iterator = iterator
+    def __init__(
+        self,
+        dataset: grain.MapDataset,
+        sources: Sequence[RecordSource],
+        batch_size: int,
+        *,
+        workers: int,
+        shard: grain.sharding.ShardOptions,
+        quarantine: Quarantine,
+        state: dict[str, Any] | None,
+    ) -> None:
+        if batch_size % shard.shard_count:
+            raise ConfigError(
+                f"batch_size {batch_size} does not divide over {shard.shard_count} processes; make it a multiple"
+            )
+        self._dataset, self._sources, self._batch_size = dataset, sources, batch_size
+        self._workers, self._shard, self._quarantine = workers, shard, quarantine
+        self._place = 0 if state is None else int(state[PLACE])
+        self._iterator: Any = None
+        self._restarts = 0
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> Arrays:
-        return next(self._iterator)
+        arrays = self._fetch()
+        self._place += self._batch_size
+        local = np.arange(self._batch_size // self._shard.shard_count, dtype=np.int32)
+        return arrays | {"index": self._shard.shard_index + self._shard.shard_count * local}
+
+    def _fetch(self) -> Arrays:
+        while True:
+            if self._iterator is None:
+                self._iterator = iter(self._cut())
+            try:
+                arrays = next(self._iterator)
+                self._restarts = 0
+                return arrays
+            except RuntimeError as error:  # so Grain says that a worker was killed, for lack of memory mostly
+                if not self._workers or "terminated unexpectedly" not in str(error):
+                    raise
+                self.close()
+                self._restarts += 1
+                if self._restarts > MAX_RESTARTS:
+                    raise StoreError(
+                        f"processes that read data died {self._restarts} times in a row, the last with: {error}; "
+                        f"run again with fewer workers (now {self._workers})"
+                    ) from error
+                _log.warning("a process that reads data died (%s); it is started again", error)
+
+    def _cut(self) -> grain.IterDataset:
+        shard = self._shard
+        cut = self._dataset[self._place + shard.shard_index :: shard.shard_count]
+        cut = cut.batch(self._batch_size // shard.shard_count, drop_remainder=True)
+        cut = cut.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))  # in batches
+        if not self._workers:
+            return cut
+        absl.flags.FLAGS.mark_as_parsed()  # Grain's workers refuse to start otherwise
+        return cut.mp_prefetch(grain.MultiprocessingOptions(self._workers, per_worker_buffer_size=2), _start_worker)
 
     def __enter__(self) -> Self:
         return self
@@ -88,11 +117,45 @@ class Loader:
 
     def state(self) -> dict[str, Any]:
         """Where the order stands, JSON-ready: :func:`batches` given this goes on with the batch that would be next."""
-        return self._iterator.get_state()
+        return {PLACE: self._place}
+
+    def identify(self, arrays: Arrays) -> list[dict[str, Any]]:
+        """Where the records of a batch lie and where they come from, JSON-ready, one object a row.
+
+        ``store``, ``split``, ``record`` and ``file`` say where it lies (of a source that is not a store's, ``record``
+        alone); ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
+        """
+        return [
+            _describe(self._sources[part], int(record))
+            for part, record in zip(arrays["part"], arrays["record"], strict=True)
+        ]
+
+    def whole(self, state: dict[str, Any]) -> "Loader":
+        """A loader of all processes' rows from this state on, read by this process alone: to look at a batch again."""
+        return Loader(
+            self._dataset,
+            self._sources,
+            self._batch_size,
+            workers=0,
+            shard=grain.sharding.NoSharding(),
+            quarantine=self._quarantine,
+            state=state,
+        )
+
+    @property
+    def shared(self) -> bool:
+        """Whether other processes get the rest of each batch."""
+        return self._shard.shard_count > 1
+
+    def quarantined(self) -> int:
+        """How many records are known to be damaged, to all processes and in earlier runs of this stage."""
+        return self._quarantine.count()
 
     def close(self) -> None:
-        """Stop the worker processes."""
-        self._iterator.close()
+        """Stop the worker processes; the next batch starts others."""
+        if self._iterator is not None:
+            self._iterator.close()
+            self._iterator = None
 
 
 def batches(
@@ -103,36 +166,54 @@ def batches(
     *,
     workers: int = 0,
     state: dict[str, Any] | None = None,
+    quarantine: Path | None = None,
+    max_damaged: float = MAX_DAMAGED,
+    shard: grain.sharding.ShardOptions | None = None,
 ) -> Loader:
     """An endless loader: every epoch shuffled anew, batches across the epochs' borders, the same for any ``workers``.
 
     Args:
-        source: the records; a damaged one is replaced as :class:`Substituting` says.
-        transform: record → arrays, see above.
+        source: the records; a damaged one is replaced as :class:`rsjax.data.records.Readable` says.
+        transform: record → arrays, see :mod:`rsjax.data.order`.
         batch_size: records per batch, over all processes of a multi-host run.
         seed: of the order and of the transform's generator.
         workers: processes that read and transform; 0 uses threads of this one.
         state: an earlier loader's :meth:`Loader.state`.
+        quarantine: the file that lists damaged records; None: none is written.
+        max_damaged: share of the records that may be damaged.
+        shard: which share of each batch this process gets; that of its place among jax's processes if not given.
 
     Raises:
         StoreError: if the source is empty.
     """
-    if not len(source):
+    listed = Quarantine(quarantine, len(source), max_damaged)
+    stages = [Stage((Part(source, transform),), 0)]
+    return staged_batches(stages, batch_size, seed, listed, workers=workers, state=state, shard=shard)
+
+
+def staged_batches(
+    stages: Sequence[Stage],
+    batch_size: int,
+    seed: int,
+    quarantine: Quarantine,
+    *,
+    workers: int = 0,
+    state: dict[str, Any] | None = None,
+    shard: grain.sharding.ShardOptions | None = None,
+) -> Loader:
+    """The same, of stages one after another. Arguments and errors as in :func:`batches`."""
+    parts = [part for stage in stages for part in stage.parts]
+    if not all(map(len, parts)):
         raise StoreError("the split has no records; collect or tokenize again")
-    dataset = grain.MapDataset.source(Substituting(source)).seed(seed).shuffle().repeat(None)
-    dataset = dataset.random_map(transform)
-    if workers:
-        absl.flags.FLAGS.mark_as_parsed()  # Grain's workers refuse to start otherwise
-    iterator = ElasticIterator(
-        dataset,
+    return Loader(
+        ordered(stages, seed, quarantine),
+        [part.source for part in parts],
         batch_size,
-        grain.sharding.ShardByJaxProcess(),
-        read_options=grain.ReadOptions(num_threads=2, prefetch_buffer_size=4),  # in batches
-        multiprocessing_options=grain.MultiprocessingOptions(num_workers=workers) if workers else None,
+        workers=workers,
+        shard=shard or grain.sharding.ShardByJaxProcess(),
+        quarantine=quarantine,
+        state=state,
     )
-    if state is not None:
-        iterator.set_state(state)
-    return Loader(iterator)
 
 
 def epoch(source: RecordSource, batch_size: int, transform: Transform) -> Iterator[Arrays]:
@@ -149,3 +230,26 @@ def epoch(source: RecordSource, batch_size: int, transform: Transform) -> Iterat
         rows += [rows[-1]] * (batch_size - len(rows))
         batch = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         yield batch | {"weight": (indices < len(source)).astype(np.float32)}
+
+
+def _describe(source: RecordSource, record: int) -> dict[str, Any]:
+    place = place_of(source, record)
+    try:
+        read = source[record]
+    except StoreError:
+        return place
+    return place | {name: read[name] for name in ("task", "provenance") if name in read}
+
+
+def _start_worker(index: int, count: int) -> None:
+    """In a worker process: signals are its parent's to answer, and it does not outlive its parent."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

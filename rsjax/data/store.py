@@ -1,7 +1,6 @@
 """The store: ArrayRecord shards per split and a ``manifest.json``, in one directory that appears whole or not at all.
 
-A record is a dict of arrays and JSON-ready values; a :class:`rsjax.clip.Clip` is one kind of record. Its payload is a
-checksum and msgpack with the arrays' raw bytes, never pickle.
+A :class:`rsjax.clip.Clip` is one kind of record; :mod:`rsjax.data.codec` is how a record lies in a shard.
 """
 
 import dataclasses
@@ -9,18 +8,18 @@ import errno
 import json
 import os
 import shutil
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordWriter
 
 from rsjax.clip import Clip
+from rsjax.data.codec import Record, decode, encode
+from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.errors import UserError
 
 FORMAT = 1
@@ -28,37 +27,9 @@ MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
 SHARD_BYTES = 256 * 2**20
 
-Record = dict[str, Any]
-
 
 class StoreError(UserError):
     """A store that cannot be read or written. The message names the file and the cure."""
-
-
-def encode(record: Record) -> bytes:
-    """A record's payload: CRC-32, then msgpack of its arrays (dtype, shape, bytes) and of its other values."""
-    arrays = {
-        name: (value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes())
-        for name, value in record.items()
-        if isinstance(value, np.ndarray)
-    }
-    values = {name: value for name, value in record.items() if name not in arrays}
-    body = msgpack.packb((arrays, values))
-    return zlib.crc32(body).to_bytes(4, "little") + body
-
-
-def decode(payload: bytes) -> Record:
-    """The inverse of :func:`encode`.
-
-    Raises:
-        ValueError: if the payload is damaged.
-    """
-    if len(payload) < 4 or zlib.crc32(payload[4:]) != int.from_bytes(payload[:4], "little"):
-        raise ValueError("its checksum is wrong")
-    arrays, values = msgpack.unpackb(payload[4:], strict_map_key=False)
-    return values | {
-        name: np.frombuffer(raw, np.dtype(dtype)).reshape(shape).copy() for name, (dtype, shape, raw) in arrays.items()
-    }
 
 
 def encode_clip(clip: Clip) -> Record:
@@ -74,12 +45,18 @@ def decode_clip(record: Record) -> Clip:
 class Source:
     """Random access to one split's records: ``len(source)``, ``source[i]``. Can be sent to other processes.
 
+    Args:
+        store: the store's directory.
+        split: the split's name.
+        files: each shard's name and number of records, in order.
+
     Raises:
         StoreError: on reading a record that is damaged; it names the file and the record.
     """
 
-    def __init__(self, paths: list[Path], counts: list[int]) -> None:
-        self._paths, self._starts = paths, np.cumsum([0, *counts])
+    def __init__(self, store: Path, split: str, files: list[tuple[str, int]]) -> None:
+        self._store, self._split = store, split
+        self._paths, self._starts = [store / name for name, _ in files], np.cumsum([0, *(count for _, count in files)])
         self._reader: Any = None
 
     def __len__(self) -> int:
@@ -92,15 +69,35 @@ class Source:
         if not 0 <= index < len(self):
             raise IndexError(f"record {index} of a split with {len(self)} records")
         try:
-            if self._reader is None:
-                self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
-            return decode(self._reader[index])
+            return self._read(index)
+        except Exception:  # as below; a file handle that went stale is not damage, so it is opened once more
+            self._reader = None
+        try:
+            return self._read(index)
         except Exception as error:  # array_record reports damage as several types
-            shard = int(np.searchsorted(self._starts, index, side="right")) - 1
+            shard = self._shard(index)
             raise StoreError(
                 f"{self._paths[shard]}: record {index - self._starts[shard]} (number {index} of the split) cannot be "
                 f"read: {error}; delete {self._paths[shard].parent} and make it again"
             ) from error
+
+    def _read(self, index: int) -> Record:
+        reader = self._reader  # another thread may close the one that this object has
+        if reader is None:
+            reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
+        return decode(reader[index])
+
+    def _shard(self, index: int) -> int:
+        return int(np.searchsorted(self._starts, index, side="right")) - 1
+
+    def locate(self, index: int) -> dict[str, Any]:
+        """Where a record lies, JSON-ready, without reading it: store, split, its number there, and file."""
+        return {
+            "store": str(self._store.absolute()),
+            "split": self._split,
+            "record": int(index),
+            "file": self._paths[self._shard(index)].name,
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,10 +119,32 @@ class Store:
 
     def source(self, split: str) -> Source:
         """The records of one split."""
+        entry = self._entry(split)
+        return Source(self.path, split, [(file["name"], file["count"]) for file in entry["files"]])
+
+    def labelled(self, split: str) -> bool:
+        """Whether the store was written with labels."""
+        return "labels" in self._entry(split)
+
+    def labels(self, split: str) -> Labels:
+        """What the records of one split are called.
+
+        Raises:
+            StoreError: the store was written without labels, or they are damaged.
+        """
+        entry = self._entry(split).get("labels")
+        cure = f"delete {self.path} and make it again"
+        if entry is None:
+            raise StoreError(f"{self.path / MANIFEST}: names no task and difficulty of its {split} records; {cure}")
+        try:
+            return Labels.read(self.path / entry["name"], entry)
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{self.path / entry['name']}: cannot be read ({error}); {cure}") from error
+
+    def _entry(self, split: str) -> dict[str, Any]:
         if split not in self.manifest["splits"]:
             raise StoreError(f"{self.path}: no split {split!r}; it has {', '.join(self.splits)}")
-        entry = self.manifest["splits"][split]
-        return Source([self.path / file["name"] for file in entry["files"]], [f["count"] for f in entry["files"]])
+        return self.manifest["splits"][split]
 
 
 def open_store(path: Path | str) -> Store:
@@ -145,7 +164,7 @@ def open_store(path: Path | str) -> Store:
     if manifest.get("format") != FORMAT:
         raise StoreError(f"{path / MANIFEST}: format {manifest.get('format')}, this code reads format {FORMAT}; {cure}")
     for entry in manifest["splits"].values():
-        for file in entry["files"]:
+        for file in entry["files"] + ([entry["labels"]] if "labels" in entry else []):
             shard = path / file["name"]
             if not shard.exists():
                 raise StoreError(f"{shard}: missing; {cure}")
@@ -162,7 +181,13 @@ def complete_key(path: Path | str) -> str | None:
         return None
 
 
-def write_store(path: Path | str, kind: str, splits: Mapping[str, Iterable[Record]], meta: dict[str, Any]) -> None:
+def write_store(
+    path: Path | str,
+    kind: str,
+    splits: Mapping[str, Iterable[Record]],
+    meta: dict[str, Any],
+    label: Label | None = None,
+) -> None:
     """Write a store; it replaces an older one at the same place only when it is complete.
 
     Args:
@@ -170,6 +195,7 @@ def write_store(path: Path | str, kind: str, splits: Mapping[str, Iterable[Recor
         kind: what the records are, e.g. ``"clips"``.
         splits: each split's records, consumed once and in order.
         meta: more of the manifest, JSON-ready; ``key`` is the content key that :func:`complete_key` returns.
+        label: a record's words by column, kept for :meth:`Store.labels`.
 
     Raises:
         StoreError: on a full disk, or where ``path`` holds something that is not a store.
@@ -184,12 +210,19 @@ def write_store(path: Path | str, kind: str, splits: Mapping[str, Iterable[Recor
         try:
             manifest: dict[str, Any] = {"format": FORMAT, "kind": kind, "splits": {}} | meta
             for split, records in splits.items():
-                manifest["splits"][split] = {"files": _write_split(building, split, records)}
-                manifest["splits"][split]["count"] = sum(f["count"] for f in manifest["splits"][split]["files"])
+                manifest["splits"][split] = _write_labelled(building, split, records, label)
             (building / MANIFEST).write_text(json.dumps(manifest, indent=1))
             replace_directory(building, path)
         finally:
             shutil.rmtree(building, ignore_errors=True)
+
+
+def _write_labelled(folder: Path, split: str, records: Iterable[Record], label: Label | None) -> dict[str, Any]:
+    """Write one split's shards and labels; returns the manifest's entry."""
+    labels = LabelWriter()
+    files = _write_split(folder, split, labels.noting(records, label) if label else records)
+    entry: dict[str, Any] = {"files": files, "count": sum(file["count"] for file in files)}
+    return entry | ({"labels": labels.write(folder / f"{split}-labels.npy")} if label and files else {})
 
 
 def _write_split(folder: Path, split: str, records: Iterable[Record]) -> list[dict[str, Any]]:

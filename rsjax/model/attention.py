@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ModelConfig
@@ -19,15 +20,20 @@ from rsjax.model.matmul import matmul_bf16
 
 # torch's default for linear layers, U(±1/√fan_in), which the public weights were trained from.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
+FEW = 2  # frames that a pass of a rollout is over
 LARGE_FRAME = 128  # cells per frame from which bf16 products in attention gain more than their transposes cost
 
 
 @struct.dataclass
 class KeyValues:
-    """Temporal keys and values of one branch; with a leading axis over blocks where all blocks' are held."""
+    """Temporal keys and values of one branch; with a leading axis over blocks where all blocks' are held.
 
-    k: Float[Array, "*L B T S C"]
-    v: Float[Array, "*L B T S C"]
+    A head's frames lie together, as its products read them: otherwise every pass would move the whole cache.
+    """
+
+    k: Float[Array, "*L B S h T e"]
+    v: Float[Array, "*L B S h T e"]
 
 
 class Dense(nn.Module):
@@ -45,6 +51,7 @@ class Dense(nn.Module):
             out = matmul_bf16(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
         else:
             out = x @ kernel
+        out = checkpoint_name(out, PRODUCT)
         return out + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else out
 
 
@@ -60,21 +67,26 @@ def attend(
     mask: Bool[Array, "q k"] | None,
 ) -> Float[Array, "*N q h e"]:
     """softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax in float32."""
-    return attend_parts(q, [(k, v, mask)])
+    scores = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+    if mask is not None:
+        scores = jnp.where(mask, scores, jnp.finfo(jnp.float32).min)
+    return jnp.einsum("...hqk,...khe->...qhe", jax.nn.softmax(scores, axis=-1).astype(v.dtype), v)
 
 
 def attend_parts(
-    q: Float[Array, "*N q h e"], parts: Sequence[tuple[Array, Array, Bool[Array, "q k"] | None]]
-) -> Float[Array, "*N q h e"]:
-    """:func:`attend` over keys and values that lie in several arrays, each with its mask, as if they were one."""
+    q: Float[Array, "*N q e"], parts: Sequence[tuple[KeyValues, Bool[Array, "q k"]]]
+) -> Float[Array, "*N q e"]:
+    """:func:`attend` over keys and values that lie in several places, each with its mask, as if they were one."""
     scores = []
-    for k, _, mask in parts:
-        product = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
-        scores.append(product if mask is None else jnp.where(mask, product, jnp.finfo(jnp.float32).min))
+    for held, mask in parts:
+        product = jnp.einsum("...qe,...ke->...qk", q, held.k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+        scores.append(jnp.where(mask, product, jnp.finfo(jnp.float32).min))
     weights = jax.nn.softmax(jnp.concatenate(scores, axis=-1), axis=-1)
-    ends = np.cumsum([k.shape[-3] for k, _, _ in parts])[:-1]
-    shares = zip(jnp.split(weights, ends, axis=-1), parts, strict=True)
-    outs = [jnp.einsum("...hqk,...khe->...qhe", share.astype(v.dtype), v) for share, (_, v, _) in shares]
+    shares = jnp.split(weights, np.cumsum([x.shape[-1] for x in scores])[:-1], axis=-1)
+    outs = [
+        jnp.einsum("...qk,...ke->...qe", share.astype(held.v.dtype), held.v)
+        for share, (held, _) in zip(shares, parts, strict=True)
+    ]
     return sum(outs[1:], start=outs[0])
 
 
@@ -110,19 +122,19 @@ def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
 
 
 def put_frames(cache: KeyValues, new: KeyValues, start: Any, ring: bool) -> KeyValues:
-    """A cache with the frames from ``start`` on written in; both with a leading axis over blocks, frames on axis 2.
+    """A cache with the frames from ``start`` on written in; both with a leading axis over blocks.
 
     Args:
         ring: slots are taken over where positions pass their number.
     """
 
-    def put(held: Float[Array, "L B N S C"], fresh: Float[Array, "L B T S C"]) -> Float[Array, "L B N S C"]:
+    def put(held: Float[Array, "L B S h N e"], fresh: Float[Array, "L B S h T e"]) -> Float[Array, "L B S h N e"]:
         fresh = fresh.astype(held.dtype)
         if not ring:
-            return jax.lax.dynamic_update_slice_in_dim(held, fresh, start, axis=2)
-        for i in range(fresh.shape[2]):  # frame by frame, for the slots may go around the end
-            slot = (start + i) % held.shape[2]
-            held = jax.lax.dynamic_update_slice_in_dim(held, fresh[:, :, i : i + 1], slot, axis=2)
+            return jax.lax.dynamic_update_slice_in_dim(held, fresh, start, axis=-2)
+        for i in range(fresh.shape[-2]):  # frame by frame, for the slots may go around the end
+            slot = (start + i) % held.shape[-2]
+            held = jax.lax.dynamic_update_slice_in_dim(held, fresh[..., i : i + 1, :], slot, axis=-2)
         return held
 
     return jax.tree.map(put, cache, new)
@@ -170,17 +182,28 @@ class Attention(nn.Module):
         positions = start + jnp.arange(x.shape[1])
         if cfg.positions == "rotary":
             q, k = (rotate(self._heads(y), positions).reshape(y.shape) for y in (q, k))
-        sources = [(KeyValues(k, v), positions)]
-        if cache is not None:
-            if x.shape[1] > cache.k.shape[1]:
-                raise ValueError(f"{x.shape[1]} frames do not fit a cache of {cache.k.shape[1]}")
-            sources.insert(0, (cache, frames_held(cache.k.shape[1], start - 1)))
-        parts = [(self._over_time(held.k), self._over_time(held.v), self._sees(positions, at)) for held, at in sources]
-        out = attend_parts(self._over_time(q), parts).swapaxes(1, 2)
-        return self.proj(out.reshape(x.shape)), None if cache is None else KeyValues(k, v)
+        if cache is None:
+            q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))
+            out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
+            return self.proj(out.reshape(x.shape)), None
+        frames, slots = x.shape[1], cache.k.shape[-2]
+        if frames > slots:
+            raise ValueError(f"{frames} frames do not fit a cache of {slots}")
+        q, new = self._head_major(q), KeyValues(self._head_major(k), self._head_major(v))
+        sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
+        # XLA's CPU backend is three times as fast at products of one row with each matrix as of two.
+        at_once = 1 if frames <= FEW else frames
+        outs = [
+            attend_parts(
+                q[..., i : i + at_once, :], [(cache, sees[0][i : i + at_once]), (new, sees[1][i : i + at_once])]
+            )
+            for i in range(0, frames, at_once)
+        ]
+        out = jnp.concatenate(outs, axis=-2).transpose(0, 3, 1, 2, 4)
+        return self.proj(out.reshape(x.shape)), new
 
-    def _over_time(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S T h e"]:
-        return self._heads(x.swapaxes(1, 2))
+    def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:
+        return self._heads(x).transpose(0, 2, 3, 1, 4)
 
     def _sees(self, positions: Int[Array, " q"], held: Int[Array, " k"]) -> Bool[Array, "q k"]:
         age = positions[:, None] - held[None, :]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ModelConfig
-from rsjax.model.attention import Dense, KeyValues, layer_norm, put_frames
+from rsjax.model.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
 from rsjax.model.blocks import DualBlock
 from rsjax.tokenizer import lfq
 
@@ -93,8 +93,7 @@ class WorldModel(nn.Module):
             for branch in branches(cfg)
         }
         blocks = nn.scan(
-            # Common subexpressions could undo the recomputation within a turn of the scan, not from turn to turn.
-            nn.remat(DualBlock, prevent_cse=cfg.unroll > 1) if cfg.remat else DualBlock,
+            _rematerialised(cfg),
             variable_axes={"params": 0},
             split_rngs={"params": True},
             in_axes=(0, nn.broadcast),
@@ -135,6 +134,14 @@ class WorldModel(nn.Module):
         return self.init(key, dict.fromkeys(branches(cfg), tokens), tokens == 0, actions)["params"]
 
 
+def _rematerialised(config: ModelConfig) -> Any:
+    if config.remat == "none":
+        return DualBlock
+    keep = None if config.remat == "blocks" else jax.checkpoint_policies.save_only_these_names(PRODUCT)
+    # Common subexpressions could undo the recomputation within a turn of the scan, not from turn to turn.
+    return nn.remat(DualBlock, prevent_cse=config.unroll > 1, policy=keep)
+
+
 def branches(config: ModelConfig) -> tuple[str, ...]:
     """Names of the branches that the model has."""
     return ("rgb", "depth") if config.depth else ("rgb",)
@@ -142,6 +149,6 @@ def branches(config: ModelConfig) -> tuple[str, ...]:
 
 def empty_cache(config: ModelConfig, batch: int, frames: int, dtype: Any = jnp.float32) -> Cache:
     """A cache of ``frames`` slots for every block and branch: zeros, never read before they are written."""
-    shape = (config.blocks, batch, frames, config.grid**2, config.width)
+    shape = (config.blocks, batch, config.grid**2, config.heads, frames, config.head_width)
     zeros = jnp.zeros(shape, dtype)
     return {branch: KeyValues(zeros, zeros) for branch in branches(config)}

@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,10 @@ from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
 TRAINED = ("tokenizer", "world_model")  # never replaced unasked
+DECIDED_BY = {  # sections of the configuration that a trained stage depends on
+    "tokenizer": ("sim", "tokenizer", "tokenizer_train"),
+    "world_model": ("sim", "tokenizer", "tokenizer_train", "model", "mask", "loss", "train"),
+}
 OUTPUTS = {  # in the run directory; clips lie outside
     "tokenizer": "tokenizer/weights",
     "tokens": "tokens/store",
@@ -76,21 +80,28 @@ class Run:
                 if not overwrite:
                     raise RunError(
                         f"{self.directory} holds a {stage.replace('_', ' ')} of another configuration "
-                        f"({self._differences()}); choose another --run-dir, or train it again with --overwrite"
+                        f"({self._differences(stage)}); choose another --run-dir, or train it again with --overwrite"
                     )
                 shutil.rmtree(self.directory / stage)
         with disk_guard(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
             write_atomically(self.directory / "config.json", json.dumps(to_dict(self.config), indent=1).encode())
 
-    def _differences(self) -> str:
+    def _differences(self, stage: str) -> str:
+        """The fields that make the stage in the directory another one; not those that change no result."""
         try:
             saved = _flat(json.loads((self.directory / "config.json").read_text()))
         except (OSError, ValueError):
             return "its config.json is missing or damaged"
-        here = _flat(to_dict(self.config))
-        names = [name for name in here | saved if here.get(name) != saved.get(name)]
-        return "; ".join(f"{name} is {saved.get(name)} there, {here.get(name)} here" for name in names) or "older code"
+        here, free = _flat(to_dict(self.config)), _runtime_fields(self.config)
+        names = [
+            name
+            for name in here | saved
+            if here.get(name) != saved.get(name) and name not in free and name.partition(".")[0] in DECIDED_BY[stage]
+        ]
+        return "; ".join(f"{name} is {_told(saved, name)} there, {_told(here, name)} here" for name in names) or (
+            "older code"
+        )
 
     def output(self, stage: str) -> Path:
         """What the stage leaves: a file or directory that appears whole."""
@@ -138,7 +149,25 @@ class Run:
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted names, such as ``train.stages.0.epochs``."""
     out: dict[str, Any] = {}
     for name, value in values.items():
+        if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+            value = {str(i): item for i, item in enumerate(value)}
         out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return out
+
+
+def _told(values: dict[str, Any], name: str) -> Any:
+    return values.get(name, "not set")
+
+
+def _runtime_fields(config: Any, prefix: str = "") -> set[str]:
+    names: set[str] = set()
+    for field in fields(config):
+        value, name = getattr(config, field.name), prefix + field.name
+        if field.metadata.get("runtime"):
+            names.add(name)
+        elif is_dataclass(value):
+            names |= _runtime_fields(value, f"{name}.")
+    return names

@@ -6,28 +6,37 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import ModelConfig, TokenizerConfig
-from rsjax.data import loader
-from rsjax.data.store import Record, disk_guard, open_store, write_store
-from rsjax.pipeline import evaluation, transforms
-from rsjax.pipeline.run import STAGES, Run
+from rsjax.data.codec import Record
+from rsjax.data.curriculum import check_stages
+from rsjax.data.store import disk_guard, open_store, write_store
+from rsjax.pipeline import evaluation
+from rsjax.pipeline.feeding import fingerprint, readable
+from rsjax.pipeline.jobs import tokenizer_job, world_model_job
+from rsjax.pipeline.provenance import record_data, record_start
+from rsjax.pipeline.run import STAGES, TRAINED, Run
 from rsjax.pipeline.summary import write_summary
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.sample.generator import Codec, Generator, Units, load_tokenizer
 from rsjax.sim.collect import collect
+from rsjax.sim.expert import difficulty
 from rsjax.train.checkpoint import save_weights
-from rsjax.train.loop import fit
-from rsjax.train.objectives import TokenizerObjective, WorldModelObjective
-from rsjax.train.parts import check_part, start_tokenizer, start_world_model
+from rsjax.train.distributed import agree, barrier, is_lead, on_lead
+from rsjax.train.parts import check_part
+from rsjax.train.placement import Placement
+from rsjax.train.wandb_run import find_wandb
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
     """Runs every stage that is not finished, in order, and says which were skipped.
+
+    Several processes, which have one run directory, train together; the lead alone does the other stages.
 
     Args:
         resume: False starts an unfinished training stage over instead of going on from its checkpoint.
         command: how to repeat the run, for the report.
     """
     _check_starts(run)
+    on_lead("run.json", partial(_record_start, run, command))
     works: dict[str, Callable[[Run], None]] = {
         "collect": collect_clips,
         "tokenizer": partial(train_tokenizer, resume=resume),
@@ -45,21 +54,47 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         "report": "writing the report",
     }
     for number, name in enumerate(STAGES, 1):
-        if run.finished(name):
-            stage(number, len(STAGES), name, f"up to date, skipped ({duration(run.mark(name)['seconds'])} when it ran)")
-            continue
-        stage(number, len(STAGES), name, notes[name])
+        finished = agree(run.finished(name), name)
+        if is_lead():
+            seconds = f" ({duration(run.mark(name)['seconds'])} when it ran)" if finished else ""
+            stage(number, len(STAGES), name, f"up to date, skipped{seconds}" if finished else notes[name])
+        if not finished:
+            _do(run, name, works[name])
+
+
+def _do(run: Run, name: str, work: Callable[[Run], None]) -> None:
+    def marked() -> None:
         with run.stage(name):
-            works[name](run)
+            work(run)
+        record_data(run)
+
+    if name not in TRAINED:
+        on_lead(name, marked)
+    elif is_lead():
+        marked()
+    else:
+        work(run)
+    barrier(name)
 
 
 def _check_starts(run: Run) -> None:
-    """A mistyped path is told before hours of work, not after."""
+    """A mistyped path, a missing package or a batch that does not divide is told before hours of work, not after."""
     cfg = run.config
     starts = {"tokenizer": (cfg.tokenizer_train, TokenizerConfig), "world_model": (cfg.train, ModelConfig)}
     for name, (loop, kind) in starts.items():
-        if loop.start_from and not run.finished(name):
+        if run.finished(name):
+            continue
+        Placement.create(loop)
+        if loop.start_from:
             check_part(Path(loop.start_from), kind)
+        if loop.wandb:
+            find_wandb()
+
+
+def _record_start(run: Run, command: str) -> None:
+    changed = " and ".join(record_start(run, command))
+    if changed and not all(map(run.finished, TRAINED)):
+        note(f"since the last start {changed} changed (run.json); results may differ from those of one unbroken run")
 
 
 def collect_clips(run: Run) -> None:
@@ -70,52 +105,44 @@ def collect_clips(run: Run) -> None:
 
 def train_tokenizer(run: Run, resume: bool) -> None:
     """Stage 2."""
-    cfg, train = run.config, run.config.tokenizer_train
-    transform = partial(
-        transforms.tokenizer_images,
-        count=train.frames_per_clip,
-        depth_share=train.depth_share,
-        scale=cfg.tokenizer.depth_scale,
-        flip=train.flip,
-    )
-    objective = TokenizerObjective(cfg.tokenizer, train)
+    train = run.config.tokenizer_train
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
-    source = open_store(run.clips).source("train")
-    state = fit(
-        objective,
-        train,
-        lambda data: loader.batches(source, transform, train.batch_size, train.seed, state=data),
-        run.directory / "tokenizer",
-        name="tokenizer",
-        to_batch=transforms.image_batch,
-        start=partial(start_tokenizer, cfg.tokenizer, Path(train.start_from)) if train.start_from else None,
-        resume=resume,
-    )
-    save_weights(run.output("tokenizer"), objective.tokenizer_params(state.weights))
+    # Before the tokenizer is trained, whose clips the world model's stages choose from.
+    check_stages(run.config.train, open_store(run.clips))
+    job = tokenizer_job(run)
+    state = job.fit(resume)
+    if is_lead():
+        save_weights(run.output("tokenizer"), job.objective.tokenizer_params(state.weights))
 
 
 def tokenize(run: Run) -> None:
     """Stage 3: both token grids of every clip, with the actions in the model's units."""
     clips = open_store(run.clips)
     units = Units.create(clips)
-    codec = Codec(run.config, load_tokenizer(run.config, run.directory), units)
+    tokenizer = load_tokenizer(run.config, run.directory)
+    codec = Codec(run.config, tokenizer, units)
     total = sum(len(clips.source(split)) for split in clips.splits)
+    folder = run.directory / "tokens"
 
     with Progress("tokens", total, "clips") as progress:
         done = 0
 
         def tokenized(split: str) -> Any:
             nonlocal done
-            source = clips.source(split)
-            for index in range(len(source)):
-                yield _token_record(codec, source[index])
+            for clip in readable(clips.source(split), split, folder, run.config.train.max_damaged):
+                yield _token_record(codec, clip)
                 done += 1
                 progress.update(done)
 
         meta = {name: clips.manifest[name] for name in ("action_mean", "action_std", "depth_range")}
-        key = {"key": run.keys()["tokens"], "source": str(run.clips)}
-        write_store(run.output("tokens"), "tokens", {s: tokenized(s) for s in clips.splits}, meta | key)
+        key = {"key": run.keys()["tokens"], "source": str(run.clips), "tokenizer": fingerprint(tokenizer)}
+        splits = {split: tokenized(split) for split in clips.splits}
+        write_store(run.output("tokens"), "tokens", splits, meta | key, label=_labels)
+
+
+def _labels(record: Record) -> dict[str, str]:
+    return {name: record[name] for name in ("task", "difficulty")}
 
 
 def _token_record(codec: Codec, clip: Record) -> Record:
@@ -126,6 +153,7 @@ def _token_record(codec: Codec, clip: Record) -> Record:
         "tracks": clip["tracks"],
         "visible": clip["visible"],
         "task": clip["task"],
+        "difficulty": difficulty(clip["provenance"]),
         "provenance": clip["provenance"],
     }
 
@@ -138,18 +166,9 @@ def train_world_model(run: Run, resume: bool) -> None:
             f"train.start_from {train.start_from} is not tokenizer_train.start_from; "
             f"its model has to know the tokens of this run's tokenizer"
         )
-    source = open_store(run.output("tokens")).source("train")
-    state = fit(
-        WorldModelObjective.create(cfg),
-        train,
-        lambda data: loader.batches(source, transforms.token_clip, train.batch_size, train.seed, state=data),
-        run.directory / "world_model",
-        name="world model",
-        to_batch=transforms.token_batch,
-        start=partial(start_world_model, cfg.model, Path(train.start_from)) if train.start_from else None,
-        resume=resume,
-    )
-    save_weights(run.output("world_model"), state.weights)
+    state = world_model_job(run).fit(resume)
+    if is_lead():
+        save_weights(run.output("world_model"), state.weights)
 
 
 def evaluate(run: Run) -> None:

@@ -1,13 +1,16 @@
 """Records to training arrays, run inside the loader. Plain numpy, picklable."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rsjax.clip import Batch
-from rsjax.data.loader import Arrays
-from rsjax.data.store import Record
+from rsjax.data.codec import Record
+from rsjax.data.order import Arrays
 from rsjax.tokenizer.depth_color import depth_to_color
+
+if TYPE_CHECKING:  # the loader's worker processes have no need of the models
+    from rsjax.sample.generator import Units
 
 
 def tokenizer_images(
@@ -45,12 +48,33 @@ def image_batch(arrays: Arrays) -> np.ndarray:
     return images.reshape(-1, *images.shape[2:])
 
 
+TOKEN_ARRAYS = ("rgb", "depth", "actions", "tracks", "visible")
+
+
 def token_clip(record: Record, rng: np.random.Generator) -> Arrays:
     """The arrays of a token record that a training step reads."""
-    return {name: record[name] for name in ("rgb", "depth", "actions", "tracks", "visible")}
+    return {name: record[name] for name in TOKEN_ARRAYS}
+
+
+def token_clip_in(units: "Units", there: "Units", integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
+    """The same of a record whose actions are in another store's units.
+
+    Args:
+        units: those of the model's own data.
+        there: those of the record's store.
+        integrate: whether the actions' sums follow them (see ``Units.action_inputs``).
+    """
+    inputs = record["actions"]
+    scaled = inputs[..., : inputs.shape[-1] // 2] if integrate else inputs
+    actions = units.action_inputs(there.actions(scaled), integrate)
+    return token_clip(record | {"actions": actions}, rng)
 
 
 def token_batch(arrays: Arrays) -> Batch:
-    """Stacked :func:`token_clip` as a :class:`Batch` in which every clip counts."""
+    """Stacked :func:`token_clip` as a :class:`Batch`.
+
+    Every clip counts and is numbered by its row where ``weight`` and ``index`` do not say otherwise.
+    """
     size = len(arrays["rgb"])
-    return Batch(**arrays, weight=np.ones(size, np.float32), index=np.arange(size, dtype=np.int32))
+    given = {"weight": np.ones(size, np.float32), "index": np.arange(size, dtype=np.int32)} | arrays
+    return Batch(**{name: given[name] for name in (*TOKEN_ARRAYS, "weight", "index")})

@@ -45,7 +45,7 @@ class ClipFigure:
 
     title: str
     truth: UInt8[np.ndarray, "T H W 3"]
-    prediction: UInt8[np.ndarray, "T H W 3"]
+    prediction: UInt8[np.ndarray, "T H W 3"] | None
     reconstruction: UInt8[np.ndarray, "T H W 3"] | None = None
     other_actions: UInt8[np.ndarray, "T H W 3"] | None = None
     true_depth: Float32[np.ndarray, "T H W"] | None = None

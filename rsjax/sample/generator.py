@@ -60,6 +60,10 @@ class Units:
             scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
         return scaled.astype(np.float32)
 
+    def actions(self, scaled: Float[np.ndarray, "*B T A"]) -> Float[np.ndarray, "*B T A"]:
+        """Actions in the data's units, out of what :meth:`action_inputs` gives without sums."""
+        return scaled * np.maximum(self.action_std, 1e-3) + np.asarray(self.action_mean)
+
 
 @dataclass(frozen=True)
 class Codec:

@@ -49,7 +49,7 @@ def guided_cache(model: ModelConfig, sample: SampleConfig, batch: int, slots: in
 def repeat_cache(sample: SampleConfig, cache: Cache, clips: int) -> Cache:
     """The cache of one clip as that of ``clips`` clips that all begin with it."""
 
-    def repeat(x: Float[Array, "L c N S C"]) -> Float[Array, "L cB N S C"]:
+    def repeat(x: Float[Array, "L c S h N e"]) -> Float[Array, "L cB S h N e"]:
         shape = (len(x), _copies(sample), clips, *x.shape[2:])
         return jnp.broadcast_to(x[:, :, None], shape).reshape(len(x), -1, *x.shape[2:])
 

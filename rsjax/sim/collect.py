@@ -32,7 +32,7 @@ from rsjax.data.store import (
     write_store,
 )
 from rsjax.errors import UserError
-from rsjax.sim.expert import MODES, Expert, draw_manner
+from rsjax.sim.expert import MODES, Expert, difficulty, draw_manner
 from rsjax.sim.gl import GLError, choose_gl
 from rsjax.sim.labels import Snapshot, pick_pixels, track
 from rsjax.sim.lift import TASK, LiftSim
@@ -220,7 +220,12 @@ def _pack(config: SimConfig, partial: Path, out: Path) -> None:
         **summary,
     }
     stamp = {"depth_range": statistics["depth_range"]}
-    write_store(out, "clips", {split: _stamped(paths, stamp) for split, paths in files.items()}, meta)
+    write_store(out, "clips", {split: _stamped(paths, stamp) for split, paths in files.items()}, meta, labels)
+
+
+def labels(clip: Record) -> dict[str, str]:
+    """What a curriculum can choose a clip by."""
+    return {"task": clip["task"], "difficulty": difficulty(clip["provenance"])}
 
 
 def _stamped(paths: list[Path], stamp: dict[str, Any]) -> Iterator[Record]:

@@ -5,6 +5,7 @@ others let it fall, grasp beside or above it, or move about without a goal.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from rsjax.sim.lift import State
 
 MODES = {"lift": 0.55, "drop": 0.16, "near_miss": 0.16, "explore": 0.13}  # mode → probability
+SIMPLE = ("lift",)  # the modes that a curriculum begins with; the others are difficult
 TABLE_HEIGHT = 0.8  # metres
 OPEN, CLOSE = -1.0, 1.0
 NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to the next
@@ -68,6 +70,14 @@ def draw_manner(rng: np.random.Generator) -> Manner:
         carry=(float(rng.uniform(-0.04, 0.14)), float(rng.uniform(-0.15, 0.15)), float(rng.uniform(0.08, 0.2))),
         release=int(rng.integers(4, 18)) if mode == "drop" else -1,
     )
+
+
+def difficulty(provenance: dict[str, Any]) -> str:
+    """A clip's difficulty for a curriculum: simple or difficult by its expert's mode, unknown where it had none."""
+    expert = provenance.get("expert")
+    if expert is None:
+        return "unknown"
+    return "simple" if expert["mode"] in SIMPLE else "difficult"
 
 
 class Expert:

@@ -1,27 +1,49 @@
 """The training loop: batches in, steps, logs and checkpoints out; stops and resumes exactly."""
 
-import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 from rsjax.config import LoopConfig
 from rsjax.data.loader import Loader
-from rsjax.errors import UserError
-from rsjax.progress import Progress
+from rsjax.data.prefetch import Fed, Prefetch
+from rsjax.errors import Preempted, UserError
+from rsjax.progress import Progress, note
 from rsjax.train.checkpoint import Checkpoints
+from rsjax.train.distributed import agree, barrier, is_lead
+from rsjax.train.held_out import Evaluate, HeldOut
 from rsjax.train.log import ScalarLog
+from rsjax.train.memory import memory_scalars
 from rsjax.train.objectives import Objective
 from rsjax.train.placement import Placement
-from rsjax.train.state import TrainState, create_state
+from rsjax.train.preemption import StopRequest
+from rsjax.train.profile import Profile
+from rsjax.train.skipped import NAME as SKIPPED
+from rsjax.train.skipped import SkippedSteps
+from rsjax.train.state import TrainState
 
 
 class DivergedError(UserError):
-    """The loss or a parameter is not a number any more."""
+    """More steps were not finite than the configuration allows."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How a run is looked at while it goes on; nothing that it makes depends on this.
+
+    Attributes:
+        per_step: what a step works on and how much of it, such as ("tokens", 16384), for rates.
+        held_out: looks at the weights every ``loop.eval_every`` steps.
+    """
+
+    per_step: tuple[str, float] | None = None
+    held_out: Evaluate | None = None
 
 
 def fit(
@@ -35,8 +57,11 @@ def fit(
     start: Callable[[Any], Any] | None = None,
     resume: bool = True,
     stop_at: int | None = None,
+    watch: Watch | None = None,
 ) -> TrainState:
     """Trains until ``loop.steps`` steps are done, going on from the newest checkpoint in ``directory``.
+
+    Of several processes all call this with the same arguments; the lead alone writes logs.
 
     Args:
         loader: given a loader's saved state (or None), the loader that goes on from there.
@@ -48,76 +73,165 @@ def fit(
         stop_at: stop (and save) after this step, as if interrupted.
 
     Returns:
-        The final state, on the host's first device.
+        The final state, on this process's first device.
 
     Raises:
-        CheckpointError: the newest checkpoint does not fit.
-        DivergedError: the loss or a parameter is not finite; such a state is never saved.
+        CheckpointError: the newest checkpoint does not fit, or none can be read.
+        DivergedError: the loss or the gradient of too many steps was not finite; their batches are written down.
+        Preempted: SIGTERM; everything up to the step that was under way is saved.
         StoreError: too many damaged records, or a full disk.
     """
-    if not resume:
+    if not resume and is_lead():
         shutil.rmtree(directory / "checkpoints", ignore_errors=True)
-    checkpoints = Checkpoints(directory / "checkpoints")
+    barrier(f"{name} begins")
     placement = Placement.create(loop)
-    begun = checkpoints.latest() is not None
-    state, data = create_state(objective, loop, None if begun else start), None
-    if begun:
-        state, data = checkpoints.restore(state)
-    first, last = int(state.step), min(stop_at or loop.steps, loop.steps)
-    state, step_fn = placement.put_state(state), placement.compile(objective, loop)
-    try:
-        with (
-            loader(data) as batches,
-            ScalarLog(directory, first) as log,
-            Progress(name, loop.steps, "steps", start=first) as progress,
-        ):
-            clock = _Clock()
+    with ExitStack() as stack:
+        checkpoints = Checkpoints(directory / "checkpoints", loop.keep_last, loop.keep_every, loop.keep_best)
+        stack.callback(checkpoints.close)
+        if checkpoints.latest() is None:
+            state, data = placement.init(objective, loop, start), None
+        else:
+            state, data = checkpoints.restore(placement.template(objective, loop))
+            state = placement.adopt(state)
+        run = _Run(objective, loop, directory, placement, checkpoints, watch or Watch())
+        last = min(stop_at or loop.steps, loop.steps)
+        batches = stack.enter_context(Prefetch(loader(data), lambda arrays: placement.put_batch(to_batch(arrays))))
+        state = run.steps(state, batches, last, name)
+    return placement.gather(state)
+
+
+class _Taken(NamedTuple):
+    """A step that was dispatched, and may still be computed."""
+
+    step: int
+    fed: Fed
+    metrics: dict[str, Any]
+
+
+class _Run:
+    """One call of :func:`fit`."""
+
+    def __init__(
+        self,
+        objective: Objective,
+        loop: LoopConfig,
+        directory: Path,
+        placement: Placement,
+        checkpoints: Checkpoints,
+        watch: Watch,
+    ) -> None:
+        self.objective, self.loop, self.directory = objective, loop, directory
+        self.placement, self.checkpoints, self.watch = placement, checkpoints, watch
+
+    def steps(self, state: TrainState, batches: Prefetch, last: int, name: str) -> TrainState:
+        """From the state's step to the last."""
+        loop, first = self.loop, int(state.step)
+        step_fn = self.placement.compile(self.objective, loop)
+        self._skips, self._skipped_steps = int(state.skipped), SkippedSteps(self.directory, first)
+        with ExitStack() as stack:
+            log = stack.enter_context(self._log(first)) if is_lead() else None
+            shown = (name, loop.steps, "steps", first)
+            progress = stack.enter_context(Progress(*shown, per_unit=self.watch.per_step)) if is_lead() else None
+            traces = (self.directory / "profile", first, last, self.loop.profile)
+            profile = stack.enter_context(Profile.after(*traces))
+            stop = stack.enter_context(StopRequest())
+            clock, before = _Clock(batches, first), None
             for step in range(first + 1, last + 1):
-                with clock.waiting():
-                    batch = placement.put_batch(to_batch(next(batches)))
-                state, metrics = step_fn(state, batch)
-                logs, saves = (step % every == 0 or step == last for every in (loop.log_every, loop.checkpoint_every))
-                if logs or saves:
-                    scalars = {k: float(v) for k, v in placement.first(metrics).items()}
-                    _check_finite(scalars, step, directory)
-                if logs:
-                    log.write(step, scalars | clock.lap())
-                progress.update(step, loss=placement.first(metrics)["loss"])
-                if saves:
-                    checkpoints.save(placement.first(state), batches.state())
-    finally:
-        checkpoints.close()
-    return jax.device_put(placement.first(state), jax.local_devices()[0])
+                profile.at(step, state)
+                fed = next(batches)
+                with jax.profiler.StepTraceAnnotation("train", step_num=step):
+                    state, metrics = step_fn(state, fed.batch)
+                if before is not None:  # one step is computed while the next one is prepared, not more
+                    self._check(before, batches)
+                before = _Taken(step, fed, metrics)
+                if progress is not None:
+                    progress.update(step, **{term: metrics[term] for term in ("loss", *self.objective.weights)})
+                asked = stop.asked(step)
+                due = {every: at > 0 and (step % at == 0 or step == last) for every, at in self._schedule().items()}
+                if asked or any(due.values()):
+                    self._check(before, batches)
+                    before = None
+                    if log is not None and due["log"]:
+                        measured = clock.lap(step, self.watch.per_step) | memory_scalars()
+                        log.write(step, self.placement.scalars(metrics) | measured)
+                    found = None
+                    if due["held_out"]:
+                        with clock.stopped():
+                            found = self._look(state, step, log)
+                    if due["checkpoint"] or asked:
+                        metric = None if found is None else found.metric
+                        self.checkpoints.save(step, self.placement.portable(state), batches.state(), metric)
+                if asked and step < last:
+                    self.checkpoints.wait()
+                    raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
+            profile.at(last + 1, state)
+            damaged = batches.quarantined()
+            if damaged and is_lead():
+                note(f"{damaged} damaged records were replaced; {self.directory / 'quarantine.jsonl'} lists them")
+        return state
 
+    def _schedule(self) -> dict[str, int]:
+        loop = self.loop
+        held_out = loop.eval_every if self.watch.held_out is not None else 0
+        return {"log": loop.log_every, "checkpoint": loop.checkpoint_every, "held_out": held_out}
 
-def _check_finite(scalars: dict[str, float], step: int, directory: Path) -> None:
-    # A finite loss can have a gradient that is not: then the parameters tell.
-    for name in ("loss", "param_norm"):
-        if not math.isfinite(scalars[name]):
+    def _log(self, first: int) -> ScalarLog:
+        return ScalarLog(self.directory, first, self.loop.wandb, resume=first > 0)
+
+    def _check(self, taken: _Taken, batches: Prefetch) -> None:
+        """Waits for a step; writes it down if it was left out.
+
+        Raises:
+            DivergedError: it was one too many.
+        """
+        skips, allowed = int(taken.metrics["skipped"]), self.loop.skip_budget
+        if skips == self._skips:
+            return
+        self._skips, scalars = skips, self.placement.scalars(taken.metrics)
+        if is_lead():
+            self._skipped_steps.add(taken.step, scalars, batches.identify(taken.fed), taken.fed.before)
+            told = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
+            note(f"step {taken.step} is left out ({told}): {skips} of at most {allowed}")
+        if skips > allowed:
             raise DivergedError(
-                f"{directory}: {name} is {scalars[name]} at step {step}; lower the learning rate "
-                f"(optimizer.learning-rate) and start again with --no-resume"
+                f"{self.directory}: {skips} steps were not finite, more than skip_budget = {allowed} (the last was "
+                f"step {taken.step}, loss {scalars['loss']}); {SKIPPED} there has their batches; lower the learning "
+                f"rate (optimizer.learning-rate) and start again with --no-resume"
             )
+
+    def _look(self, state: TrainState, step: int, log: ScalarLog | None) -> HeldOut:
+        """What the lead finds on held-out clips; the others learn the metric."""
+        assert self.watch.held_out is not None
+        weights = self.placement.gather(state.weights)
+        found = self.watch.held_out(step, weights) if log is not None else HeldOut(0.0, {})
+        if log is not None:
+            log.write(step, found.scalars)
+            for name, picture in found.pictures.items():
+                log.image(step, name, picture)
+        return HeldOut(agree(found.metric, f"held out {step}"), found.scalars)
 
 
 class _Clock:
-    """Seconds a step, and the share of the time that steps waited for data, since the last lap."""
+    """Seconds a step, rates, and the share of the time that steps waited for data, since the last lap."""
 
-    def __init__(self) -> None:
-        self._began, self._waited, self._step = time.monotonic(), 0.0, 0
+    def __init__(self, batches: Prefetch, first: int) -> None:
+        self._batches = batches
+        self._began, self._waited, self._step = time.monotonic(), batches.waited, first
 
-    def waiting(self) -> "_Clock":
-        return self
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Around what is no training."""
+        began = time.monotonic()
+        yield
+        self._began += time.monotonic() - began
 
-    def __enter__(self) -> None:
-        self._wait_began = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self._waited += time.monotonic() - self._wait_began
-        self._step += 1
-
-    def lap(self) -> dict[str, float]:
-        seconds = time.monotonic() - self._began
-        scalars = {"seconds_per_step": seconds / self._step, "data_wait_share": self._waited / seconds}
-        self._began, self._waited, self._step = time.monotonic(), 0.0, 0
+    def lap(self, step: int, per_step: tuple[str, float] | None) -> dict[str, float]:
+        """The scalars of the time since the last lap, or the start; ``step`` is the last one done."""
+        now, waited = time.monotonic(), self._batches.waited
+        steps = step - self._step
+        seconds = now - self._began
+        scalars = {"seconds_per_step": seconds / steps, "data_wait_share": (waited - self._waited) / seconds}
+        if per_step is not None:
+            scalars[f"{per_step[0]}_per_second"] = per_step[1] * steps / seconds
+        self._began, self._waited, self._step = now, waited, step
         return scalars

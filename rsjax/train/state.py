@@ -9,7 +9,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int32
 
-from rsjax.config import LoopConfig
+from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.train.objectives import Objective
 
 
@@ -21,7 +21,8 @@ class TrainState:
     params: Any
     opt_state: Any
     ema: Any  # averaged parameters, or None
-    extra: Any = None  # what else the objective carries from step to step, or None
+    extra: Any  # what else the objective carries from step to step, or None
+    skipped: Int32[Array, ""]  # steps that were left out, for their loss or gradient was not finite
 
     @property
     def weights(self) -> Any:
@@ -30,17 +31,27 @@ class TrainState:
 
 
 def learning_rate(loop: LoopConfig) -> optax.Schedule:
-    """Linear warm-up, then a cosine to ``final_share`` of the peak at the last step, or falls to a tenth."""
-    opt = loop.optimizer
-    warmup = min(opt.warmup_steps, max(loop.steps - 1, 1))
+    """Warm-up and schedule over the whole run, or over each stretch between ``loop.restarts``."""
+    begins = [0, *loop.restarts]
+    ends = [*loop.restarts, loop.steps]
+    stretches = [_schedule(loop.optimizer, max(end - begin, 1)) for begin, end in zip(begins, ends, strict=True)]
+    return optax.join_schedules(stretches, list(loop.restarts))
+
+
+def _schedule(opt: OptimizerConfig, steps: int) -> optax.Schedule:
+    peak, low = opt.learning_rate, opt.learning_rate * opt.final_share
+    warmup = min(opt.warmup_steps, max(steps - 1, 1))
+    if opt.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(0.0, peak, warmup, max(steps, warmup + 1), low)
     if opt.schedule == "steps":
-        drops = optax.piecewise_constant_schedule(
-            opt.learning_rate, {round(share * loop.steps): 0.1 for share in opt.drop_at}
-        )
+        drops = optax.piecewise_constant_schedule(peak, {round(share * steps): 0.1 for share in opt.drop_at})
         return lambda step: drops(step) * jnp.minimum(1.0, step / warmup if warmup else 1.0)
-    return optax.warmup_cosine_decay_schedule(
-        0.0, opt.learning_rate, warmup, max(loop.steps, warmup + 1), opt.learning_rate * opt.final_share
-    )
+    rise = optax.linear_schedule(0.0, peak, warmup)
+    fall = max(1, steps - warmup if opt.schedule == "linear" else round(opt.decay_share * steps))
+    begin = max(warmup, steps - fall)
+    fall = max(1, steps - begin)
+    parts = [rise, optax.constant_schedule(peak), optax.linear_schedule(peak, low, fall)]
+    return optax.join_schedules(parts, [warmup, begin])
 
 
 def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
@@ -82,4 +93,11 @@ def create_state(objective: Objective, loop: LoopConfig, start: Callable[[Any], 
     if start is not None:
         params = start(params)
     ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
-    return TrainState(jnp.int32(0), params, make_optimizer(loop).init(params), ema, objective.init_extra())
+    return TrainState(
+        step=jnp.int32(0),
+        params=params,
+        opt_state=make_optimizer(loop).init(params),
+        ema=ema,
+        extra=objective.init_extra(),
+        skipped=jnp.int32(0),
+    )

@@ -1,5 +1,6 @@
 """The one train step, for the tokenizer and the world model, for one device and many."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 
 from rsjax.config import LoopConfig
 from rsjax.objective import losses
+from rsjax.objective.losses import Term
 from rsjax.train.objectives import Objective, Surroundings
 from rsjax.train.state import TrainState, learning_rate, make_optimizer
 
@@ -20,26 +22,31 @@ def train_step(
 ) -> tuple[TrainState, Metrics]:
     """One optimizer step; a pure function, the same under jit, pmap and jit over a sharded mesh.
 
+    Where the loss or the gradient is not finite, the state stays as it was, but for ``step`` and ``skipped``.
+
     Args:
         objective: static; what is trained.
-        loop: static; optimizer, averaging and seed.
+        loop: static; optimizer, averaging, seed, and the parts that the batch is computed in.
         state: replicated where there are several devices.
         batch: this device's part.
         axis_name: of pmap, over which sums and weights are added (separately); None where XLA sees the whole batch.
 
     Returns:
-        The new state, and float32 scalars: the objective, its terms, and the norms of gradient, parameters and update.
+        The new state, and float32 scalars: the objective, its terms, the norms of gradient, parameters and update, and
+        how many steps were left out so far.
     """
     # Keys follow from the step alone, so a resumed run draws what an uninterrupted one would have drawn.
     key = jax.random.fold_in(jax.random.key(loop.seed + 1), state.step)
     total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
     around = Surroundings(state.step, state.extra, axis_name)
 
-    def share_of_loss(params: Any) -> tuple[Float[Array, ""], Metrics]:
-        return losses.combine(objective.terms(params, batch, key, around), objective.weights, total)
+    def terms(params: Any, part: Any) -> dict[str, Term]:
+        return objective.terms(params, part, key, around)
 
-    (loss, terms), grads = jax.value_and_grad(share_of_loss, has_aux=True)(state.params)
-    grads, metrics = total(grads), total({"loss": loss, **terms})
+    grads, metrics = _gradients(terms, objective.weights, total, state.params, batch, loop.accumulate)
+    grads, metrics = total(grads), total(metrics)
+    grad_norm = optax.global_norm(grads)
+    sound = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
 
     updates, opt_state = make_optimizer(loop).update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
@@ -48,11 +55,54 @@ def train_step(
         # A young average would remember the initial weights: its decay grows with its age.
         decay = jnp.minimum(loop.ema, (1.0 + state.step) / (10.0 + state.step))
         ema = optax.incremental_update(params, ema, 1 - decay)
-    extra = objective.next_extra(state.extra, metrics)
+    new = (params, opt_state, ema, objective.next_extra(state.extra, metrics))
+    old = (state.params, state.opt_state, state.ema, state.extra)
+    params, opt_state, ema, extra = jax.tree.map(lambda new, old: jnp.where(sound, new, old), new, old)
+    skipped = state.skipped + ~sound
     metrics |= {
-        "grad_norm": optax.global_norm(grads),
+        "grad_norm": grad_norm,
         "param_norm": optax.global_norm(params),
         "update_norm": optax.global_norm(updates),
-        "learning_rate": jnp.float32(learning_rate(loop)(state.step)),
+        "learning_rate": jnp.float32(learning_rate(loop)(state.step - state.skipped)),
+        "skipped": skipped.astype(jnp.float32),
     }
-    return TrainState(state.step + 1, params, opt_state, ema, extra), metrics
+    return TrainState(state.step + 1, params, opt_state, ema, extra, skipped), metrics
+
+
+def _gradients(
+    terms: Callable[[Any, Any], dict[str, Term]],
+    weights: dict[str, float],
+    total: Callable[[Any], Any],
+    params: Any,
+    batch: Any,
+    parts: int,
+) -> tuple[Any, Metrics]:
+    """This device's share of the gradient, and of the objective and its terms.
+
+    A batch in several parts gives the same, to rounding: every part is divided by the weights of the whole batch, which
+    are found first (no network is run for them). Only the tokenizer's entropy is then a part's own.
+    """
+
+    def share(params: Any, part: Any, whole: dict[str, Float[Array, ""]] | None) -> tuple[Float[Array, ""], Metrics]:
+        found = terms(params, part)
+        if whole is not None:
+            found = {name: (value, whole[name]) for name, (value, _) in found.items()}
+        loss, shares = losses.combine(found, weights, total)
+        return loss, {"loss": loss, **shares}
+
+    gradient = jax.grad(share, has_aux=True)
+    if parts == 1:
+        return gradient(params, batch, None)
+    # Every parts-th row, so that rows that lie on one device of a mesh stay there.
+    cut = jax.tree.map(lambda x: x.reshape(-1, parts, *x.shape[1:]).swapaxes(0, 1), batch)
+    of_parts = jax.lax.map(lambda part: {name: weight for name, (_, weight) in terms(params, part).items()}, cut)
+    whole = jax.tree.map(lambda x: jnp.sum(x, axis=0), of_parts)
+
+    def add(carry: Any, part: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, carry, gradient(params, part, whole)), None
+
+    zeros = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype),
+        jax.eval_shape(gradient, params, jax.tree.map(lambda x: x[0], cut), whole),
+    )
+    return jax.lax.scan(add, zeros, cut)[0]

@@ -1,13 +1,15 @@
 import dataclasses
 import io
 import json
+import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from rsjax import presets
-from rsjax.bench import parts
+from rsjax.bench import feed, parts
 from rsjax.bench.run import PARTS, bench, ratios, table
 from rsjax.config import Config, ConfigError, MaskConfig
 from rsjax.errors import UserError
@@ -44,6 +46,8 @@ def test_every_quantity_is_there_positive_and_flat(numbers: dict[str, Any]) -> N
         "tokenizer_encode_frames_per_s",
         "tokenizer_decode_frames_per_s",
         "loader_clips_per_s",
+        "feed_step_s",
+        "data_wait_share",
         "peak_memory_bytes",
     }
     assert measured <= numbers.keys()
@@ -61,6 +65,7 @@ def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     assert numbers["sample_s_per_frame_cached"] == numbers["sample_s_per_frame_cached_4"]
     ratio = numbers["sample_s_per_frame_cached_6"] / numbers["sample_s_per_frame_cached_4"]
     assert numbers["sample_cost_ratio_6_over_4"] == pytest.approx(ratio)
+    assert numbers["data_wait_share"] == pytest.approx(numbers["data_wait_s"] / numbers["feed_step_s"])
     peaks = [numbers[f"{part}_peak_memory_bytes"] for part in PARTS]
     assert peaks == sorted(peaks) and numbers["peak_memory_bytes"] >= peaks[-1]
 
@@ -76,6 +81,22 @@ def test_a_part_alone_measures_that_part() -> None:
     measured = bench(toy(), batch=1, only=["loader"], budget=0.0)
     assert "loader_clips_per_s" in measured
     assert not [name for name in measured if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
+
+
+@pytest.mark.parametrize(("step_s", "batch_s", "low", "high"), [(0.0, 0.02, 0.8, 1.0), (0.03, 0.0, 0.0, 0.2)])
+def test_steps_wait_for_a_slow_loader_and_not_for_a_quick_one(
+    step_s: float, batch_s: float, low: float, high: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def step(state: Any, batch: Any) -> tuple[Any, Any]:
+        time.sleep(step_s)
+        return state, {}
+
+    placement = SimpleNamespace(compile=lambda *_: step, put_batch=lambda batch: time.sleep(batch_s))
+    monkeypatch.setattr(feed.Placement, "create", lambda loop: placement)
+    monkeypatch.setattr(feed, "create_state", lambda objective, loop: 0)
+    measured = bench(toy(), only=["feed"], budget=0.0)
+    assert low < measured["data_wait_share"] < high
+    assert (measured["feed_steps"], measured["feed_batch"]) == (feed.LEAST, toy().train.batch_size)
 
 
 def test_rollouts_begin_with_one_frame_whatever_the_preset_trains_with(monkeypatch: pytest.MonkeyPatch) -> None:

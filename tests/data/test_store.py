@@ -167,3 +167,43 @@ def test_replaces_a_store_but_nothing_else(path: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(StoreError, match=r"not a store"):
         write_store(tmp_path / "mine", "numbers", {"train": numbered(1)}, {})
+
+
+@given(st.lists(st.tuples(st.text(), st.sampled_from("ab")), max_size=20))
+def test_labels_are_those_of_the_records_in_their_order(tmp_path_factory: pytest.TempPathFactory, rows: list) -> None:
+    path = tmp_path_factory.mktemp("labels") / "set"
+    records = [{"i": np.array(i), "one": one, "two": two} for i, (one, two) in enumerate(rows)]
+    write_store(path, "numbers", {"train": records}, {}, lambda r: {"one": r["one"], "two": r["two"]})
+    store = open_store(path)
+    assert len(store.source("train")) == len(rows)
+    assert store.labelled("train") == bool(rows)
+    if not rows:
+        return
+    labels = store.labels("train")
+    for column, name in enumerate(("one", "two")):
+        found = [labels.words[name][code] for code in labels.codes[name]]
+        assert found == [row[column] for row in rows]
+        assert sum(labels.counts()[name].values()) == len(rows)
+
+
+def test_damaged_labels_are_named(tmp_path: Path) -> None:
+    write_store(tmp_path / "set", "numbers", {"train": numbered(3)}, {}, lambda r: {"name": r["name"]})
+    file = tmp_path / "set" / "train-labels.npy"
+    payload = bytearray(file.read_bytes())
+    payload[-1] ^= 1
+    file.write_bytes(payload)
+    with pytest.raises(StoreError, match=f"{file}: cannot be read .*make it again"):
+        open_store(tmp_path / "set").labels("train")
+    file.unlink()
+    with pytest.raises(StoreError, match=f"{file}: missing"):
+        open_store(tmp_path / "set")
+
+
+def test_a_reader_that_went_stale_is_opened_again(path: Path) -> None:
+    class Stale:
+        def __getitem__(self, index: int) -> bytes:
+            raise RuntimeError("stale file handle")
+
+    source = open_store(path).source("train")
+    source._reader = Stale()
+    assert source[3]["name"] == "record 3"

@@ -1,6 +1,6 @@
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -195,15 +195,26 @@ def test_actions_cannot_be_dropped_without_a_null_action() -> None:
         _apply_plain(DUAL, random_params(DUAL), *random_inputs(DUAL), drop_actions=np.array([True, False]))
 
 
-def test_remat_changes_neither_parameters_nor_gradients() -> None:
+@pytest.mark.parametrize("remat", ["products", "blocks"])
+def test_remat_changes_neither_parameters_nor_gradients(remat: Literal["products", "blocks"]) -> None:
     params, inputs = random_params(DUAL), random_inputs(DUAL)
 
     def gradients(config: ModelConfig) -> Any:
         loss = lambda params: sum(jnp.mean(jnp.square(x)) for x in _apply_plain(config, params, *inputs)[0].values())  # noqa: E731
         return jax.jit(jax.grad(loss))(params)
 
-    plain, again = gradients(DUAL), gradients(replace(DUAL, remat=True))
+    plain, again = gradients(DUAL), gradients(replace(DUAL, remat=remat))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), plain, again)
+
+
+def test_of_the_remat_policies_each_keeps_less_than_the_one_before() -> None:
+    params, inputs = random_params(DUAL), random_inputs(DUAL)
+
+    def kept(remat: Literal["none", "products", "blocks"]) -> int:
+        forward = lambda params: _apply_plain(replace(DUAL, remat=remat), params, *inputs)[0]  # noqa: E731
+        return sum(x.size for x in jax.tree.leaves(jax.eval_shape(lambda p: jax.vjp(forward, p)[1], params)))
+
+    assert kept("none") > kept("products") > kept("blocks")
 
 
 def test_without_depth_nothing_of_it_exists() -> None:

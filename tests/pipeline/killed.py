@@ -33,9 +33,10 @@ def in_tokens() -> None:
 def in_world_model() -> None:
     save = Checkpoints.save
 
-    def dying(self: Checkpoints, state: Any, data: Any) -> None:
-        save(self, state, data)
-        if self.directory.parent.name == "world_model" and state.step == 2:
+    def dying(self: Checkpoints, step: int, *arguments: Any, **options: Any) -> None:
+        save(self, step, *arguments, **options)
+        if self.directory.parent.name == "world_model" and step == 2:
+            self.wait()
             die()
 
     Checkpoints.save = dying  # type: ignore[method-assign]

@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -6,7 +7,7 @@ from typing import Any
 import pytest
 
 from rsjax import presets
-from rsjax.config import Config
+from rsjax.config import Config, PartConfig, StageConfig
 from rsjax.pipeline import run as module
 from rsjax.pipeline.run import STAGES, TRAINED, Run, RunError
 
@@ -41,6 +42,8 @@ def make(run: Run, *stages: str) -> None:
         ("mask", "corruption_keep", 0.5, "world_model"),
         ("loss", "gamma", 4.0, "world_model"),
         ("train", "ema", 0.5, "world_model"),
+        ("train", "stages", (StageConfig(epochs=2.0),), "world_model"),
+        ("train", "skip_budget", 3, "world_model"),
         ("sample", "steps", 3, "evaluation"),
         ("eval", "action_draws", 2, "evaluation"),
     ],
@@ -56,7 +59,17 @@ def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(
 
 @pytest.mark.parametrize(
     ("section", "field", "value"),
-    [("sim", "workers", 3), ("train", "log_every", 7), ("tokenizer_train", "checkpoint_every", 9)],
+    [
+        ("sim", "workers", 3),
+        ("tokenizer_train", "checkpoint_every", 9),
+        ("train", "placement", "mesh"),
+        ("train", "accumulate", 2),
+        ("train", "eval_every", 5),
+        ("train", "keep_best", False),
+        ("train", "workers", 2),
+        ("train", "wandb", "robots"),
+        ("train", "profile", 3),
+    ],
 )
 def test_how_a_run_is_carried_out_changes_no_key(section: str, field: str, value: Any) -> None:
     assert keys(changed(section, field, value)) == keys(DEBUG)
@@ -136,6 +149,43 @@ def test_overwrite_removes_the_trained_stages_that_differ_and_no_more(
     other.prepare(overwrite=True)
     assert [stage for stage in STAGES if not (run.directory / stage).exists()] == removed
     assert json.loads((run.directory / "config.json").read_text())[section][field] == value
+
+
+def test_a_run_is_resumed_though_how_it_is_carried_out_differs(tmp_path: Path) -> None:
+    run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    make(run, *STAGES)
+    otherwise = replace(DEBUG.train, eval_every=5, placement="mesh", keep_last=7, wandb="robots", workers=2)
+    other = Run(replace(DEBUG, train=otherwise), run.directory, run.data_directory)
+    other.prepare(overwrite=False)
+    assert all(other.finished(stage) for stage in STAGES)
+
+
+def test_only_fields_that_change_the_refused_stage_are_named_down_to_those_of_a_curriculum(tmp_path: Path) -> None:
+    two = replace(DEBUG.train, stages=(StageConfig(), StageConfig((PartConfig(difficulties=("simple",)),), epochs=2.0)))
+    run = Run(replace(DEBUG, train=two), tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    make(run, *STAGES)
+    changes = replace(two.stages[1], epochs=3.0, restart=True)
+    loop = replace(two, stages=(two.stages[0], changes), log_every=77, skip_budget=3)
+    config = replace(DEBUG, train=loop, sample=replace(DEBUG.sample, steps=3))
+    with pytest.raises(RunError) as told:
+        Run(config, run.directory, run.data_directory).prepare(overwrite=False)
+    named = re.search(r"of another configuration \((.*)\);", str(told.value))
+    assert named and set(named[1].split("; ")) == {
+        "train.stages.1.epochs is 2.0 there, 3.0 here",
+        "train.stages.1.restart is False there, True here",
+        "train.skip_budget is 10 there, 3 here",
+    }
+
+
+def test_a_field_that_one_side_does_not_have_is_named(tmp_path: Path) -> None:
+    run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
+    run.prepare(overwrite=False)
+    make(run, *STAGES)
+    longer = Run(changed("train", "stages", (StageConfig(),)), run.directory, run.data_directory)
+    with pytest.raises(RunError, match=r"train.stages.0.epochs is not set there, 1.0 here"):
+        longer.prepare(overwrite=False)
 
 
 def test_a_mark_of_older_code_is_refused_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

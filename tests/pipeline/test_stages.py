@@ -11,7 +11,7 @@ import pytest
 
 from rsjax.config import LoopConfig, TokenizerTrainConfig
 from rsjax.data.store import write_store
-from rsjax.pipeline import stages
+from rsjax.pipeline import jobs, stages
 from rsjax.pipeline.run import Run
 from rsjax.sample.generator import load_tokenizer
 from rsjax.train.objectives import TokenizerObjective
@@ -31,7 +31,7 @@ def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.Monk
         states.append(create_state(objective, loop))
         return states[0]
 
-    monkeypatch.setattr(stages, "fit", untrained)
+    monkeypatch.setattr(jobs, "fit", untrained)
     (run.directory / "tokenizer").mkdir(parents=True)
     stages.train_tokenizer(run, resume=True)
     return run, states[0]
@@ -71,7 +71,7 @@ def test_weights_from_elsewhere_bring_the_reminder_of_their_tokens(
     )
     run = Run(cfg, tmp_path / "run", tmp_path / "data")
     write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, {"key": "toy"})
-    monkeypatch.setattr(stages, "fit", lambda *_, **__: SimpleNamespace(weights={}))
+    monkeypatch.setattr(jobs, "fit", lambda *_, **__: SimpleNamespace(weights={}))
     monkeypatch.setattr(stages, "save_weights", lambda *_: None)
     stages.train_world_model(run, resume=True)
     assert capsys.readouterr().out.count("the tokens of this run's tokenizer") == reminded

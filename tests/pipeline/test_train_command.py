@@ -31,8 +31,8 @@ def skipped(output: str) -> list[str]:
 
 
 def files(run: Path) -> dict[Path, tuple[int, int]]:
-    """Every file's size and time of change, but for the configuration, which every command writes."""
-    found = [path for path in run.rglob("*") if path.is_file() and path.name != "config.json"]
+    """Every file's size and time of change, but for those that every start writes."""
+    found = [path for path in run.rglob("*") if path.is_file() and path.name not in ("config.json", "run.json")]
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in found}
 
 
@@ -133,7 +133,7 @@ def test_a_part_that_is_switched_off_is_gone_and_the_rest_runs(
 
 
 def test_a_truncated_store_is_named_and_deleting_it_cures(run: Path, debug: Path, command: Commands) -> None:
-    (shard,) = (run / "tokens" / "store").glob("train-*")
+    (shard,) = (run / "tokens" / "store").glob("train-*.array_record")
     os.truncate(shard, shard.stat().st_size // 2)
     shutil.rmtree(run / "world_model" / "weights")
     line = command.refused("experiments.train", "debug", "--run-dir", run)
@@ -163,3 +163,9 @@ def test_without_opengl_one_line_says_what_to_install(
     assert line.count("\n") == 1
     assert not (tmp_path / "data").exists()
     assert not json.loads((tmp_path / "run" / "collect" / "stage.json").read_text())["finished"]
+
+
+def test_a_run_that_left_no_step_out_says_so(debug: Path, command: Commands) -> None:
+    done = command("experiments.replay", debug)
+    assert done.returncode == 0 and "no step of world_model was left out" in done.stdout
+    assert "step 3 was not left out (left out: none)" in command.refused("experiments.replay", debug, "--step", "3")

@@ -2,9 +2,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rsjax.data.store import Record, encode_clip
 from rsjax.pipeline import transforms
+from rsjax.sample.generator import Units
 from rsjax.tokenizer.depth_color import depth_to_color
 from tests.pipeline import toy
 
@@ -87,3 +90,28 @@ def test_a_token_batch_counts_every_clip_and_numbers_them(record: Record) -> Non
     assert batch.index.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(batch.depth, np.ones((3, 6, 8, 8)))
     np.testing.assert_array_equal(batch.tracks[1], record["tracks"])
+
+
+def test_a_token_batch_takes_weights_and_places_where_it_is_given_them(record: Record) -> None:
+    grid = np.zeros((6, 8, 8), np.int32)
+    arrays = transforms.token_clip(record | {"rgb": grid, "depth": grid}, np.random.default_rng(0))
+    stacked = {name: np.stack([array] * 2) for name, array in arrays.items()}
+    stacked |= {"weight": np.array([1.0, 0.0], np.float32), "index": np.array([1, 3], np.int32), "part": np.zeros(2)}
+    batch = transforms.token_batch(stacked)
+    assert (batch.weight.tolist(), batch.index.tolist()) == ([1, 0], [1, 3])
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_another_stores_actions_become_what_this_store_would_have_made_of_them(seed: int, integrate: bool) -> None:
+    rng = np.random.default_rng(seed)
+    own, other = (Units(tuple(rng.normal(size=3)), tuple(rng.uniform(0.1, 2, 3)), (0.1, 1.0)) for _ in range(2))
+    actions = rng.normal(size=(5, 3))
+    there, here = (
+        dict.fromkeys(transforms.TOKEN_ARRAYS, actions) | {"actions": units.action_inputs(actions, integrate)}
+        for units in (other, own)
+    )
+    moved = transforms.token_clip_in(own, other, integrate, there, rng)
+    assert moved.keys() == transforms.token_clip(here, rng).keys()
+    assert moved["actions"].dtype == here["actions"].dtype
+    near = 1e-4 * np.abs(here["actions"]).max()
+    np.testing.assert_allclose(moved["actions"], here["actions"], rtol=0, atol=near)

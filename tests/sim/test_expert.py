@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rsjax.sim.expert import MODES, Expert, Manner, draw_manner
+from rsjax.sim.expert import MODES, Expert, Manner, difficulty, draw_manner
 from rsjax.sim.lift import LiftSim
 
 STEPS = 60
@@ -78,3 +78,9 @@ def test_turns_towards_the_cube(blind: LiftSim) -> None:
         assert misalignment() < before / 2
         return
     pytest.fail("no seed gave a turned cube")
+
+
+def test_only_plain_success_is_simple() -> None:
+    found = {mode: difficulty({"expert": {"mode": mode}}) for mode in MODES}
+    assert found == {"lift": "simple", "drop": "difficult", "near_miss": "difficult", "explore": "difficult"}
+    assert difficulty({}) == "unknown"

@@ -42,7 +42,7 @@ def test_all_of_a_state_comes_back(tmp_path: Path) -> None:
     state = create_state(Regression(), replace(LOOP, ema=0.5)).replace(step=jax.numpy.int32(7))  # type: ignore[attr-defined]
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.latest() is None
-    checkpoints.save(state, {"next": [1, 2]})
+    checkpoints.save(7, state, {"next": [1, 2]})
     checkpoints.close()
     again = Checkpoints(tmp_path)
     restored, data = again.restore(create_state(Regression(), replace(LOOP, ema=0.5, seed=1)))
@@ -59,11 +59,14 @@ def test_a_checkpoint_of_another_architecture_is_named(trained: Path, change: di
     assert "\n" not in str(raised.value)
 
 
-def test_a_damaged_checkpoint_is_named(trained: Path) -> None:
+def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = train(LOOP, trained)
     truncate_largest(trained / "checkpoints" / "2" / "state")
-    with pytest.raises(CheckpointError, match=rf"{trained}/checkpoints/2: .*damaged") as raised:
-        train(replace(LOOP, steps=3), trained)
-    assert "\n" not in str(raised.value)
+    jax.tree.map(np.testing.assert_array_equal, train(LOOP, trained), whole)
+    assert "checkpoint 2 is damaged" in capsys.readouterr().out
+    assert {path.name for path in (trained / "checkpoints").iterdir()} == {"1", "2", "bad-2"}
 
 
 def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +75,7 @@ def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: 
     usage = module.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=10))
     for name, save in (
-        ("checkpoints", lambda: checkpoints.save(state, {})),
+        ("checkpoints", lambda: checkpoints.save(1, state, {})),
         ("weights", lambda: save_weights(tmp_path / "weights", state.params)),
     ):
         with pytest.raises(StoreError, match=f"{tmp_path / name}: the disk is full"):

@@ -83,7 +83,7 @@ def test_the_averages_are_saved_with_the_state(
     start: TrainState, stepped: tuple[TrainState, dict[str, Any]], tmp_path: Path
 ) -> None:
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(stepped[0], {})
+    checkpoints.save(1, stepped[0], {})
     restored, _ = checkpoints.restore(start)
     checkpoints.close()
     same(restored, stepped[0])
@@ -116,7 +116,7 @@ def test_a_step_with_lpips_survives_its_checkpoint(tmp_path: Path, monkeypatch: 
     assert metrics["perceptual"] > 0
     same(stepped.extra, {"lpips": weights})
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(stepped, {})
+    checkpoints.save(1, stepped, {})
     restored, _ = checkpoints.restore(begun)
     checkpoints.close()
     same(restored, stepped)

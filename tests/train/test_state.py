@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import partial
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from rsjax.config import ConfigError, LoopConfig, OptimizerConfig
 from rsjax.train.state import create_state, learning_rate, make_optimizer
 from rsjax.train.step import train_step
+from tests.train import devices
 from tests.train.toy import Regression, records
 
 OPTIMIZER = OptimizerConfig(learning_rate=0.1, warmup_steps=4, final_share=0.2, weight_decay=0.03, grad_clip=0.5)
@@ -29,6 +31,24 @@ def test_the_learning_rate_of_steps_falls_to_a_tenth_at_each_share_of_the_run() 
     np.testing.assert_allclose([rate(step) for step in (0, 1, 2, 19)], [0.0, 0.05, 0.1, 0.1], rtol=1e-6)
     np.testing.assert_allclose([rate(step) for step in (20, 24, 25, 27)], [0.01, 0.01, 0.001, 0.001], rtol=1e-6)
     assert learning_rate(LoopConfig(steps=27, optimizer=replace(optimizer, warmup_steps=0)))(0) == np.float32(0.1)
+
+
+def test_linear_falls_all_the_way_and_wsd_only_at_the_end() -> None:
+    linear, wsd = (
+        learning_rate(LoopConfig(steps=24, optimizer=replace(OPTIMIZER, schedule=schedule, decay_share=0.25)))
+        for schedule in get_args(Literal["linear", "wsd"])
+    )
+    np.testing.assert_allclose([linear(step) for step in (0, 2, 4, 14, 24)], [0, 0.05, 0.1, 0.06, 0.02], rtol=1e-5)
+    np.testing.assert_allclose([wsd(s) for s in (0, 2, 4, 18, 21, 24)], [0, 0.05, 0.1, 0.1, 0.06, 0.02], rtol=1e-5)
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "linear", "wsd"])
+def test_a_restart_runs_the_schedule_again_over_what_is_left(schedule: Any) -> None:
+    optimizer = replace(OPTIMIZER, schedule=schedule)
+    whole = learning_rate(LoopConfig(steps=30, restarts=(10,), optimizer=optimizer))
+    first, second = (learning_rate(LoopConfig(steps=steps, optimizer=optimizer)) for steps in (10, 20))
+    np.testing.assert_allclose([whole(s) for s in range(10)], [first(s) for s in range(10)], rtol=1e-6)
+    np.testing.assert_allclose([whole(s) for s in range(10, 31)], [second(s) for s in range(21)], rtol=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 200.0])
@@ -87,6 +107,7 @@ def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
             "param_norm": np.linalg.norm(theta),
             "update_norm": np.linalg.norm(update),
             "learning_rate": rate,
+            "skipped": 0.0,
         }
         assert metrics.keys() == expected.keys()
         for name, value in expected.items():
@@ -134,3 +155,29 @@ def test_muon_orthogonalises_the_blocks_matrices_and_leaves_the_rest_to_adamw() 
     for path in (("blocks", "bias"), ("embed", "embedding"), ("head", "kernel")):
         ours, adamw = (updates[kind][path[0]][path[1]] for kind in ("muon", "adamw"))
         np.testing.assert_allclose(ours, adamw, rtol=1e-5)
+
+
+def test_a_batch_in_parts_takes_the_same_step() -> None:
+    """Clips of unequal weight and masks of unequal size: the parts' own means would differ."""
+    batch, taken = devices.batch(0), []
+    state = jax.jit(partial(create_state, devices.OBJECTIVE, devices.LOOP))()
+    for parts in (1, 4):
+        loop = replace(devices.LOOP, accumulate=parts)
+        taken.append(jax.jit(partial(train_step, devices.OBJECTIVE, loop))(state, batch))
+    (one, of_one), (many, of_many) = taken
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), of_one, of_many)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), one.opt_state, many.opt_state)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_step_that_is_not_finite_is_left_out_and_counted(bad: float) -> None:
+    loop, objective = replace(LOOP, ema=0.5), Regression()
+    step = jax.jit(partial(train_step, objective, loop))
+    before, _ = step(create_state(objective, loop), BATCH)
+    after, metrics = step(before, BATCH | {"y": np.full_like(BATCH["y"], bad)})
+    assert int(after.step) == 2 and int(after.skipped) == 1 and float(metrics["skipped"]) == 1
+    for name in ("params", "opt_state", "ema"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(before, name), getattr(after, name))
+    onwards, metrics = step(after, BATCH)
+    assert int(onwards.skipped) == 1 and np.isfinite(float(metrics["loss"]))
+    assert np.any(np.asarray(onwards.params["w"]) != np.asarray(before.params["w"]))

@@ -1,0 +1,87 @@
+"""What each record of a split is called, kept beside the records so that choosing among them reads none.
+
+A label is a word in a column, such as ``difficulty``: ``simple``. Columns are stored as int32 codes into their words.
+"""
+
+import fnmatch
+import io
+import zlib
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int32
+
+from rsjax.data.codec import Record
+
+Label = Callable[[Record], dict[str, str]]  # a record's word in each column; the columns are always the same
+
+
+class LabelWriter:
+    """Notes the labels of records that pass by, in order, and writes them to one file."""
+
+    def __init__(self) -> None:
+        self._words: dict[str, dict[str, int]] = {}
+        self._codes: dict[str, array[int]] = {}
+
+    def noting(self, records: Iterable[Record], label: Label) -> Iterator[Record]:
+        """The same records; each one's labels are noted on the way."""
+        for record in records:
+            for name, word in label(record).items():
+                words = self._words.setdefault(name, {})
+                self._codes.setdefault(name, array("i")).append(words.setdefault(word, len(words)))
+            yield record
+
+    def write(self, path: Path) -> dict[str, Any]:
+        """Writes the codes of at least one record; returns what the manifest says of them."""
+        buffer = io.BytesIO()
+        np.save(buffer, np.stack([np.asarray(codes, np.int32) for codes in self._codes.values()]))
+        payload = buffer.getvalue()
+        path.write_bytes(payload)
+        words = {name: list(words) for name, words in self._words.items()}
+        return {"name": path.name, "bytes": len(payload), "crc32": zlib.crc32(payload), "words": words}
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The labels of a split.
+
+    Attributes:
+        words: each column's, in the order of their first use.
+        codes: each record's place among its column's words, (N,).
+    """
+
+    words: dict[str, list[str]]
+    codes: dict[str, Int32[np.ndarray, " N"]]
+
+    @classmethod
+    def read(cls, path: Path, entry: dict[str, Any]) -> "Labels":
+        """The inverse of :meth:`LabelWriter.write`.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is damaged.
+        """
+        payload = path.read_bytes()
+        if zlib.crc32(payload) != entry["crc32"]:
+            raise ValueError("its checksum is wrong")
+        codes = np.load(io.BytesIO(payload), allow_pickle=False)
+        return cls(entry["words"], dict(zip(entry["words"], codes, strict=True)))
+
+    def matching(self, patterns: Mapping[str, tuple[str, ...]]) -> Bool[np.ndarray, " N"]:
+        """Which records have, in every column named, a word that one of its patterns (a shell's) matches."""
+        passes = np.ones(len(next(iter(self.codes.values()))), bool)
+        for name, allowed in patterns.items():
+            chosen = [any(fnmatch.fnmatchcase(word, pattern) for pattern in allowed) for word in self.words[name]]
+            passes &= np.asarray(chosen, bool)[self.codes[name]]
+        return passes
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """How many records each word of each column has."""
+        return {
+            name: dict(zip(words, np.bincount(self.codes[name], minlength=len(words)).tolist(), strict=True))
+            for name, words in self.words.items()
+        }

@@ -1,0 +1,3 @@
+from tests.pipeline.conftest import command, debug, shared
+
+__all__ = ["command", "debug", "shared"]

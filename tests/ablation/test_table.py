@@ -1,0 +1,139 @@
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from rsjax.ablation.figure import draw
+from rsjax.ablation.results import Result, State, final_terms
+from rsjax.ablation.table import METRICS, Spread, as_csv, as_json, best, markdown, present, tabulate
+from tests.ablation import toy
+
+PSNR = METRICS[0]
+CELLS = toy.cells("model.depth=True,False", "loss.keypoints=True,False", seeds=(0, 1, 2))
+
+
+def results(metrics: Mapping[int, Mapping[str, float]], others: State = "missing") -> list[Result]:
+    """The cells' results: these are finished with their metrics, and the others are not."""
+    return [
+        Result(cell, "finished", "", metrics[i]) if i in metrics else Result(cell, others, "its reason", {})
+        for i, cell in enumerate(CELLS)
+    ]
+
+
+def full(rng: np.random.Generator) -> dict[int, dict[str, float]]:
+    """Of all cells; those without depth have no depth scores."""
+    return {
+        i: {m.key: float(rng.normal()) for m in METRICS if cell.config.model.depth or not m.key.startswith("depth")}
+        for i, cell in enumerate(CELLS)
+    }
+
+
+@given(st.lists(st.floats(-1e6, 1e6), max_size=8))
+def test_a_spread_is_numpys(values: list[float]) -> None:
+    spread = Spread.over(values)
+    if not values:
+        assert spread is None
+        return
+    assert spread is not None
+    assert spread.n == len(values)
+    assert spread.mean == pytest.approx(np.mean(values), abs=1e-6)
+    if len(values) == 1:
+        assert spread.std is None
+    else:
+        assert spread.std == pytest.approx(
+            np.sqrt(np.square(np.array(values) - np.mean(values)).sum() / (len(values) - 1)), abs=1e-6
+        )
+
+
+def test_rows_gather_the_seeds_of_equal_values() -> None:
+    metrics = full(np.random.default_rng(0))
+    rows = tabulate(results(metrics))
+    assert [tuple(row.values.values()) for row in rows] == [(True, True), (True, False), (False, True), (False, False)]
+    for number, row in enumerate(rows):
+        seeds = [metrics[number + 4 * seed]["psnr"] for seed in range(3)]
+        expected = (np.mean(seeds), np.std(seeds, ddof=1), 3)
+        assert tuple(vars(row.spreads["psnr"]).values()) == pytest.approx(expected)
+    assert "depth_absrel" not in rows[2].spreads
+
+
+def test_the_best_mean_is_the_largest_or_smallest_as_the_metric_wants() -> None:
+    metrics = full(np.random.default_rng(1))
+    rows = tabulate(results(metrics))
+    for metric in METRICS:
+        means = [row.spreads[metric.key].mean if metric.key in row.spreads else np.nan for row in rows]
+        assert best(rows, metric) == {int(np.nanargmax(means) if metric.more else np.nanargmin(means))}
+        less = replace(metric, digits=-1)
+        assert best(rows, less) == {i for i, mean in enumerate(means) if not np.isnan(mean)}, "all are shown as 0"
+    assert best(rows[:1], PSNR) == set(), "nothing to compare with"
+    same = tabulate(results({i: {"psnr": 1.0} for i in range(12)}))
+    assert best(same, PSNR) == {0, 1, 2, 3}
+    broken = tabulate(results({i: {"psnr": float("nan") if i % 4 == 0 else i % 4} for i in range(12)}))
+    assert best(broken, PSNR) == {3}
+
+
+def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
+    metrics = {0: {"psnr": 20.0, "depth_absrel": 0.1}, 4: {"psnr": 21.0, "depth_absrel": 0.3}, 2: {"psnr": 22.0}}
+    text = markdown(tabulate(results(metrics)))
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert lines[0] == ["model.depth", "loss.keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
+    assert lines[2] == ["True", "True", "2/3", "20.50 ± 0.71", "0.2000 ± 0.1414"]
+    assert lines[3] == ["True", "False", "0/3", "–", "–"]
+    assert lines[4] == ["False", "True", "1/3", "**22.00**", "–"]
+    assert len({len(line) for line in text.splitlines() if line.startswith("|")}) == 1
+    assert text.count("- model.depth=") == 9
+    assert "- model.depth=False,loss.keypoints=False,seed=2: missing (its reason)" in text
+
+
+def test_a_whole_table_names_no_cell() -> None:
+    assert "Not in the table" not in markdown(tabulate(results(full(np.random.default_rng(2)))))
+
+
+def test_files_have_every_metric_at_full_precision() -> None:
+    metrics = {i: m | {"psnr_low": -1.5} for i, m in full(np.random.default_rng(3)).items()}
+    rows = tabulate(results(metrics))
+    lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    told = as_json(rows)
+    for row, line, entry in zip(rows, lines, told["rows"], strict=True):
+        assert line["model.depth"] == str(row.values["model.depth"])
+        assert entry["values"] == row.values
+        for name, spread in row.spreads.items():
+            assert [float(line[f"{name}_{part}"]) for part in ("mean", "std", "n")] == [
+                spread.mean,
+                spread.std,
+                spread.n,
+            ]
+            assert entry[name] == {"mean": spread.mean, "std": spread.std, "n": spread.n}
+    assert lines[3]["depth_absrel_mean"] == "" and lines[3]["depth_absrel_n"] == "0"
+    assert told["best"]["psnr"] == sorted(best(rows, PSNR))
+    assert [cell["metrics"] for cell in told["cells"]] == [dict(r.metrics) for row in rows for r in row.results]
+
+
+def test_the_picture_has_a_panel_per_metric_and_grows_with_the_rows() -> None:
+    whole, part = tabulate(results(full(np.random.default_rng(4)))), tabulate(results({0: {"psnr": 1.0}}))
+    sizes = []
+    for rows in (whole, part, whole[:2], tabulate(results({}))):
+        with Image.open(io.BytesIO(draw(rows, "a grid"))) as image:
+            sizes.append(image.size)
+    assert sizes[0][0] > sizes[1][0]
+    assert sizes[0][1] > sizes[2][1]
+    assert [len(present(rows)) for rows in (whole, part)] == [len(METRICS), 1]
+
+
+def test_a_bar_stands_in_a_text_value_without_breaking_the_table() -> None:
+    cells = toy.cells("train.start_from=a|b,c")
+    rows = tabulate([Result(cell, "finished", "", {"psnr": 1.0}) for cell in cells])
+    assert r"| a\|b" in markdown(rows)
+
+
+@given(st.lists(st.floats(0, 10), min_size=1, max_size=40))
+def test_a_loss_at_the_end_is_the_mean_of_its_last_tenth(values: list[float]) -> None:
+    log = [{"step": i, "rgb": value} for i, value in enumerate(values)]
+    count = max(1, round(len(values) / 10))
+    assert final_terms(log, ("rgb", "depth")) == {"loss_rgb": pytest.approx(np.mean(values[-count:]))}
+    assert final_terms([], ("rgb",)) == {}

@@ -1,0 +1,174 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.config import LoopConfig, PartConfig
+from rsjax.config.stages import parse_stage
+from rsjax.data.codec import Record
+from rsjax.data.curriculum import check_stages, choose, plan
+from rsjax.data.order import Arrays
+from rsjax.data.store import Store, StoreError, open_store, write_store
+from tests.data import toy
+from tests.data.toy import assert_same, jitter, take
+
+COUNT = 30
+MEANT = {"pick*": {"pick up", "pick out"}, "*": set(toy.TASKS)} | {task: {task} for task in toy.TASKS}
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("curriculum") / "own", COUNT, tokenizer="a")
+
+
+def transform(store: Store) -> Any:
+    return jitter
+
+
+def loop(*stages: str, **fields: Any) -> LoopConfig:
+    return LoopConfig(batch_size=4, stages=tuple(map(parse_stage, stages)), **fields)
+
+
+@given(st.sets(st.sampled_from(sorted(MEANT))), st.sets(st.sampled_from(toy.DIFFICULTIES)))
+def test_a_filter_by_labels_is_a_filter_by_reading_every_record(
+    own: Store, tasks: set[str], difficulties: set[str]
+) -> None:
+    source = own.source("train")
+    meant = {task for pattern in tasks for task in MEANT[pattern]}
+    expected = [i for i in range(COUNT) if source[i]["task"] in meant and source[i]["difficulty"] in difficulties]
+    part = PartConfig(tasks=tuple(tasks), difficulties=tuple(difficulties))
+    if expected:
+        chosen = choose(part, own, "train")
+        assert chosen is not None and chosen.tolist() == expected
+    else:
+        with pytest.raises(StoreError, match="no train record"):
+            choose(part, own, "train")
+
+
+def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
+    for check in (
+        lambda: check_stages(loop("hard/pick*:1"), own),
+        lambda: plan(loop("hard:1"), own, transform, own.path),
+    ):
+        with pytest.raises(StoreError) as caught:
+            check()
+        assert "difficulty like hard and a task like" in str(caught.value)
+        assert "task 'pick out' 10×, 'pick up' 10×, 'place' 10×; difficulty 'difficult' 15×, 'simple' 15×" in str(
+            caught.value
+        )
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["simple", "all", "difficult/pick*"]), st.integers(1, 30), st.booleans()), min_size=1
+    ),
+    st.integers(1, 40),
+)
+def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
+    own: Store, stages: list[tuple[str, int, bool]], batch_size: int
+) -> None:
+    """Epochs in tenths, so that no rounding of floats may add a batch."""
+    sizes = {"simple": 15, "all": 30, "difficult/pick*": 10}
+    words = [f"{part}:{tenths / 10}{':restart' if restart else ''}" for part, tenths, restart in stages]
+    steps = [-(-sizes[part] * tenths // (10 * batch_size)) for part, tenths, _ in stages]
+    firsts = np.cumsum([0, *steps]).tolist()
+    planned, feed = plan(replace(loop(*words), batch_size=batch_size), own, transform, own.path)
+    assert planned.steps == sum(steps)
+    assert planned.restarts == tuple(f for f, (_, _, restart) in zip(firsts, stages, strict=False) if restart and f)
+    assert len(feed.summary()) == len(stages)
+
+
+def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_difficult_one_three_times(own: Store) -> None:
+    planned, feed = plan(replace(loop("simple:2", "difficult:3:restart"), batch_size=5), own, transform, own.path)
+    assert (planned.steps, planned.restarts) == (6 + 9, (6,))
+    with feed(None) as loader:
+        taken = take(loader, planned.steps)["i"]
+    simple, difficult = np.arange(0, COUNT, 2), np.arange(1, COUNT, 2)
+    np.testing.assert_array_equal(np.sort(taken[:6].ravel()), np.repeat(simple, 2))
+    np.testing.assert_array_equal(np.sort(taken[6:].ravel()), np.repeat(difficult, 3))
+    assert feed.summary() == [
+        "stage simple:2: 15 clips, steps 1 to 6",
+        "stage difficult:3:restart: 15 clips, steps 7 to 15",
+    ]
+
+
+def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
+    plain, feed = plan(loop(steps=7), own, transform, own.path)
+    assert plain == loop(steps=7) and feed.summary() == []
+    one, same = plan(loop("all:1"), own, transform, own.path)
+    assert one.steps == 8
+    with feed(None) as left, same(None) as right:
+        assert_same(take(left, 10), take(right, 10))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 20))
+def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store, number: int) -> None:
+    _, feed = plan(loop("simple+difficult=2:1", "all:1"), own, transform, own.path)
+    with feed(None) as loader:
+        for _ in range(number):
+            next(loader)
+        before = json.loads(json.dumps(loader.state()))
+        arrays = next(loader)
+        assert_same(feed.replay(before), arrays)
+        with loader.whole(before) as again:
+            assert again.identify(next(again)) == loader.identify(arrays)
+
+
+def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path) -> None:
+    other = toy.store(tmp_path / "other", 6, first=100, tokenizer="a")
+    _, feed = plan(loop(f"simple=1+all=3@{other.path}:1"), own, transform, tmp_path)
+    with feed(None) as loader:
+        for _ in range(5):
+            arrays = next(loader)
+            assert (arrays["i"] >= 100).sum() == 3
+            names = [Path(row["store"]).name for row in loader.identify(arrays)]
+            assert names == ["other" if number >= 100 else "own" for number in arrays["i"]]
+
+
+def test_stores_that_do_not_go_together_are_refused(own: Store, tmp_path: Path) -> None:
+    toy.store(tmp_path / "other", 3, tokenizer="b")
+    with pytest.raises(StoreError, match="its tokenizer is b, that of .* is a"):
+        plan(loop(f"all@{tmp_path}/other:1"), own, transform, tmp_path)
+    toy.store(tmp_path / "same", 3, tokenizer="a")
+
+    def longer(store: Store) -> Any:
+        return jitter if store is own else stretched
+
+    with pytest.raises(StoreError, match=r"its i is int64 \(2,\), that of .* is int64 \(\)"):
+        plan(loop(f"all@{tmp_path}/same:1"), own, longer, tmp_path)
+    with pytest.raises(StoreError, match="manifest.json: missing"):
+        check_stages(loop(f"all@{tmp_path}/nothing:1"), own)
+
+
+def stretched(record: Record, rng: np.random.Generator) -> Arrays:
+    return jitter(record, rng) | {"i": np.stack([record["i"]] * 2)}
+
+
+def test_a_store_without_labels_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    write_store(tmp_path / "old", "numbers", {"train": map(toy.record, range(3))}, {})
+    old = open_store(tmp_path / "old")
+    assert plan(loop("all:4"), old, transform, tmp_path)[0].steps == 3
+    check_stages(loop("simple:1"), old)  # its tokens may have them
+    with pytest.raises(StoreError, match="names no task and difficulty"):
+        plan(loop("simple:1"), old, transform, tmp_path)
+
+
+def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Path) -> None:
+    own = toy.store(tmp_path / "own", 10)
+    toy.damage(own.path, 4)
+    _, feed = plan(loop("simple:1", "all:1", max_damaged=0.1), own, transform, tmp_path / "stage")
+    for _ in range(2):
+        with feed(None) as loader:
+            assert 4 not in take(loader, 6)["i"]
+            assert loader.quarantined() == 1
+    (line,) = (tmp_path / "stage" / "quarantine.jsonl").read_text().splitlines()
+    assert json.loads(line)["record"] == 4
+    _, strict = plan(loop("simple:1", "all:1", max_damaged=0.0), own, transform, tmp_path / "stage")
+    with strict(None) as loader, pytest.raises(StoreError, match="1 of 10 records are damaged"):
+        take(loader, 6)

@@ -1,0 +1,79 @@
+import threading
+import time
+
+import grain
+import numpy as np
+import pytest
+
+from rsjax.data.loader import Loader, batches
+from rsjax.data.prefetch import Prefetch
+from rsjax.data.store import StoreError
+from tests.data.toy import Numbers, assert_same, jitter
+
+
+def loader(place: int = 0, bad: tuple[int, ...] = ()) -> Loader:
+    return batches(Numbers(50, bad=bad), jitter, 4, seed=1, state={"global_next_index": place}, max_damaged=0.0)
+
+
+def test_batches_and_states_are_the_loaders_however_far_ahead_it_is() -> None:
+    with loader() as plain, Prefetch(loader(), lambda arrays: {"put": arrays["i"]}) as ahead:
+        for number in range(6):
+            before, arrays = plain.state(), next(plain)
+            time.sleep(0.02)  # for the thread to run ahead
+            fed = next(ahead)
+            np.testing.assert_array_equal(fed.batch["put"], arrays["i"])
+            assert (fed.before, fed.after, ahead.state()) == (before, plain.state(), plain.state())
+            assert ahead.identify(fed) == plain.identify(arrays)
+            if number == 3:
+                with loader(fed.before["global_next_index"]) as again:
+                    assert_same(next(again), arrays)
+        assert ahead.quarantined() == 0
+
+
+def test_of_a_batch_that_processes_share_all_rows_are_named() -> None:
+    shard = grain.sharding.ShardOptions(1, 2)
+    with loader() as plain, Prefetch(batches(Numbers(50), jitter, 4, seed=1, shard=shard), lambda arrays: None) as half:
+        for _ in range(3):
+            arrays, fed = next(plain), next(half)
+            assert fed.clips["record"].tolist() == arrays["record"][1::2].tolist()
+            assert half.identify(fed) == plain.identify(arrays)
+
+
+def test_batches_are_put_before_they_are_asked_for_but_no_more_than_wait() -> None:
+    made = threading.Semaphore(0)
+    count = []
+
+    def put(arrays: object) -> None:
+        count.append(arrays)
+        made.release()
+
+    with Prefetch(loader(), put, ahead=2) as ahead:
+        for _ in range(3):  # two wait, and a third is held ready
+            assert made.acquire(timeout=10)
+        assert not made.acquire(timeout=0.1)
+        waited = ahead.waited
+        next(ahead)
+        assert made.acquire(timeout=10)
+        assert ahead.waited - waited < 0.1
+    assert len(count) == 4
+
+
+def test_the_wait_for_a_slow_batch_is_counted() -> None:
+    with Prefetch(loader(), lambda arrays: time.sleep(0.2)) as ahead:
+        for _ in range(2):
+            next(ahead)
+        assert 0.2 < ahead.waited < 1.0
+
+
+def test_an_error_arrives_where_the_batch_is_asked_for_and_stays() -> None:
+    with Prefetch(loader(bad=tuple(range(50))), lambda arrays: arrays) as ahead:
+        for _ in range(2):
+            with pytest.raises(StoreError, match="cannot be read"):
+                next(ahead)
+        assert ahead.state() == {"global_next_index": 0}
+
+
+def test_closing_ends_the_thread_while_it_waits_for_room() -> None:
+    with Prefetch(loader(), lambda arrays: arrays, ahead=1):
+        time.sleep(0.1)
+    assert "prefetch" not in [thread.name for thread in threading.enumerate()]

@@ -1,0 +1,116 @@
+"""From damaged clips to a curriculum of tokens, with the tokenizer left untrained."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import LoopConfig
+from rsjax.config.stages import parse_stage
+from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
+from rsjax.pipeline import stages, transforms
+from rsjax.pipeline.feeding import fingerprint, planned, readable, token_transform
+from rsjax.pipeline.run import Run
+from rsjax.sample.generator import Units
+from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.train.checkpoint import save_weights
+from tests.pipeline import toy
+
+
+def damage(store: Store, split: str, index: int) -> None:
+    """Changes a byte in which no other record has a part."""
+    shard = store.path / f"{split}-00000.array_record"
+    sound, count = shard.read_bytes(), len(store.source(split))
+    for share in np.linspace(0.2, 0.8, 7):
+        payload = bytearray(sound)
+        payload[int(len(sound) * (index + share) / count)] ^= 255
+        shard.write_bytes(bytes(payload))
+        if [number for number in range(count) if not can_read(store, split, number)] == [index]:
+            return
+    raise AssertionError("no byte found")
+
+
+def can_read(store: Store, split: str, index: int) -> bool:
+    try:
+        return bool(store.source(split)[index])
+    except StoreError:
+        return False
+
+
+def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(toy.config(), tmp_path / "run", tmp_path / "data")
+    clips = toy.store(run.clips)
+    damage(clips, "train", 1)
+    params = jax.jit(Tokenizer(run.config.tokenizer).init_params)(jax.random.key(0))
+    (run.directory / "tokenizer").mkdir(parents=True)
+    save_weights(run.directory / "tokenizer" / "weights", params)
+    stages.tokenize(run)
+    tokens = open_store(run.output("tokens"))
+    assert tokens.manifest["tokenizer"] == fingerprint(params)
+    source = tokens.source("train")
+    assert [source[i]["provenance"]["episode"] for i in range(len(source))] == [0, 2]
+    assert tokens.labels("train").counts() == {"task": {"drift": 2}, "difficulty": {"unknown": 2}}
+    (line,) = (run.directory / "tokens" / "quarantine.jsonl").read_text().splitlines()
+    assert '"record": 1' in line
+    with pytest.raises(StoreError, match="task 'drift' 2×; difficulty 'unknown' 2×"):
+        planned(loop("simple:2"), tokens, lambda store: transforms.token_clip, tmp_path)
+    planned(loop("unknown/dri*:3"), tokens, lambda store: transforms.token_clip, tmp_path)
+    assert "note: stage unknown/dri*:3: 2 clips, steps 1 to 3" in capsys.readouterr().out
+
+
+def loop(*words: str) -> LoopConfig:
+    return LoopConfig(batch_size=2, stages=tuple(map(parse_stage, words)))
+
+
+def test_a_clip_that_scores_need_is_not_left_out(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    damage(clips, "test", 2)
+    with pytest.raises(StoreError, match="number 2 of the split"):
+        list(readable(clips.source("test"), "test", tmp_path, 1.0))
+    assert not (tmp_path / "quarantine.jsonl").exists()
+
+
+def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:
+    params = {"a": np.zeros(3, np.float32), "b": {"c": np.ones((2, 2), np.float32)}}
+    other = jax.tree.map(np.copy, params)
+    assert fingerprint(params) == fingerprint(other)
+    other["b"]["c"][1, 1] += 1e-6  # type: ignore[index, call-overload]
+    assert fingerprint(params) != fingerprint(other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "moved", "told"),
+    [({}, False, 0), ({"action_mean": [1.0]}, True, 0), ({"depth_range": [0, 9]}, False, 1)],
+)
+def test_another_stores_tokens_come_in_this_stores_units(
+    changes: dict[str, Any], moved: bool, told: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meta = {"action_mean": [0.0], "action_std": [1.0], "depth_range": [0.5, 2.0]}
+    for name, more in (("own", {}), ("other", changes)):
+        write_store(tmp_path / name, "tokens", {"train": [{"x": np.zeros(1)}]}, meta | more)
+    own, other = (open_store(tmp_path / name) for name in ("own", "other"))
+    assert token_transform(own, False, own) is transforms.token_clip
+    made = token_transform(own, False, other)
+    assert (made is not transforms.token_clip) == moved
+    if moved:
+        assert made.args == (Units.create(own), Units.create(other), False)  # type: ignore[attr-defined]
+    assert capsys.readouterr().out.count("its depth tokens stand for") == told
+
+
+def test_a_mistyped_stage_is_told_before_the_tokenizer_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cfg = toy.config()
+    cfg = replace(cfg, train=replace(cfg.train, stages=loop("hard:1").stages))
+    run = Run(cfg, tmp_path / "run", tmp_path / "data")
+    write_store(
+        run.clips, "clips", {"train": [encode_clip(toy.clip(0))]}, {}, lambda clip: {"task": "", "difficulty": "simple"}
+    )
+    monkeypatch.setattr(stages, "fit", lambda *_, **__: pytest.fail("it was trained"))
+    with pytest.raises(StoreError, match="no train record has a difficulty like hard"):
+        stages.train_tokenizer(run, resume=True)

@@ -1,0 +1,46 @@
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsjax.soak.rounds import Stage, Target
+from rsjax.soak.runs import run_through
+from tests.pipeline.conftest import command, debug, shared
+from tests.reliability.program import make_store
+
+__all__ = ["command", "debug", "shared"]
+
+Targets = Callable[..., Target]
+STEP_SECONDS, EVERY, STEPS = 0.025, 10, 60
+
+
+@pytest.fixture(scope="session")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "store"
+    make_store(path)
+    return path
+
+
+@pytest.fixture
+def target(store: Path, tmp_path: Path) -> Targets:
+    """A small program that trains, about to be started: ``target(name, *arguments, store=…)``."""
+
+    def make(name: str, *arguments: object, store: Path = store) -> Target:
+        folder = tmp_path / name / "stage"
+        folder.mkdir(parents=True)
+        command = (sys.executable, "-m", "tests.reliability.program", str(folder), str(store), *map(str, arguments))
+        return Target(
+            command, (Stage(folder),), tmp_path / f"{name}.log", EVERY * STEP_SECONDS, STEP_SECONDS, to_the_end=True
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def whole(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stage's folder of a run that nothing disturbed. Only for reading."""
+    folder = tmp_path_factory.mktemp("whole") / "stage"
+    command = (sys.executable, "-m", "tests.reliability.program", str(folder), str(store))
+    run_through(Target(command, (Stage(folder),), folder.parent / "output", 0.0, 0.0, to_the_end=True))
+    return folder

@@ -1,0 +1,104 @@
+"""A stage that trains, small and slow enough to be disturbed: ``python -m tests.reliability.program FOLDER STORE …``.
+
+It leaves what a stage of the main job leaves: a mark, checkpoints, a log and the final weights.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.cli import main_errors
+from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.data.loader import batches
+from rsjax.data.quarantine import NAME as QUARANTINE
+from rsjax.data.store import open_store, write_atomically, write_store
+from rsjax.objective.losses import Term
+from rsjax.train.checkpoint import save_weights
+from tests.train import toy
+
+
+@dataclass(frozen=True)
+class Heavy(toy.Regression):
+    """A regression whose checkpoints take a moment to write, and whose loss is not a number at some steps.
+
+    Attributes:
+        poisoned: steps done before those.
+    """
+
+    poisoned: tuple[int, ...] = ()
+
+    @property
+    def weights(self) -> dict[str, float]:
+        return super().weights | {"weight": 1.0}
+
+    def init(self, key: Any) -> Any:
+        return super().init(key) | {"ballast": jax.random.normal(key, (200_000,))}
+
+    def terms(self, params: Any, batch: Any, key: Any, around: Any) -> dict[str, Term]:
+        numbers = jnp.isin(around.step, jnp.array(self.poisoned or (-1,)))
+        ballast = jnp.sum(jnp.square(params["ballast"]))
+        weight = (jnp.where(numbers, jnp.nan, ballast), jnp.float32(params["ballast"].size))
+        return super().terms(params, batch, key, around) | {"weight": weight}
+
+
+def make_store(path: Path) -> None:
+    """Twenty records."""
+    write_store(path, "toy", {"train": iter(toy.records(20))}, {"key": "toy"})
+
+
+@main_errors()
+def main() -> None:
+    """Trains until it is finished."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--every", type=int, default=10)
+    parser.add_argument("--poisoned", type=int, nargs="*", default=())
+    parser.add_argument("--budget", type=int, default=10)
+    options = parser.parse_args()
+
+    loop = LoopConfig(
+        steps=options.steps,
+        batch_size=2,
+        optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=2),
+        ema=0.9,
+        log_every=1,
+        checkpoint_every=options.every,
+        skip_budget=options.budget,
+        placement="jit",
+    )
+    source = open_store(options.store).source("train")
+    mark(options.folder, False)
+    state = toy.train(
+        loop,
+        options.folder,
+        objective=Heavy(poisoned=tuple(options.poisoned)),
+        loader=lambda data: batches(
+            source, toy.jitter, loop.batch_size, seed=3, state=data, quarantine=options.folder / QUARANTINE
+        ),
+        to_batch=slowly,
+    )
+    save_weights(options.folder / "weights", state.weights)
+    mark(options.folder, True)
+
+
+def slowly(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    time.sleep(0.02)
+    return {"x": arrays["x"], "y": arrays["y"]}
+
+
+def mark(folder: Path, finished: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "stage.json", json.dumps({"finished": finished}).encode())
+
+
+if __name__ == "__main__":
+    main()
