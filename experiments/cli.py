@@ -81,7 +81,7 @@ def parse_options(argv: Sequence[str], prog: str, description: str, options: Opt
 def main_errors() -> Iterator[None]:
     """Turns errors that the user can cure into one line on standard error and an exit status, without a traceback.
 
-    Around a command's main function, as a decorator or in a ``with``. Exits with 2 for a :class:`UserError`, a full
+    Around a command's main function, as a decorator or in a ``with``. Exits with 2 for most :class:`UserError`, a full
     disk or a missing permission, with 130 for an interrupt, and with 75 (to be started again) for SIGTERM. Any other
     exception is a bug and keeps its traceback.
     """
@@ -93,7 +93,7 @@ def main_errors() -> Iterator[None]:
     except Preempted as stop:
         _exit(str(stop), os.EX_TEMPFAIL)
     except UserError as error:
-        _exit(f"error: {error}", 2)
+        _exit(f"error: {error}", error.status)
     except Exception as error:
         cure = _cure(error)
         if cure is None:
@@ -113,7 +113,17 @@ def _cure(error: Exception) -> str | None:
 
 def _exit(line: str, status: int) -> None:
     print(" ".join(line.split()), file=sys.stderr)
+    if status == UserError.status and _one_of_several():
+        # jax waits for the other processes at the end of this one, in vain, and then aborts with a status of its own.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
     raise SystemExit(status)
+
+
+def _one_of_several() -> bool:
+    distributed = sys.modules.get("rsjax.train.distributed")
+    return distributed is not None and distributed.jax.distributed.is_initialized()
 
 
 def _parse(kind: Any, default: Any, argv: Sequence[str], prog: str, description: str, known: list[str]) -> Any:

@@ -8,7 +8,12 @@ class UserError(Exception):
     """Something that the user can put right. The message is one line that names the thing and the cure.
 
     Not a :class:`ValueError`, so that libraries which catch those (the command-line parser does) pass it on untouched.
+
+    Attributes:
+        status: what a command that ends with it exits with.
     """
+
+    status = 2
 
 
 def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
@@ -26,5 +31,9 @@ def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
     return f"; did you mean {' or '.join(repr(prefix + c) for c in near)}?" if near else ""
 
 
-class Preempted(Exception):
-    """The process was told to stop (SIGTERM) and did, with its work saved. The message says what goes on with it."""
+class Preempted(BaseException):
+    """The process was told to stop (SIGTERM) and did, with its work saved. The message says what goes on with it.
+
+    Not an :class:`Exception`, as :class:`KeyboardInterrupt` is none: it may be raised anywhere, and what handles errors
+    there must not take it for one.
+    """

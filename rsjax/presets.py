@@ -72,6 +72,7 @@ def tiny() -> Config:
             commitment=0.1,
             placement="jit",
             checkpoint_every=500,
+            eval_every=1700,
         ),
         model=ModelConfig(
             grid=8,
@@ -96,7 +97,8 @@ def tiny() -> Config:
             batch_size=4,
             optimizer=OptimizerConfig(kind="muon", learning_rate=2e-3, final_share=0.02),
             ema=0.995,
-            checkpoint_every=400,
+            checkpoint_every=500,
+            eval_every=500,
         ),
     )
 
@@ -152,6 +154,7 @@ def _full_size(name: str, model: ModelConfig) -> Config:
             adversarial=0.1,
             log_every=100,
             checkpoint_every=5000,
+            eval_every=5000,
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
         train=LoopConfig(
@@ -160,6 +163,7 @@ def _full_size(name: str, model: ModelConfig) -> Config:
             optimizer=OptimizerConfig(beta2=0.999, schedule="linear", final_share=0.0),
             log_every=100,
             checkpoint_every=1000,
+            eval_every=5000,
         ),
     )
 

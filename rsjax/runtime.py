@@ -1,5 +1,6 @@
 """What has to be settled about the process before JAX is loaded."""
 
+import faulthandler
 import os
 import signal
 import sys
@@ -33,7 +34,8 @@ def sigterm_stops() -> Iterator[None]:
     """Around a command: SIGTERM, by which schedulers say that a process has to go, raises :class:`Preempted`.
 
     Such a command ends with the exit status 75 (EX_TEMPFAIL), on which a scheduler is to start it again. Training loops
-    save first (:mod:`rsjax.train.preemption`). Does nothing off the main thread, which alone may handle signals.
+    save first (:mod:`rsjax.train.preemption`). SIGUSR1 prints what every thread is doing, should a command stand still.
+    Does nothing off the main thread, which alone may handle signals.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -42,6 +44,7 @@ def sigterm_stops() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    faulthandler.register(signal.SIGUSR1, file=sys.__stderr__)
     before = signal.signal(signal.SIGTERM, stop)
     try:
         yield

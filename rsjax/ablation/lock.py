@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 from rsjax.ablation.fields import GridError
 from rsjax.data.store import disk_guard
 from rsjax.progress import note
+
+LOOKS, LOOK_SECONDS = 5, 0.05  # before a lock that is not waited for counts as another's
 
 
 @contextmanager
@@ -29,6 +32,11 @@ def lock(path: Path, wait: str = "") -> Iterator[bool]:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         held = _take(handle, path, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for _ in range(LOOKS):  # it may only be looked at
+            if held or wait:
+                break
+            time.sleep(LOOK_SECONDS)
+            held = _take(handle, path, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not held and wait:
             note(wait)
             held = _take(handle, path, fcntl.LOCK_EX)
@@ -41,8 +49,11 @@ def is_held(path: Path) -> bool:
     """Whether another holds the lock of this name. Nothing is made where there is none."""
     if not path.exists():
         return False
-    with lock(path) as free:
-        return not free
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        return not _take(handle, path, fcntl.LOCK_SH | fcntl.LOCK_NB)  # so that lookers do not see each other
+    finally:
+        os.close(handle)
 
 
 def _take(handle: int, path: Path, how: int) -> bool:

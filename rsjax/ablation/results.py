@@ -72,6 +72,7 @@ def read_metrics(run: Run) -> dict[str, float] | None:
 
 def final_terms(log: list[dict[str, Any]], terms: tuple[str, ...]) -> dict[str, float]:
     """``loss_<term>``: each term's mean over the last tenth of the logged steps (at least one)."""
+    log = [row for row in log if any(term in row for term in terms)]  # held-out scores have rows of their own
     last = log[-max(1, round(FINAL_SHARE * len(log))) :]
     values = {term: [row[term] for row in last if term in row] for term in terms}
     return {f"loss_{term}": float(np.mean(found)) for term, found in values.items() if found}

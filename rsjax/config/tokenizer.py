@@ -64,6 +64,8 @@ class TokenizerTrainConfig(LoopConfig):
     ``batch_size`` counts clips, of which ``frames_per_clip`` frames each are drawn. Weights are named as their terms.
     """
 
+    # Not a runtime field here: the codes' entropy, the discriminator's normalisation and LeCAM go by each part.
+    accumulate: int = 1
     frames_per_clip: int = 4
     depth_share: float = 0.25  # of the drawn frames: their colourised depth map is taken instead
     flip: bool = False  # mirror half of the images

@@ -61,7 +61,9 @@ class StageConfig:
 
     parts: tuple[PartConfig, ...] = (PartConfig(),)
     epochs: float = 1.0  # as many clips are drawn as the parts have, this many times
-    restart: bool = False  # the learning rate's schedule starts again with this stage, and ends with it
+    restart: bool = (
+        False  # the learning rate's schedule starts again here, and ends where the next restart or the run does
+    )
 
     def __post_init__(self) -> None:
         require(self.epochs > 0, f"a curriculum's stage has {self.epochs} epochs; it must have more than 0")
@@ -85,7 +87,7 @@ class LoopConfig:
     stages: tuple[StageConfig, ...] = ()
     restarts: tuple[int, ...] = ()  # steps at which the learning rate's schedule starts again; stages set it
     # Steps whose loss or gradient is not finite are left out, at most this many in all; then training stops.
-    skip_budget: int = 10
+    skip_budget: int = runtime(10)
     log_every: int = runtime(20)
     checkpoint_every: int = runtime(200)
     keep_last: int = runtime(2)  # checkpoints kept: the newest …
@@ -110,6 +112,10 @@ class LoopConfig:
             require(value >= least, f"{name} of a training loop is {value}; it must be at least {least}")
         for name in ("skip_budget", "keep_every", "eval_every", "workers", "profile"):
             require(getattr(self, name) >= 0, f"{name} of a training loop is {getattr(self, name)}; it is at least 0")
+        require(
+            list(self.restarts) == sorted(set(self.restarts)) and all(step > 0 for step in self.restarts),
+            f"restarts of a training loop are {self.restarts}; they are steps above 0, in their order",
+        )
         require(
             self.batch_size % self.accumulate == 0,
             f"batch_size {self.batch_size} does not divide into accumulate = {self.accumulate} parts; change one",

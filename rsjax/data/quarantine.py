@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import logging
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -22,8 +23,8 @@ class Quarantine:
     """The damaged records of one training run. Can be sent to other processes, which then share the list.
 
     Args:
-        path: the list, a JSON object per line with ``store``, ``split``, ``record``, ``file`` and ``error``; made with
-            the first damaged record. None: the list is in this process's memory.
+        path: the list, a JSON object per line with ``store`` (as seen from the list), ``split``, ``record``, ``file``
+            and ``error``; made with the first damaged record. None: the list is in this process's memory.
         records: how many records there are.
         share: of the records that may be damaged. A single one always may, unless the share is 0.
     """
@@ -44,6 +45,8 @@ class Quarantine:
         Raises:
             StoreError: too many are damaged, or the list cannot be written.
         """
+        if self._path is not None and os.path.isabs(place.get("store", "")):  # a run may be moved, with what it reads
+            place = place | {"store": os.path.relpath(place["store"], self._path.parent)}
         key = _key(place)
         if key in self._known:
             return

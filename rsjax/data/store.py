@@ -254,7 +254,7 @@ def replace_directory(new: Path, path: Path) -> None:
 
 def write_atomically(path: Path, payload: bytes) -> None:
     """Write a file that a reader sees whole or not at all."""
-    temporary = path.with_name(f"{path.name}.tmp")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         temporary.write_bytes(payload)
         os.replace(temporary, path)

@@ -64,7 +64,7 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
 
 def _newest(job: Job[Any]) -> TrainState:
     loop = replace(job.loop, placement="jit", fsdp=1)
-    checkpoints = Checkpoints(job.directory / "checkpoints", loop.keep_last, loop.keep_every, loop.keep_best)
+    checkpoints = Checkpoints(job.directory / "checkpoints", read_only=True)
     try:
         if checkpoints.latest() is None:
             return Placement.create(loop).init(job.objective, loop, job.start)

@@ -8,6 +8,7 @@ from typing import Any
 from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.codec import Record
 from rsjax.data.curriculum import check_stages
+from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import disk_guard, open_store, write_store
 from rsjax.pipeline import evaluation
 from rsjax.pipeline.feeding import fingerprint, readable
@@ -124,6 +125,7 @@ def tokenize(run: Run) -> None:
     codec = Codec(run.config, tokenizer, units)
     total = sum(len(clips.source(split)) for split in clips.splits)
     folder = run.directory / "tokens"
+    (folder / QUARANTINE).unlink(missing_ok=True)  # all clips are read again
 
     with Progress("tokens", total, "clips") as progress:
         done = 0

@@ -5,6 +5,7 @@ import random
 import shutil
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -181,6 +182,8 @@ def _ends(attempt: Attempt) -> bool:
     try:
         attempt.process.wait(PATIENCE)
     except subprocess.TimeoutExpired:
+        attempt.process.send_signal(signal.SIGUSR1)  # what it hangs in goes to its output
+        time.sleep(1.0)
         attempt.kill()
         return False
     return True

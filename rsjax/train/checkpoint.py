@@ -43,10 +43,18 @@ class Checkpoints:
         keep_last: the newest checkpoints are kept, this many …
         keep_every: … and every one at a multiple of this many steps (0: none for that) …
         keep_best: … and the one with the lowest metric.
+        read_only: nothing is cleaned up or moved, so that another process may be writing here.
     """
 
-    def __init__(self, directory: Path, keep_last: int = 2, keep_every: int = 0, keep_best: bool = False) -> None:
-        self.directory = directory.absolute()
+    def __init__(
+        self,
+        directory: Path,
+        keep_last: int = 2,
+        keep_every: int = 0,
+        keep_best: bool = False,
+        read_only: bool = False,
+    ) -> None:
+        self.directory, self._read_only = directory.absolute(), read_only
         self._keep = (keep_last, keep_every, keep_best)
         with disk_guard(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -112,7 +120,7 @@ class Checkpoints:
             restored = self._manager.restore(step, args=arguments)
         except Exception as error:  # orbax reports what does not fit as many types
             raise _misfit(self.directory / str(step), error) from error
-        if faults:
+        if faults and not self._read_only:
             self._set_aside(faults, step)
         return restored["state"], restored["data"]
 
@@ -141,7 +149,7 @@ class Checkpoints:
         }
         options = ocp.CheckpointManagerOptions(
             preservation_policy=retention(keep_last, keep_every, self._metrics if keep_best else None),
-            cleanup_tmp_directories=True,
+            cleanup_tmp_directories=not self._read_only,
             lightweight_initialize=True,  # else a damaged checkpoint keeps the others from being found
             async_options=ocp.AsyncOptions(post_finalization_callback=self._write_manifest),
         )

@@ -15,16 +15,23 @@ import numpy as np
 from jax.experimental import multihost_utils
 from orbax.checkpoint import multihost
 
-from rsjax.errors import UserError
+from rsjax.errors import Preempted, UserError
 
 BARRIER_SECONDS = 7 * 24 * 3600  # the others wait while the lead simulates, tokenizes and evaluates
+JOIN_SECONDS = 1800  # a node that takes another's place may be long in coming
 SHUTDOWN_SECONDS = 30  # how long a process that failed waits for the others before it exits
 
 _numbers = itertools.count()  # all processes come to the same barriers in the same order
 
 
 class HostsError(UserError):
-    """Processes that cannot join each other, or one that lost the others."""
+    """Several processes that were not told how to join each other, or whose lead failed."""
+
+
+class LostHostError(HostsError):
+    """Processes that cannot join each other, or one that lost the others: to be started again."""
+
+    status = os.EX_TEMPFAIL
 
 
 def cluster(environ: Mapping[str, str]) -> str:
@@ -69,12 +76,14 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
     jax.config.update("jax_enable_preemption_service", False)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        jax.distributed.initialize(**arguments, shutdown_timeout_seconds=SHUTDOWN_SECONDS)
+        jax.distributed.initialize(
+            **arguments, initialization_timeout=JOIN_SECONDS, shutdown_timeout_seconds=SHUTDOWN_SECONDS
+        )
     except (RuntimeError, ValueError) as error:
         if not coordinator and cluster(os.environ) == "tpu" and isinstance(error, ValueError):
             return  # libtpu is installed, but no TPU is here
         reason = str(error).strip().partition("\n")[0][:200]
-        raise HostsError(
+        raise LostHostError(
             f"process {process_id if coordinator else 'of a cluster'} cannot join the others ({reason}); start all "
             f"of them, with the same --coordinator and --processes, which all of them can reach"
         ) from error
@@ -122,9 +131,9 @@ def barrier(name: str) -> None:
     try:
         wait(key=f"rsjax-{next(_numbers)}-{name}", timeout_ms=BARRIER_SECONDS * 1000)
     except jax.errors.JaxRuntimeError as error:
-        raise HostsError(f"another process was lost ({name}); its own message says why; start all of them again") from (
-            error
-        )
+        raise LostHostError(
+            f"another process was lost ({name}); its own message says why; start all of them again"
+        ) from (error)
 
 
 def agree(value: Any, name: str = "agree") -> Any:
@@ -167,4 +176,6 @@ def on_lead(name: str, work: Callable[[], None]) -> None:
     if failure is not None:
         raise failure
     if told is not None:
+        if told.startswith(f"{Preempted.__name__}: "):
+            raise Preempted(told)
         raise HostsError(f"{name} failed on process 0 ({told})")

@@ -73,7 +73,7 @@ def fit(
         stop_at: stop (and save) after this step, as if interrupted.
 
     Returns:
-        The final state, on this process's first device.
+        The final state, on this process's first device; of one that devices share (``loop.fsdp``), the weights alone.
 
     Raises:
         CheckpointError: the newest checkpoint does not fit, or none can be read.
@@ -88,7 +88,7 @@ def fit(
     with ExitStack() as stack:
         checkpoints = Checkpoints(directory / "checkpoints", loop.keep_last, loop.keep_every, loop.keep_best)
         stack.callback(checkpoints.close)
-        if checkpoints.latest() is None:
+        if agree(checkpoints.latest(), f"{name}: newest checkpoint") is None:
             state, data = placement.init(objective, loop, start), None
         else:
             state, data = checkpoints.restore(placement.template(objective, loop))
@@ -97,6 +97,10 @@ def fit(
         last = min(stop_at or loop.steps, loop.steps)
         batches = stack.enter_context(Prefetch(loader(data), lambda arrays: placement.put_batch(to_batch(arrays))))
         state = run.steps(state, batches, last, name)
+    if placement.shares:  # the whole state need not fit one device
+        kept = "params" if state.ema is None else "ema"
+        weights = placement.gather(state.weights)
+        return state.replace(**{"params": None, "opt_state": None, "ema": None, "extra": None} | {kept: weights})
     return placement.gather(state)
 
 
@@ -127,7 +131,8 @@ class _Run:
         """From the state's step to the last."""
         loop, first = self.loop, int(state.step)
         step_fn = self.placement.compile(self.objective, loop)
-        self._skips, self._skipped_steps = int(state.skipped), SkippedSteps(self.directory, first)
+        self._skips = int(state.skipped)
+        self._skipped_steps = SkippedSteps(self.directory, first) if is_lead() else None
         with ExitStack() as stack:
             log = stack.enter_context(self._log(first)) if is_lead() else None
             shown = (name, loop.steps, "steps", first)
@@ -158,7 +163,7 @@ class _Run:
                     if due["held_out"]:
                         with clock.stopped():
                             found = self._look(state, step, log)
-                    if due["checkpoint"] or asked:
+                    if due["checkpoint"] or asked or (found is not None and loop.keep_best):
                         metric = None if found is None else found.metric
                         self.checkpoints.save(step, self.placement.portable(state), batches.state(), metric)
                 if asked and step < last:
@@ -188,15 +193,15 @@ class _Run:
         if skips == self._skips:
             return
         self._skips, scalars = skips, self.placement.scalars(taken.metrics)
-        if is_lead():
+        if self._skipped_steps is not None:
             self._skipped_steps.add(taken.step, scalars, batches.identify(taken.fed), taken.fed.before)
             told = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
             note(f"step {taken.step} is left out ({told}): {skips} of at most {allowed}")
         if skips > allowed:
             raise DivergedError(
                 f"{self.directory}: {skips} steps were not finite, more than skip_budget = {allowed} (the last was "
-                f"step {taken.step}, loss {scalars['loss']}); {SKIPPED} there has their batches; lower the learning "
-                f"rate (optimizer.learning-rate) and start again with --no-resume"
+                f"step {taken.step}, loss {scalars['loss']}); {SKIPPED} there has their batches; raise skip_budget "
+                f"and start again, or train anew with a lower optimizer.learning-rate and --overwrite"
             )
 
     def _look(self, state: TrainState, step: int, log: ScalarLog | None) -> HeldOut:

@@ -138,6 +138,11 @@ class Placement:
             return jax.device_put(cut, NamedSharding(local, P(AXIS)))
         return jax.tree.map(lambda x: jax.make_array_from_process_local_data(self._rows, np.asarray(x)), batch)
 
+    @property
+    def shares(self) -> bool:
+        """Whether several devices share one state."""
+        return self.kind == "mesh" and self.mesh.shape[FSDP] > 1
+
     def scalars(self, metrics: Metrics) -> dict[str, float]:
         """A step's metrics as numbers; waits for the step."""
         return {name: float(value) for name, value in jax.device_get(metrics).items()}

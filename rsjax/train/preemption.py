@@ -9,7 +9,7 @@ import jax
 
 from rsjax.train.distributed import anywhere
 
-HOSTS_EVERY = 10  # steps between two questions among several processes whether one of them is to stop
+HOSTS_EVERY = 5  # steps between two questions among several processes whether one of them is to stop
 
 
 class StopRequest:
@@ -27,9 +27,11 @@ class StopRequest:
             self._before = signal.signal(signal.SIGTERM, self._note)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._handles:
             signal.signal(signal.SIGTERM, self._before)
+            if self._noted and kind is None:  # too late for a step to be stopped at: who had it before answers it
+                signal.raise_signal(signal.SIGTERM)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._noted = True

@@ -22,7 +22,8 @@ def train_step(
 ) -> tuple[TrainState, Metrics]:
     """One optimizer step; a pure function, the same under jit, pmap and jit over a sharded mesh.
 
-    Where the loss or the gradient is not finite, the state stays as it was, but for ``step`` and ``skipped``.
+    Where the loss or the gradient is not finite, the state stays as it was, but for ``step``, ``skipped`` and the place
+    in the learning rate's schedule.
 
     Args:
         objective: static; what is trained.
@@ -58,15 +59,21 @@ def train_step(
     new = (params, opt_state, ema, objective.next_extra(state.extra, metrics))
     old = (state.params, state.opt_state, state.ema, state.extra)
     params, opt_state, ema, extra = jax.tree.map(lambda new, old: jnp.where(sound, new, old), new, old)
+    # A step that was left out counts in the schedule of the learning rate, or the stages' restarts would come late.
+    opt_state = optax.tree_utils.tree_set(opt_state, _is_schedule, count=state.step + 1)
     skipped = state.skipped + ~sound
     metrics |= {
         "grad_norm": grad_norm,
         "param_norm": optax.global_norm(params),
-        "update_norm": optax.global_norm(updates),
-        "learning_rate": jnp.float32(learning_rate(loop)(state.step - state.skipped)),
+        "update_norm": jnp.where(sound, optax.global_norm(updates), 0.0),
+        "learning_rate": jnp.float32(learning_rate(loop)(state.step)),
         "skipped": skipped.astype(jnp.float32),
     }
     return TrainState(state.step + 1, params, opt_state, ema, extra, skipped), metrics
+
+
+def _is_schedule(path: Any, value: Any) -> bool:
+    return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
 
 
 def _gradients(
@@ -80,7 +87,8 @@ def _gradients(
     """This device's share of the gradient, and of the objective and its terms.
 
     A batch in several parts gives the same, to rounding: every part is divided by the weights of the whole batch, which
-    are found first (no network is run for them). Only the tokenizer's entropy is then a part's own.
+    are found first (no network is run for them). Only what the tokenizer finds over a batch (its codes' entropy, the
+    discriminator's normalisation, LeCAM's averages) is then a part's own.
     """
 
     def share(params: Any, part: Any, whole: dict[str, Float[Array, ""]] | None) -> tuple[Float[Array, ""], Metrics]:

@@ -3,6 +3,7 @@
 import importlib
 import json
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,11 +77,11 @@ class WandbRun:
 
     def write(self, step: int, scalars: dict[str, float]) -> None:
         """Adds scalars of one step."""
-        self._log({"step": step} | scalars)
+        self._guarded(lambda run: run.log({"step": step} | scalars))
 
     def image(self, step: int, name: str, image: UInt8[np.ndarray, "H W 3"]) -> None:
         """Adds a picture, 0–255."""
-        self._log({"step": step, name: self._wandb.Image(image)})
+        self._guarded(lambda run: run.log({"step": step, name: self._wandb.Image(image)}))
 
     def close(self, failed: bool) -> None:
         """Waits until W&B has what it was given.
@@ -88,14 +89,13 @@ class WandbRun:
         Args:
             failed: the run ends with an error, and W&B shows it so.
         """
-        if self._run is not None:
-            self._run.finish(exit_code=int(failed))
+        self._guarded(lambda run: run.finish(exit_code=int(failed)))
 
-    def _log(self, values: dict[str, Any]) -> None:
+    def _guarded(self, work: Callable[[Any], Any]) -> None:
         if self._run is None:
             return
         try:
-            self._run.log(values)
+            work(self._run)
         except Exception as error:  # as above
             self._run = None
             note(f"Weights & Biases is off until the next start ({_first_line(error)}); training goes on")

@@ -43,7 +43,7 @@ def make(run: Run, *stages: str) -> None:
         ("loss", "gamma", 4.0, "world_model"),
         ("train", "ema", 0.5, "world_model"),
         ("train", "stages", (StageConfig(epochs=2.0),), "world_model"),
-        ("train", "skip_budget", 3, "world_model"),
+        ("train", "restarts", (3,), "world_model"),
         ("sample", "steps", 3, "evaluation"),
         ("eval", "action_draws", 2, "evaluation"),
     ],
@@ -167,7 +167,7 @@ def test_only_fields_that_change_the_refused_stage_are_named_down_to_those_of_a_
     run.prepare(overwrite=False)
     make(run, *STAGES)
     changes = replace(two.stages[1], epochs=3.0, restart=True)
-    loop = replace(two, stages=(two.stages[0], changes), log_every=77, skip_budget=3)
+    loop = replace(two, stages=(two.stages[0], changes), log_every=77, skip_budget=3, ema=0.3)
     config = replace(DEBUG, train=loop, sample=replace(DEBUG.sample, steps=3))
     with pytest.raises(RunError) as told:
         Run(config, run.directory, run.data_directory).prepare(overwrite=False)
@@ -175,7 +175,7 @@ def test_only_fields_that_change_the_refused_stage_are_named_down_to_those_of_a_
     assert named and set(named[1].split("; ")) == {
         "train.stages.1.epochs is 2.0 there, 3.0 here",
         "train.stages.1.restart is False there, True here",
-        "train.skip_budget is 10 there, 3 here",
+        f"train.ema is {two.ema} there, 0.3 here",
     }
 
 

@@ -132,6 +132,8 @@ def test_what_a_killed_soak_had_started_dies_with_it(target: Dummies, tmp_path: 
     soak = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert soak.stdout is not None
     child = int(soak.stdout.readline())
+    while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():  # which asks for the signal, on its way
+        time.sleep(0.01)
     soak.kill()
     soak.wait()
     end = time.monotonic() + 5

@@ -176,8 +176,29 @@ def test_a_step_that_is_not_finite_is_left_out_and_counted(bad: float) -> None:
     before, _ = step(create_state(objective, loop), BATCH)
     after, metrics = step(before, BATCH | {"y": np.full_like(BATCH["y"], bad)})
     assert int(after.step) == 2 and int(after.skipped) == 1 and float(metrics["skipped"]) == 1
-    for name in ("params", "opt_state", "ema"):
+    for name in ("params", "ema"):
         jax.tree.map(np.testing.assert_array_equal, getattr(before, name), getattr(after, name))
+    for name in ("mu", "nu"):
+        moments = (optax.tree_utils.tree_get(state.opt_state, name) for state in (before, after))
+        jax.tree.map(np.testing.assert_array_equal, *moments)
     onwards, metrics = step(after, BATCH)
     assert int(onwards.skipped) == 1 and np.isfinite(float(metrics["loss"]))
+    assert float(metrics["learning_rate"]) == np.float32(learning_rate(loop)(2))
     assert np.any(np.asarray(onwards.params["w"]) != np.asarray(before.params["w"]))
+
+
+@pytest.mark.parametrize("kind", ["adamw", "muon"])
+def test_a_step_that_is_left_out_counts_in_the_schedule(kind: Any) -> None:
+    loop = replace(devices.LOOP, optimizer=replace(devices.LOOP.optimizer, kind=kind))
+    state = jax.jit(partial(create_state, devices.OBJECTIVE, loop))()
+    batch = devices.batch(0)
+    bad = batch.replace(actions=np.full_like(batch.actions, np.nan))  # type: ignore[attr-defined]
+    step = jax.jit(partial(train_step, devices.OBJECTIVE, loop))
+    state, _ = step(step(state, batch)[0], bad)
+    counts = [
+        int(x)
+        for x in jax.tree.leaves(state.opt_state, is_leaf=lambda x: isinstance(x, optax.ScaleByScheduleState))
+        if isinstance(x, optax.ScaleByScheduleState)
+        for x in x
+    ]
+    assert counts and set(counts) == {2} and int(state.skipped) == 1
