@@ -1,5 +1,6 @@
 """The training loop: batches in, steps, logs and checkpoints out; stops and resumes exactly."""
 
+import dataclasses
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -100,7 +101,8 @@ def fit(
     if placement.shares:  # the whole state need not fit one device
         kept = "params" if state.ema is None else "ema"
         weights = placement.gather(state.weights)
-        return state.replace(**{"params": None, "opt_state": None, "ema": None, "extra": None} | {kept: weights})
+        left = {"params": None, "opt_state": None, "ema": None, "extra": None} | {kept: weights}
+        return dataclasses.replace(state, **left)  # type: ignore[type-var]
     return placement.gather(state)
 
 
