@@ -151,7 +151,11 @@ class Checkpoints:
             preservation_policy=retention(keep_last, keep_every, self._metrics if keep_best else None),
             cleanup_tmp_directories=not self._read_only,
             lightweight_initialize=True,  # else a damaged checkpoint keeps the others from being found
-            async_options=ocp.AsyncOptions(post_finalization_callback=self._write_manifest),
+            # Directories are made before save returns: their making in the background is waited for by signals between
+            # orbax's threads, for minutes where one gets lost.
+            async_options=ocp.AsyncOptions(
+                post_finalization_callback=self._write_manifest, create_directories_asynchronously=False
+            ),
         )
         return ocp.CheckpointManager(self.directory, options=options)
 
