@@ -11,7 +11,7 @@ import pytest
 from rsjax.config import LoopConfig
 from rsjax.config.stages import parse_stage
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
-from rsjax.pipeline import stages, transforms
+from rsjax.pipeline import jobs, stages, transforms
 from rsjax.pipeline.feeding import fingerprint, planned, readable, token_transform
 from rsjax.pipeline.run import Run
 from rsjax.sample.generator import Units
@@ -111,6 +111,6 @@ def test_a_mistyped_stage_is_told_before_the_tokenizer_is_trained(
     write_store(
         run.clips, "clips", {"train": [encode_clip(toy.clip(0))]}, {}, lambda clip: {"task": "", "difficulty": "simple"}
     )
-    monkeypatch.setattr(stages, "fit", lambda *_, **__: pytest.fail("it was trained"))
+    monkeypatch.setattr(jobs, "fit", lambda *_, **__: pytest.fail("it was trained"))
     with pytest.raises(StoreError, match="no train record has a difficulty like hard"):
         stages.train_tokenizer(run, resume=True)
