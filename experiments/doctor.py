@@ -1,0 +1,84 @@
+"""Checks a data set and prints what is wrong where. ``python -m experiments.doctor rlds /data/bridge``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.cli import main_errors, parse_options
+
+
+@dataclass(frozen=True)
+class Options:
+    """Goes through a data set of any format, or a store of clips, and tells what is wrong with which episode.
+
+    Exits with 0 where nothing is wrong, with 1 where something is, and with 2 where the data set cannot be listed.
+    """
+
+    what: tyro.conf.Positional[str] = tyro.MISSING
+    """A store of clips, or a format: agibot, lerobot, robomimic, libero, rlds, bair, folder, sim."""
+    path: tyro.conf.Positional[Path | None] = None
+    """Where the data set of that format is."""
+    option: tuple[str, ...] = ()
+    """The format's own settings, such as keys=bridge or split=train; lists as JSON."""
+    frames: int = 5
+    """Pictures of each camera that are decoded, evenly spread over the episode; 0: all."""
+    gap: float = 1.5
+    """A time between two frames that is too long, relative to 1 / fps."""
+    unusual: float = 20.0
+    """An action, or a step of the state, that is too large, relative to the usual."""
+    ignore: tuple[str, ...] = ()
+    """Kinds of findings that are all right, such as no-task."""
+    lines: int = 50
+    """Findings that are printed; 0: all."""
+    workers: int = 1
+    """Processes that look at episodes."""
+    fix: Path | None = None
+    """Writes a manifest here that leaves out every episode with a finding, with the reasons."""
+
+
+@main_errors()
+def main() -> None:
+    """Prints a line per finding and a table of their kinds."""
+    options = parse_options(sys.argv[1:], "python -m experiments.doctor", Options.__doc__ or "", Options())
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from experiments.ingest import source_options
+    from rsjax.data.doctor import examine, open_any
+    from rsjax.data.selection import write_selection
+    from rsjax.data.symptoms import KINDS, Thresholds
+
+    console = Console()
+    source = open_any(options.what, options.path, **source_options(options.option))
+    with console.status("looking at episodes") as status:
+        limits = Thresholds(options.frames, options.gap, options.unusual)
+        tell = lambda done: status.update(f"looking at episodes: {done}")  # noqa: E731
+        report = examine(source, limits, options.ignore, tell, options.workers)
+    shown = report.findings[: options.lines or None]
+    for finding in shown:
+        line = f"{finding.episode}: {finding.kind}: {finding.detail}"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if len(shown) < len(report.findings):
+        console.print(f"… and {len(report.findings) - len(shown)} more; --lines 0 prints all", highlight=False)
+    table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
+    for kind, count in report.counts().items():
+        table.add_row(kind, str(count), KINDS[kind])
+    if report.findings:
+        console.print(table)
+    bad = len(report.reasons())
+    console.print(
+        f"{len(report.refs)} episodes: {len(report.refs) - bad} without a finding, {bad} with", highlight=False
+    )
+    if options.fix is not None:
+        about = f"{source.name} {options.path or options.what}"
+        kept, out = write_selection(options.fix, about, report.refs, report.reasons())
+        console.print(f"{options.fix}: keeps {kept}, leaves out {out}", markup=False, highlight=False, soft_wrap=True)
+    if report.findings:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,285 @@
+"""The last stage: the windows of an episode that are kept, as clips of one length and size, one at a time.
+
+It reads what the stages before it left, as far as they were run, each record of which says of which frames it is:
+
+* ``shots``: ``spans`` int64 (S, 2), first frame and the one after the last.
+* ``motion``: ``motion`` float32 (N,), ``high`` of :class:`rsjax.annotate.protocols.Motion`.
+* ``depth``: ``first``, ``depth`` float (n, H, W) of the frames from ``first`` on, in order, and its ``unit``.
+* ``tracks``: ``first``, ``points`` float (P, n, 2) as in :class:`rsjax.clip.Clip`, and ``visible`` bool (P, n).
+* ``semantics``: ``task``, ``scene``, ``segments`` (a list of [start, end, text, skill]) and ``key_frames``.
+
+Axes: N recorded frames, n of some part of them, T frames of a clip, P points, N₀ tracks of a clip, S×S a clip's pixels.
+"""
+
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from rsjax.annotate.categories import CategoryConfig
+from rsjax.annotate.depth import FilledDepths
+from rsjax.annotate.protocols import Tracked
+from rsjax.annotate.tracks import window_tracks
+from rsjax.annotate.units import Inputs, Summary, Work
+from rsjax.annotate.windows import Span, WindowConfig, cut_spans, index_windows, judge, segment_at, tally
+from rsjax.config import require, to_dict
+from rsjax.data.actions import ActionConfig, Layout, Statistics, sampled_actions
+from rsjax.data.codec import Record
+from rsjax.data.episode import Episode, EpisodeError, Segment
+from rsjax.data.store import Source
+
+
+@dataclass(frozen=True)
+class ClipConfig:
+    """What a clip is made of."""
+
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    image_size: int = 64  # pixels; pictures of another shape are squeezed into the square
+    tracks: int = 256  # N₀
+    camera: str = ""  # none: the episode's first
+    most_holes: float = 0.5  # of a recorded depth map; holes are filled from the nearest measured pixel
+    actions: ActionConfig = field(default_factory=ActionConfig)
+    categories: CategoryConfig = field(default_factory=CategoryConfig)
+
+    def __post_init__(self) -> None:
+        require(8 <= self.image_size <= 4096, f"clips.image_size is {self.image_size}; choose one from 8 to 4096")
+        require(self.tracks >= 1, f"clips.tracks is {self.tracks}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class ClipStage:
+    """The stage ``clips``, of :class:`rsjax.annotate.units.Stage`."""
+
+    config: ClipConfig
+    needs: tuple[str, ...] = ()
+    name: str = "clips"
+    version: int = 1
+    cpus: float = 1.0
+    gpus: float = 0.0
+
+    def params(self) -> dict[str, Any]:
+        return to_dict(self.config)
+
+    def open(self) -> Work:
+        return self._work
+
+    def _work(self, episode: Episode, inputs: Inputs) -> Generator[Record, None, Summary]:
+        return (yield from cut(Annotated.load(episode, inputs), self.config))
+
+
+@dataclass(frozen=True)
+class Annotated:
+    """An episode and what the stages before found in it; None or empty where they were not run."""
+
+    episode: Episode
+    shots: Sequence[Span] = ()
+    motion: Float[np.ndarray, " N"] | None = None
+    depth: Source | None = None
+    tracks: Source | None = None
+    task: str = ""
+    scene: str = ""
+    segments: tuple[Segment, ...] = ()
+    key_frames: tuple[int, ...] = ()
+
+    @classmethod
+    def load(cls, episode: Episode, inputs: Inputs) -> "Annotated":
+        """Out of the stages' records; words are the data set's own where ``semantics`` was not run."""
+        fields: dict[str, Any] = {name: inputs[name] for name in ("depth", "tracks") if name in inputs}
+        fields |= {"task": episode.task, "scene": str(episode.meta.get("scene", "")), "segments": episode.segments}
+        if "shots" in inputs:
+            fields["shots"] = [(int(first), int(end)) for first, end in inputs["shots"][0]["spans"]]
+        if "motion" in inputs:
+            fields["motion"] = inputs["motion"][0]["motion"]
+        if "semantics" in inputs:
+            record = inputs["semantics"][0]
+            fields |= {name: record[name] for name in ("task", "scene")}
+            fields["segments"] = tuple(Segment(*row) for row in record["segments"])
+            fields["key_frames"] = tuple(record["key_frames"])
+        return cls(episode, **fields)
+
+
+def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Summary]:
+    """The clips of an episode, as records of :class:`rsjax.clip.Clip`; ``depth`` is None where there is none.
+
+    Returns:
+        ``windows`` (kept and by reason left out), ``short_spans``, ``actions`` (statistics of the clips' actions),
+        ``action_dim``, ``depth`` (range in metres), ``success`` (clips that end so).
+
+    Raises:
+        EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
+    """
+    episode, windows = annotated.episode, config.windows
+    camera = _camera(episode, config.camera)
+    spans = cut_spans(len(episode.timestamps), annotated.shots, annotated.segments, windows)
+    index = index_windows(episode.fps, spans, windows)
+    motion = _per_frame("motion", annotated.motion, episode)
+    reasons = judge(index, episode.timestamps, motion, annotated.key_frames, windows)
+    views = _Views(annotated, camera, config)
+    statistics: Statistics | None = None
+    near, far, succeeded = np.inf, 0.0, 0
+    for number in [number for number, reason in enumerate(reasons) if not reason]:
+        frames = index.frames(number)
+        tracks = _tracks(annotated, frames, config.tracks)
+        if tracks is None:
+            reasons[number] = "no track"
+            continue
+        rgb, depth = views.read(frames)
+        layout = Layout.from_json(episode.meta.get("actions", {}))
+        actions = sampled_actions(episode.actions, frames, config.actions, layout)
+        rows = Statistics.of(actions[1:])
+        statistics = statistics.merged(rows) if statistics else rows
+        if depth is not None:
+            near, far = min(near, float(depth.min())), max(far, float(depth.max()))
+        success = _success(episode, frames)
+        succeeded += bool(success[-1])
+        yield {
+            "rgb": rgb,
+            "depth": depth,
+            "actions": actions,
+            "tracks": tracks.points,
+            "visible": tracks.visible,
+            "success": success,
+            **_words(annotated, config, camera, frames, views.unit),
+        }
+    return {
+        "windows": tally(reasons),
+        "short_spans": index.short,
+        "actions": statistics.to_json() if statistics else None,
+        "action_dim": len(statistics.mean) if statistics else None,
+        "depth": [near, far] if far > 0 else None,
+        "success": succeeded,
+    }
+
+
+def _words(
+    annotated: Annotated, config: ClipConfig, camera: str, frames: Int[np.ndarray, " T"], unit: str
+) -> dict[str, Any]:
+    """``task`` and ``provenance`` of a clip."""
+    episode = annotated.episode
+    segment = segment_at(annotated.segments, frames) or Segment(0, 1, "")
+    task = annotated.task or segment.text
+    provenance = {
+        "source": episode.meta.get("source", ""),
+        "episode": episode.id,
+        "fingerprint": episode.fingerprint,
+        "camera": camera,
+        "fps": float(episode.fps),
+        "frames": frames.tolist(),
+        "segment": segment.text,
+        "skill": segment.skill,
+        "difficulty": config.categories.difficulty(task),
+        "scene": config.categories.scene(annotated.scene),
+        "depth_unit": unit,
+    }
+    if annotated.motion is not None:
+        provenance["motion"] = float(np.mean(annotated.motion[frames[0] + 1 : frames[-1] + 1]))
+    return {"task": task, "provenance": provenance}
+
+
+def words(record: Record) -> dict[str, str]:
+    """A clip's labels, by which a curriculum can choose."""
+    return {"task": record["task"]} | {name: record["provenance"][name] for name in ("difficulty", "scene")}
+
+
+def _camera(episode: Episode, name: str) -> str:
+    if name and name not in episode.cameras:
+        raise EpisodeError(f"cameras: episode {episode.id} has no {name!r}; it has {', '.join(episode.cameras)}")
+    return name or next(iter(episode.cameras))
+
+
+def _per_frame(name: str, values: Float[np.ndarray, " n"] | None, episode: Episode) -> Float[np.ndarray, " N"] | None:
+    if values is not None and len(values) != len(episode.timestamps):
+        raise EpisodeError(f"{name}: {len(values)} values for {len(episode.timestamps)} frames; annotate it again")
+    return values
+
+
+def _success(episode: Episode, frames: Int[np.ndarray, " T"]) -> Bool[np.ndarray, " T"]:
+    """As the data set says, by frame or for the whole; False where it does not."""
+    told = np.asarray(episode.meta.get("success", False), bool)
+    return told[frames] if told.ndim else np.full(len(frames), bool(told))
+
+
+def _tracks(annotated: Annotated, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
+    """``count`` of the points seen in a window's first frame; None where there are none.
+
+    Without a tracks stage they are zeros that are never visible.
+    """
+    if annotated.tracks is None:
+        return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
+    for number in range(len(annotated.tracks)):
+        record = annotated.tracks[number]
+        places = frames - int(record["first"])
+        if places[0] >= 0 and places[-1] < record["points"].shape[1]:
+            tracked = Tracked(record["points"].astype(np.float32), record["visible"])
+            return window_tracks(tracked, places, count) if tracked.visible[:, places[0]].any() else None
+    return None
+
+
+class _Views:
+    """Pictures and depth at the clips' size, each read once for the overlapping windows that need it, in order.
+
+    Attributes:
+        unit: "metres" or "relative" (see :mod:`rsjax.annotate.depth`), of what was read last; "" without depth.
+    """
+
+    def __init__(self, annotated: Annotated, camera: str, config: ClipConfig) -> None:
+        episode = annotated.episode
+        self.unit, self._size, self._pictures = "", config.image_size, episode.cameras[camera]
+        self._rgb: dict[int, np.ndarray] = {}
+        self._depth: dict[int, np.ndarray] = {}
+        self._maps: Callable[[list[int]], Iterable[np.ndarray]] | None = None
+        if camera in episode.depth:  # what was measured counts before what was estimated
+            where = f"episode {episode.id}: depth of {camera}"
+            self._maps, self.unit = FilledDepths(episode.depth[camera], config.most_holes, where).read, "metres"
+        elif annotated.depth is not None and len(annotated.depth):
+            estimated = _Estimated(annotated.depth, episode.id)
+            self._maps, self.unit = estimated.read, estimated.unit
+
+    def read(
+        self, frames: Int[np.ndarray, " T"]
+    ) -> tuple[UInt8[np.ndarray, "T S S 3"], Float32[np.ndarray, "T S S"] | None]:
+        """Of these frames; no depth where there is none."""
+        self._rgb = self._moved(self._rgb, frames, self._pictures.read)
+        rgb = np.stack([self._rgb[frame] for frame in frames.tolist()])
+        if self._maps is None:
+            return rgb, None
+        self._depth = self._moved(self._depth, frames, self._maps)
+        return rgb, np.stack([self._depth[frame] for frame in frames.tolist()])
+
+    def _moved(
+        self, kept: dict[int, np.ndarray], frames: Int[np.ndarray, " T"], read: Callable[[list[int]], Iterable[Any]]
+    ) -> dict[int, np.ndarray]:
+        """What is kept, without the frames before the window, and with those of it that were missing."""
+        missing = [frame for frame in frames.tolist() if frame not in kept]
+        later = {frame: picture for frame, picture in kept.items() if frame >= frames[0]}
+        new = read(missing) if missing else ()
+        return later | {frame: resized(picture, self._size) for frame, picture in zip(missing, new, strict=True)}
+
+
+class _Estimated:
+    """The depth stage's maps; the record that was read last is kept, as frames come in order."""
+
+    def __init__(self, records: Source, episode: str) -> None:
+        self._records, self._episode = records, episode
+        self._number, self._record = 0, records[0]
+        self.unit = str(self._record["unit"])
+
+    def read(self, frames: list[int]) -> Iterator[Float32[np.ndarray, "H W"]]:
+        for frame in frames:
+            for number in [*range(self._number, len(self._records)), *range(self._number)]:
+                if number != self._number:
+                    self._number, self._record = number, self._records[number]
+                if 0 <= frame - int(self._record["first"]) < len(self._record["depth"]):
+                    break
+            else:
+                raise EpisodeError(f"depth: no map of frame {frame} of episode {self._episode}; annotate it again")
+            yield self._record["depth"][frame - int(self._record["first"])].astype(np.float32)
+
+
+def resized(picture: np.ndarray, size: int) -> np.ndarray:
+    """A picture as a mean over areas; a depth map by its nearest values, so that none between two things is made up."""
+    method = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST_EXACT
+    return cv2.resize(picture, (size, size), interpolation=method)

@@ -1,0 +1,231 @@
+"""Stores into one, and one into several. Records are copied one at a time; what is replaced is replaced whole.
+
+A store is moved by moving its directory: its manifest names its files without their place.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rsjax.config import content_key
+from rsjax.data.actions import Statistics
+from rsjax.data.codec import Record
+from rsjax.data.episode import safe_id
+from rsjax.data.guard import open_foreign
+from rsjax.data.labels import Labels
+from rsjax.data.store import MANIFEST, Store, StoreError, write_store
+
+UNITS = ("action_mean", "action_std", "depth_range")  # what a store's numbers are told in
+OF_ALL = ("format", "splits", "key", "counts", "episodes", "success_share")  # of a manifest: not true of a part
+Words = dict[str, str]
+Chosen = Callable[[str, int, Words], bool]
+
+
+def merge(paths: Sequence[Path], out: Path) -> Store:
+    """One store of all records of several, split by split, in the order given.
+
+    Units that differ are made those of all train records together; records say their depth range, so that is set anew.
+
+    Raises:
+        StoreError: fewer than two, one twice, stores of other kinds or shapes, tokens in other units or of another
+            tokenizer, or ``out`` cannot be written or is one of them.
+    """
+    stores = [open_foreign(path) for path in paths]
+    _check_mergeable(stores, out)
+    first = stores[0].manifest
+    units = _units(stores)
+    meta = {name: value for name, value in first.items() if name not in OF_ALL}
+    meta |= units | {
+        "key": content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores)),
+        "merged": [{"path": str(store.path), "key": store.manifest.get("key")} for store in stores],
+        "quarantine": {k: v for store in stores for k, v in store.manifest.get("quarantine", {}).items()},
+    }
+    if all("success_share" in store.manifest for store in stores):
+        meta["success_share"] = _weighted(stores, "success_share")
+    stamp = units["depth_range"]
+    restamp = first["kind"] == "clips" and any(store.manifest.get("depth_range") != stamp for store in stores)
+    writer = _Copy(labels=all(_labelled(store, split) for store in stores for split in store.splits))
+    splits = {}
+    for split in dict.fromkeys(split for store in stores for split in store.splits):
+        parts = [(store, split, None) for store in stores if split in store.splits]
+        splits[split] = writer.records(parts, stamp if restamp else _KEEP)
+    write_store(out, first["kind"], splits, meta, writer.label if writer.labels else None)
+    return open_foreign(out)
+
+
+def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
+    """Stores of chosen records of one, which keep its units: what was learnt on the whole can read the parts.
+
+    Args:
+        outs: for each new store, whether it takes a record: of (split, number there, words of its labels).
+
+    Raises:
+        StoreError: nothing is chosen for one of them, or it cannot be written.
+    """
+    store = open_foreign(path)
+    meta = {name: value for name, value in store.manifest.items() if name not in (*OF_ALL, "action_count")}
+    for out, chosen in outs.items():
+        numbers = {name: _chosen(store, name, chosen) for name in store.splits}
+        if not any(numbers.values()):
+            raise StoreError(f"{out}: no record of {path} is chosen for it; choose otherwise")
+        key = content_key("split", store.manifest.get("key") or str(path), *(f"{n}{v}" for n, v in numbers.items()))
+        writer = _Copy(labels=all(_labelled(store, name) for name in store.splits))
+        splits = {name: writer.records([(store, name, numbers[name])], _KEEP) for name in store.splits}
+        write_store(out, store.manifest["kind"], splits, meta | {"key": key}, writer.label if writer.labels else None)
+    return {out: open_foreign(out) for out in outs}
+
+
+def by_label(path: Path, column: str, folder: Path) -> dict[Path, Chosen]:
+    """For :func:`split`: a store in ``folder`` for each word of a column, such as ``difficulty``, named by it.
+
+    Raises:
+        StoreError: the store has no such labels.
+    """
+    store = open_foreign(path)
+    found: dict[str, None] = {}
+    for name in store.splits:
+        if len(store.source(name)):
+            words = store.labels(name).words
+            if column not in words:
+                raise StoreError(f"{path / MANIFEST}: no label {column!r}; it has {', '.join(words)}")
+            found |= dict.fromkeys(words[column])
+    return {folder / safe_id(word): _is(column, word) for word in found}
+
+
+def into_parts(count: int, folder: Path) -> dict[Path, Chosen]:
+    """For :func:`split`: ``count`` stores in ``folder`` of as many records each, as nearly as it goes."""
+    return {folder / f"part-{part:03d}": _every(count, part) for part in range(count)}
+
+
+def _is(column: str, word: str) -> Chosen:
+    return lambda split, number, words: words[column] == word
+
+
+def _every(count: int, part: int) -> Chosen:
+    return lambda split, number, words: number % count == part
+
+
+NONE = "none"  # the shape of an array that is left out
+_KEEP = object()  # a depth range that is not to be changed
+
+
+@dataclass
+class _Copy:
+    """Hands records on, and remembers the labels of the one that was handed on last.
+
+    Attributes:
+        labels: whether the sources have them.
+    """
+
+    labels: bool
+    _words: Words = field(default_factory=dict)
+
+    def records(self, parts: Sequence[tuple[Store, str, list[int] | None]], depth_range: Any) -> Iterator[Record]:
+        """Of (store, split, numbers or None for all), with this depth range in their provenance."""
+        for store, name, numbers in parts:
+            source = store.source(name)
+            labels = store.labels(name) if self.labels and len(source) else None
+            for number in range(len(source)) if numbers is None else numbers:
+                self._words = _words(labels, number)
+                record = source[number]
+                if depth_range is not _KEEP:
+                    record = record | {"provenance": record["provenance"] | {"depth_range": depth_range}}
+                yield record
+
+    def label(self, record: Record) -> Words:
+        return self._words
+
+
+def _words(labels: Labels | None, number: int) -> Words:
+    return {} if labels is None else {name: words[labels.codes[name][number]] for name, words in labels.words.items()}
+
+
+def _labelled(store: Store, name: str) -> bool:
+    return not len(store.source(name)) or store.labelled(name)
+
+
+def _chosen(store: Store, name: str, chosen: Chosen) -> list[int]:
+    count = len(store.source(name))
+    labels = store.labels(name) if count and store.labelled(name) else None
+    return [number for number in range(count) if chosen(name, number, _words(labels, number))]
+
+
+def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
+    if len(stores) < 2:
+        raise StoreError("merging takes two stores or more")
+    places = [store.path.resolve() for store in stores]
+    if len(set(places)) < len(places) or out.resolve() in places:
+        raise StoreError(f"{out}: a store can neither be merged with itself nor into itself; choose another place")
+    one = stores[0]
+    tokens = one.manifest.get("kind") == "tokens"
+    columns = _columns(one)
+    for other in stores[1:]:
+        for name in ("kind", "tokenizer", *(UNITS if tokens else ())):
+            if other.manifest.get(name) != one.manifest.get(name):
+                raise StoreError(
+                    f"{other.path}: its {name} is {other.manifest.get(name)}, that of {one.path} is "
+                    f"{one.manifest.get(name)}; such stores can be mixed in training (docs/training.md), not merged"
+                )
+        if (there := shapes(other)) != (here := shapes(one)):
+            differing = next(name for name in here | there if here.get(name) != there.get(name))
+            raise StoreError(
+                f"{other.path}: {differing} is {there.get(differing)}, in {one.path} {here.get(differing)}; make both "
+                f"with the same settings"
+            )
+        if columns is not None and _columns(other) not in (None, columns):
+            raise StoreError(f"{other.path}: its labels are {_columns(other)}, those of {one.path} {columns}")
+
+
+def _columns(store: Store) -> list[str] | None:
+    """The names of a store's labels; None where it has none."""
+    entries = [entry["labels"] for entry in store.manifest["splits"].values() if "labels" in entry]
+    return sorted(entries[0]["words"]) if entries else None
+
+
+def shapes(store: Store) -> dict[str, str]:
+    """Type and shape of each array of the store's first record; ``NONE`` for one that is left out."""
+    for name in store.splits:
+        source = store.source(name)
+        if len(source):
+            record = source[0]
+            return {
+                key: f"{value.dtype} {value.shape}" if hasattr(value, "dtype") else NONE
+                for key, value in record.items()
+                if hasattr(value, "dtype") or value is None
+            }
+    return {}
+
+
+def _units(stores: Sequence[Store]) -> dict[str, Any]:
+    """Of all train records together, each as they stand where all stores agree."""
+    manifests = [store.manifest for store in stores]
+    units = {name: manifests[0].get(name) for name in UNITS}
+    if all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests):
+        return units
+    total: Statistics | None = None
+    for store in stores:
+        one = Statistics.from_json(store.manifest) if "action_count" in store.manifest else _measured(store)
+        total = one if total is None else total.merged(one)
+    assert total is not None
+    ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
+    merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
+    return total.to_json() | {"depth_range": merged}
+
+
+def _measured(store: Store) -> Statistics:
+    source = store.source("train")
+    total: Statistics | None = None
+    for number in range(len(source)):
+        one = Statistics.of(source[number]["actions"][1:])
+        total = one if total is None else total.merged(one)
+    if total is None:
+        raise StoreError(
+            f"{store.path}: its train split has no records, so its actions have no statistics; leave it out"
+        )
+    return total
+
+
+def _weighted(stores: Sequence[Store], name: str) -> float:
+    sizes = [sum(len(store.source(part)) for part in store.splits) for store in stores]
+    return sum(s.manifest[name] * size for s, size in zip(stores, sizes, strict=True)) / max(1, sum(sizes))

@@ -1,0 +1,54 @@
+import dataclasses
+import importlib
+from pathlib import Path
+
+import pytest
+
+from rsjax.annotate.choose import METHODS, choose, choose_annotators
+from rsjax.annotate.networks.tracks import BootsTapir
+from rsjax.annotate.stages import Annotators
+from rsjax.annotate.tracks import LucasKanade
+from rsjax.config import ConfigError
+
+
+def test_a_word_is_a_method_and_its_fields() -> None:
+    assert choose("tracks", "lucas-kanade") == LucasKanade()
+    assert choose("tracks", "lucas-kanade:grid=32,tolerance=0.25") == LucasKanade(grid=32, tolerance=0.25)
+    network = choose("tracks", "bootstapir:checkout=/a,weights=/b.npy,device=cuda")
+    assert network == BootsTapir(Path("/a"), Path("/b.npy"), device="cuda")
+    assert choose("shots", "none") is None
+
+
+def test_the_default_words_are_the_default_methods() -> None:
+    words = {
+        "shots": "hsv-histogram",
+        "motion": "dis",
+        "depth": "recorded",
+        "tracks": "lucas-kanade",
+        "semantics": "own",
+    }
+    assert choose_annotators(words) == Annotators()
+
+
+def test_every_method_is_there_under_its_own_name() -> None:
+    for methods in METHODS.values():
+        for name, (module, kind) in methods.items():
+            made = getattr(importlib.import_module(f"rsjax.annotate.{module}"), kind)
+            assert made.name == name and dataclasses.is_dataclass(made)
+
+
+@pytest.mark.parametrize(
+    ("stage", "word", "match"),
+    [
+        ("tracks", "lucas", r"tracks: no method 'lucas'.*choose lucas-kanade"),
+        ("tracks", "lucas-kanade:grids=3", r"no field 'grids=3'; did you mean 'grid'"),
+        ("tracks", "lucas-kanade:grid=x", r"grid is 'x'; it should be a number"),
+        ("tracks", "bootstapir:checkout=/a", r"weights missing; write bootstapir:weights=VALUE"),
+        ("motion", "raft:weights=/a,size=big", r"size is 'big'; choose small or large"),
+        ("depth", "video-depth-anything:checkout=/a,weights=/b,metric=yes", r"metric is 'yes'; write True or False"),
+        ("semantics", "internvl:model=/a,own=x", r"own cannot be set"),
+    ],
+)
+def test_what_cannot_be_is_told(stage: str, word: str, match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        choose(stage, word)

@@ -1,0 +1,136 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsjax.annotate.categories import CategoryConfig
+from rsjax.annotate.clips import Annotated, ClipConfig, cut, words
+from rsjax.annotate.windows import WindowConfig
+from rsjax.clip import Clip
+from rsjax.data.actions import ActionConfig
+from rsjax.data.codec import Record
+from rsjax.data.episode import Episode, EpisodeError
+from rsjax.data.store import decode_clip
+from tests.annotate.toy import Pictures, episode
+
+CONFIG = ClipConfig(WindowConfig(frames=4, rate=2), image_size=8, tracks=6)
+
+
+class Records(list):
+    """Records in memory, for what is a :class:`rsjax.data.store.Source`."""
+
+
+def clips(made: Episode, config: ClipConfig = CONFIG, **annotations: Any) -> tuple[list[Record], dict[str, Any]]:
+    generator, found = cut(Annotated(made, task=made.task, segments=made.segments, **annotations), config), []
+    while True:
+        try:
+            found.append(next(generator))
+        except StopIteration as stop:
+            return found, stop.value
+
+
+def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
+    found, summary = clips(
+        episode("a", depth=True), ClipConfig(CONFIG.windows, 8, 6, actions=ActionConfig(compose="last"))
+    )
+    assert summary["windows"] == {"kept": 5} and len(found) == 5
+    for number, record in enumerate(found):
+        frames = np.array([0, 5, 10, 15]) + 5 * number
+        clip = decode_clip(record)
+        assert record["provenance"]["frames"] == frames.tolist()
+        assert clip.rgb.shape == (4, 8, 8, 3)
+        np.testing.assert_array_equal(clip.rgb[:, 0, 0, 1], frames)
+        np.testing.assert_allclose(clip.depth[:, 3, 3], 1 + frames / 10, rtol=1e-6)
+        np.testing.assert_array_equal(clip.actions, np.stack([[0, *frames[1:]], [0, *-frames[1:]]], 1))
+    assert summary["depth"] == pytest.approx([1.0, 1 + 35 / 10])
+    assert summary["action_dim"] == 2 and summary["actions"]["action_count"] == 15
+
+
+def test_actions_between_frames_are_joined() -> None:
+    found, _ = clips(episode("a"))
+    assert found[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]
+
+
+def test_without_depth_a_clip_has_none() -> None:
+    found, summary = clips(episode("a"))
+    assert found[0]["depth"] is None and summary["depth"] is None
+    assert found[0]["provenance"]["depth_unit"] == ""
+
+
+def test_estimated_depth_is_found_in_its_parts() -> None:
+    maps = np.arange(40, dtype=np.float16)[:, None, None] + np.ones((40, 5, 5), np.float16)
+    parts = Records({"first": first, "depth": maps[first : first + 7], "unit": "relative"} for first in range(0, 40, 7))
+    found, _ = clips(episode("a"), depth=parts)
+    for record in found:
+        np.testing.assert_array_equal(record["depth"][:, 0, 0], np.array(record["provenance"]["frames"]) + 1)
+        assert record["provenance"]["depth_unit"] == "relative"
+    with pytest.raises(EpisodeError, match=r"depth: no map of frame 35 of episode a"):
+        clips(episode("a"), depth=Records(parts[:5]))
+
+
+def test_tracks_are_those_of_the_windows_shot() -> None:
+    seen = np.ones((3, 20), bool)
+    seen[2, :18] = False
+    points = np.broadcast_to(np.arange(20)[None, :, None], (3, 20, 2)).astype(np.float16)
+    shots = [(0, 20), (20, 40)]
+    records = Records({"first": first, "points": points, "visible": seen} for first, _ in shots)
+    found, summary = clips(episode("a"), shots=shots, tracks=records)
+    assert summary["windows"] == {"kept": 2}
+    for record, first in zip(found, (0, 20), strict=True):
+        assert record["tracks"].shape == (6, 4, 2) and record["visible"].all()
+        np.testing.assert_array_equal(record["tracks"][0, :, 0], np.array(record["provenance"]["frames"]) - first)
+    seen[:, 0] = False
+    found, summary = clips(episode("a"), shots=shots, tracks=records)
+    assert not found and summary["windows"] == {"kept": 0, "no track": 2}
+
+
+def test_words_are_the_tasks_and_the_segments() -> None:
+    config = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("pick*", "simple"),)))
+    found, _ = clips(episode("a"), config, motion=np.arange(40.0), scene="kitchen")
+    assert words(found[0]) == {"task": "pick a cup", "difficulty": "simple", "scene": "kitchen"}
+    assert [record["provenance"]["segment"] for record in found] == ["reach", "reach", "reach", "grasp", "grasp"]
+    assert found[0]["provenance"]["motion"] == np.mean(np.arange(1, 16))
+    unnamed, _ = clips(episode("a", task=""), config)
+    assert unnamed[4]["task"] == "grasp"
+
+
+def test_success_is_the_data_sets_by_frame_or_for_the_whole() -> None:
+    by_frame = {"success": [False] * 39 + [True]}
+    assert [bool(record["success"][-1]) for record in clips(episode("a", meta=by_frame))[0]] == [False] * 5
+    found, summary = clips(episode("a", meta={"success": True}))
+    assert found[0]["success"].all() and summary["success"] == 5
+
+
+def test_overlapping_windows_read_each_frame_once() -> None:
+    read: list[int] = []
+
+    class Counting(Pictures):
+        def read(self, indices: Any) -> np.ndarray:
+            read.extend(indices)
+            return super().read(indices)
+
+    clips(episode("a", cameras={"front": Counting(40)}))
+    assert read == [0, 5, 10, 15, 20, 25, 30, 35]
+
+
+def test_a_short_episode_gives_nothing_and_says_so() -> None:
+    found, summary = clips(episode("a", count=5))
+    assert not found and summary["windows"] == {"kept": 0} and summary["short_spans"] == 1
+
+
+@pytest.mark.parametrize(
+    ("config", "annotations", "match"),
+    [
+        (ClipConfig(camera="side"), {}, r"no 'side'; it has front"),
+        (CONFIG, {"motion": np.zeros(39)}, r"motion: 39 values for 40 frames"),
+    ],
+)
+def test_what_does_not_fit_is_named(config: ClipConfig, annotations: dict[str, Any], match: str) -> None:
+    with pytest.raises(EpisodeError, match=match):
+        clips(episode("a"), config, **annotations)
+
+
+def test_a_record_is_a_clip() -> None:
+    found, _ = clips(episode("a", depth=True))
+    assert isinstance(decode_clip(found[0]), Clip) and Path(found[0]["provenance"]["episode"]).name == "a"

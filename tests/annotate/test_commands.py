@@ -1,0 +1,112 @@
+"""``experiments.ingest``, ``experiments.inspect`` and ``experiments.store``, as a user types them."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments import ingest, inspect, store
+from rsjax.data.store import open_store
+from tests.data.clips import clip_store, numbers
+
+BRIDGE = Path("/work/shared/data/bridge")
+
+
+class Command:
+    """Runs a command in this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+
+    def __call__(self, module: ModuleType, *arguments: object) -> str:
+        """What it prints."""
+        self._monkeypatch.setattr(sys, "argv", [module.__name__, *map(str, arguments)])
+        module.main()
+        return self._capsys.readouterr().out
+
+    def refused(self, module: ModuleType, *arguments: object) -> str:
+        """The one line on standard error of a command that cannot be carried out."""
+        with pytest.raises(SystemExit, match="2"):
+            self(module, *arguments)
+        told = self._capsys.readouterr().err
+        assert told.startswith("error: ") and told.count("\n") == 1
+        return told
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(monkeypatch, capsys)
+
+
+@pytest.mark.skipif(not BRIDGE.exists(), reason="the bundled Bridge episodes are not here")
+def test_the_bundled_bridge_episodes_become_a_store(command: Command, tmp_path: Path) -> None:
+    out = tmp_path / "bridge"
+    line = ["rlds", BRIDGE, "--out", out, "--windows.frames", 4, "--windows.rate", 0, "--windows.hop", 4]
+    line += ["--workers", 0, "--difficulty", "put*=simple", "*=difficult", "--shots", "none", "--motion", "none"]
+    told = command(ingest, *line)
+    assert "episodes 25 found = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
+    opened = open_store(out)
+    counts = opened.labels("train").counts()["difficulty"]
+    assert set(counts) == {"simple", "difficult"}
+    assert "up to date" in command(ingest, *line)
+
+    told = command(inspect, out)
+    assert "float32 (4, 7)" in told and "put carrot on plate" in told
+    sheet = cv2.imread(str(tmp_path / "bridge-sheet.png"))
+    assert sheet is not None and sheet.shape[1] == 8 * 100 and sheet.std() > 20
+
+
+def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
+    clip_store(tmp_path / "a")
+    told = command(store, "split", tmp_path / "a", "--into", tmp_path / "parts", "--by", "difficulty")
+    assert told.splitlines()[0] == f"{tmp_path}/parts/simple: train 3, test 1"
+    command(store, "merge", tmp_path / "b", tmp_path / "parts" / "simple", tmp_path / "parts" / "difficult")
+    shutil.move(tmp_path / "b", tmp_path / "c")
+    assert sorted(numbers(open_store(tmp_path / "c"))) == list(range(6))
+    command(store, "split", tmp_path / "c", "--into", tmp_path / "halves", "--parts", 2)
+    assert len(numbers(open_store(tmp_path / "halves" / "part-001"))) == 3
+
+
+def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Command, tmp_path: Path) -> None:
+    clip_store(tmp_path / "a", size=32)
+    shard = tmp_path / "a" / "test-00000.array_record"
+    payload = np.fromfile(shard, np.uint8)
+    payload[len(payload) // 2 :] = 0
+    payload.tofile(shard)
+    with pytest.raises(SystemExit, match="1"):
+        command(inspect, tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "match"),
+    [
+        (ingest, [], "name a source and its path first"),
+        (ingest, ["rlsd", "."], "did you mean 'rlds'"),
+        (ingest, ["folder", "nowhere"], "nowhere: not there"),
+        (ingest, ["folder", ".", "--option", "fps"], "--option 'fps': write NAME=VALUE"),
+        (ingest, ["folder", ".", "--option", "fsp=5"], "no option 'fsp'; did you mean 'fps'"),
+        (ingest, ["folder", ".", "--difficulty", "simple"], "--difficulty 'simple': write PATTERN=WORD"),
+        (ingest, ["folder", ".", "--tracks", "magic"], "tracks: no method 'magic'"),
+        (ingest, ["folder", ".", "--test-share", "1"], "--test-share is 1.0"),
+        (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
+        (ingest, ["folder", ".", "--image-size", "1000000"], "image_size is 1000000"),
+        (inspect, [], "name a store first"),
+        (inspect, ["nowhere"], "not a (whole) store"),
+        (store, ["merge", "a", "b"], "usage"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    command: Command, module: ModuleType, arguments: list[str], match: str
+) -> None:
+    assert match in command.refused(module, *arguments)
+
+
+def test_source_options_are_json_where_they_can_be() -> None:
+    found = ingest.source_options(("fps=5", "held=[6]", "keys=bridge", "task=a=b"))
+    assert found == {"fps": 5, "held": [6], "keys": "bridge", "task": "a=b"}
+    json.dumps(found)

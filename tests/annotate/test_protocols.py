@@ -1,0 +1,89 @@
+import json
+import pickle
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax.annotate.depth import RecordedDepth
+from rsjax.annotate.motion import DISFlow
+from rsjax.annotate.networks.depth import DepthAnything, VideoDepthAnything
+from rsjax.annotate.networks.motion import RaftFlow
+from rsjax.annotate.networks.semantics import InternVL
+from rsjax.annotate.networks.shots import TransNetShots
+from rsjax.annotate.networks.tracks import BootsTapir, SpatialTracker
+from rsjax.annotate.protocols import ArrayFrames, in_chunks, parameters
+from rsjax.annotate.semantics import OwnSemantics
+from rsjax.annotate.shots import HistogramShots
+from rsjax.annotate.tracks import LucasKanade
+
+HERE = Path(__file__)
+ALL = [
+    LucasKanade(),
+    HistogramShots(),
+    DISFlow(),
+    RecordedDepth(),
+    OwnSemantics(),
+    SpatialTracker(HERE.parent, HERE),
+    BootsTapir(HERE.parent, HERE),
+    TransNetShots(),
+    RaftFlow(HERE),
+    VideoDepthAnything(HERE.parent, HERE),
+    DepthAnything(HERE.parent),
+    InternVL(HERE.parent),
+]
+
+
+@dataclass(frozen=True)
+class Weighted:
+    name: ClassVar[str] = "weighted"
+    version: ClassVar[int] = 1
+    weights: Path
+    strength: float = 1.0
+    device: str = "cpu"
+
+
+@pytest.mark.parametrize("annotator", ALL, ids=lambda annotator: annotator.name)
+def test_every_annotator_travels_and_has_parameters_that_json_holds(annotator):
+    assert pickle.loads(pickle.dumps(annotator)) == annotator
+    told = parameters(annotator)
+    assert json.loads(json.dumps(told)) == told
+    assert told["name"] == annotator.name and told["version"] == annotator.version
+
+
+def test_names_differ():
+    assert len({annotator.name for annotator in ALL}) == len(ALL)
+
+
+def test_weights_count_by_content_and_the_device_not_at_all(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    for folder in "ab":
+        (tmp_path / folder / "w.pt").write_bytes(b"weights")
+    one = Weighted(tmp_path / "a" / "w.pt")
+    assert parameters(one) == parameters(Weighted(tmp_path / "b" / "w.pt", device="cuda"))
+    assert parameters(one) != parameters(replace(one, strength=2.0))
+    before = parameters(one)
+    (tmp_path / "a" / "w.pt").write_bytes(b"other weights")
+    assert parameters(one) != before
+
+
+def test_a_folder_counts_by_all_its_files(tmp_path):
+    folder = Weighted(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    before = parameters(folder)
+    (tmp_path / "model.safetensors").write_bytes(b"x")
+    assert parameters(folder) != before
+
+
+@given(st.integers(0, 40), st.integers(2, 9), st.integers(0, 1))
+def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap):
+    pictures = np.arange(count, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 1, 1, 3), np.uint8)
+    chunks = [(start, part[:, 0, 0, 0].tolist()) for start, part in in_chunks(ArrayFrames(pictures), overlap, size)]
+    assert all(part == list(range(start, start + len(part))) and len(part) <= size for start, part in chunks)
+    held = [t for i, (_, part) in enumerate(chunks) for t in part[overlap if i else 0 :]]
+    assert held == list(range(count))

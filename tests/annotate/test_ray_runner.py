@@ -1,0 +1,85 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsjax.annotate.ray_runner import RayError, RayExecutor
+from rsjax.annotate.runner import count, run
+from tests.annotate.toy import Source, job, runs
+
+ray = pytest.importorskip("ray")
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_local_ray_survives_what_the_pool_survives(tmp_path: Path) -> None:
+    """An actor is killed in the middle of a unit, another one while it is idle; one unit fails."""
+    kills = str(tmp_path / "killed")
+    work = job(tmp_path, Source(6, broken=(4,)), fatal="episode_001", kills=kills, fails="episode_002")
+    refs = list(work.source.episodes())
+    with RayExecutor(work, workers={"first": 2, "second": 1}, cpus=3) as executor:
+        pids = executor.pids()
+        assert len(set(pids["first"] + pids["second"])) == 3
+        os.kill(pids["second"][0], signal.SIGKILL)
+        ran = run(work, refs, executor, lambda done, total: None)
+    counts = count(work, refs)
+    assert (counts.done, len(counts.quarantined), ran) == (4, 2, 10)
+    assert "no such colour" in counts.quarantined[0]["error"] and "in _work" in counts.quarantined[0]["traceback"]
+    assert runs(tmp_path).count("first episode_001") == 2
+    assert not ray.is_initialized()
+
+
+def test_a_stage_that_no_node_can_hold_is_told(tmp_path: Path) -> None:
+    work = job(tmp_path, Source(1), gpus=0.5)
+    with pytest.raises(RayError, match=r"3 CPUs and 0 GPUs, too few"):
+        RayExecutor(work, cpus=3)
+    assert not ray.is_initialized()
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from rsjax.annotate.ray_runner import RayExecutor
+from rsjax.annotate.runner import run
+from tests.annotate.toy import Source, job
+if __name__ == "__main__":
+    work = job(Path(sys.argv[1]), Source(6), seconds=0.3)
+    with RayExecutor(work, cpus=3) as executor:
+        print(*sum(executor.pids().values(), []), flush=True)
+        run(work, list(work.source.episodes()), executor, lambda done, total: None)
+"""
+
+
+def test_a_killed_driver_takes_its_cluster_along_and_only_the_rest_is_run(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    line = [sys.executable, str(program), str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    driver = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, text=True)
+    assert driver.stdout is not None
+    pids = [int(word) for word in driver.stdout.readline().split()]
+    assert len(pids) == 3
+    wait_for(lambda: len(list(tmp_path.rglob("units/second/**/*.json"))) >= 1)
+    driver.kill()
+    driver.wait()
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    marks = len(list(tmp_path.rglob("units/**/*.json")))
+    assert 0 < marks < 12
+    started = len(runs(tmp_path))
+    work = job(tmp_path, Source(6))
+    refs = list(work.source.episodes())
+    with RayExecutor(work, cpus=2) as executor:
+        run(work, refs, executor, lambda done, total: None)
+    assert count(work, refs).done == 6
+    assert len(runs(tmp_path)) - started == 12 - marks
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

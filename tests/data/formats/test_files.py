@@ -1,0 +1,78 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax.data.episode import EpisodeError, SourceError
+from rsjax.data.formats import FORMATS, open_source
+from rsjax.data.formats.files import filled, inside, json_lines
+
+ROOT = Path("/data/set")
+
+
+@given(st.lists(st.sampled_from(["..", ".", "a", "/", "//", "b.mp4", "\0", ""]), max_size=6).map("".join) | st.text())
+def test_no_name_leads_out(name: str) -> None:
+    try:
+        path = inside(ROOT, name)
+    except EpisodeError:
+        return
+    assert path.is_relative_to(ROOT)
+    assert ".." not in path.parts
+
+
+@given(st.text(alphabet="{}:!.0d3[]ab", max_size=12))
+def test_templates_are_filled_or_refused(template: str) -> None:
+    try:
+        made = filled(template, a=7, b="x")
+    except EpisodeError:
+        return
+    assert len(made) < 200
+
+
+def test_templates() -> None:
+    assert filled("c-{a:03d}/{b}_{a:06d}.mp4", a=7, b="top") == "c-007/top_000007.mp4"
+    for template in ("{a.__class__}", "{a!r}", "{a:>9}", "{c}", "{", "{a:0100d}", "{}", "{b:3d}"):
+        with pytest.raises(EpisodeError, match="path template"):
+            filled(template, a=7, b="top")
+
+
+def test_bad_lines_do_not_end_the_file(tmp_path: Path) -> None:
+    (tmp_path / "f.jsonl").write_bytes(b'{"a": 1}\n\n\xff\n' + b"[" * 100_000 + b"\n[2]")
+    (first, one), (third, two), (fourth, deep), (last, three) = json_lines(tmp_path / "f.jsonl")
+    assert (first, one, third, fourth, last, three) == (1, {"a": 1}, 3, 4, 5, [2])
+    assert isinstance(two, ValueError)
+    assert isinstance(deep, ValueError)
+    with pytest.raises(SourceError, match="gone: missing"):
+        list(json_lines(tmp_path / "gone"))
+
+
+def test_unknown_formats_are_told(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="unknown format 'lerobo'; did you mean 'lerobot'"):
+        open_source("lerobo", tmp_path)
+    assert len(set(FORMATS)) == len(FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("agibot", {"tasks": 327}, "option tasks is 327, should be Sequence"),
+        ("agibot", {"cameras": "head"}, "option cameras is 'head', should be Sequence"),
+        ("lerobot", {"held": ["x"]}, r"option held is \['x'\]"),
+        ("lerobot", {"kind": "relative"}, "option kind is 'relative', should be Literal.'absolute', 'delta'"),
+        ("folder", {"fps": "fast"}, "option fps is 'fast'"),
+        ("folder", {"rate": 3}, "no option 'rate'; it has task, fps, rows, kind, held, quaternions"),
+    ],
+)
+def test_options_are_checked(tmp_path: Path, name: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SourceError, match=f"^{name}: {message}"):
+        open_source(name, tmp_path, **options)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_can_be_opened(tmp_path: Path, name: str) -> None:
+    with pytest.raises(SourceError, match="no option 'nonsense'"):
+        open_source(name, tmp_path, nonsense=1)
+    with pytest.raises(SourceError, match="gone: not there"):
+        open_source(name, tmp_path / "gone")

@@ -1,0 +1,104 @@
+import shutil
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.data.actions import Statistics
+from rsjax.data.merge import by_label, into_parts, merge, split
+from rsjax.data.store import Store, StoreError, open_store
+from tests.data.clips import clip_store, numbers, words
+
+
+def assert_labels_are_those_of_the_records(store: Store) -> None:
+    for name in store.splits:
+        source = store.source(name)
+        labels = store.labels(name) if len(source) else None
+        for i in range(len(source)):
+            assert labels is not None
+            assert {k: labels.words[k][labels.codes[k][i]] for k in labels.words} == words(source[i])
+
+
+@pytest.mark.parametrize("counted", [True, False])
+def test_merged_stores_have_all_records_and_the_units_of_all(tmp_path: Path, counted: bool) -> None:
+    clip_store(tmp_path / "a", 0, 4, [1.0, 2.0], counted)
+    clip_store(tmp_path / "b", 10, 3, [0.5, 1.5])
+    store = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    assert numbers(store) == [0, 1, 2, 3, 10, 11, 12] and numbers(store, "test") == [90, 91, 90, 91]
+    assert store.manifest["depth_range"] == [0.5, 2.0]
+    source = store.source("train")
+    records = [source[i] for i in range(len(source))]
+    assert all(record["provenance"]["depth_range"] == [0.5, 2.0] for record in records)
+    exact = Statistics.of(np.concatenate([record["actions"][1:] for record in records])).to_json()
+    np.testing.assert_allclose(store.manifest["action_mean"], exact["action_mean"], rtol=1e-6)
+    np.testing.assert_allclose(store.manifest["action_std"], exact["action_std"], rtol=1e-6)
+    assert_labels_are_those_of_the_records(store)
+
+
+def test_a_split_by_label_holds_each_record_once_and_merges_back(tmp_path: Path) -> None:
+    whole = clip_store(tmp_path / "a", 0, 7, [1.0, 2.0])
+    parts = split(whole.path, by_label(whole.path, "difficulty", tmp_path / "parts"))
+    assert {path.name: numbers(store) for path, store in parts.items()} == {
+        "simple": [0, 2, 4, 6],
+        "difficult": [1, 3, 5],
+    }
+    for store in parts.values():
+        assert store.manifest["action_mean"] == whole.manifest["action_mean"]
+        assert_labels_are_those_of_the_records(store)
+    back = merge(list(parts), tmp_path / "b")
+    assert sorted(numbers(back)) == list(range(7))
+    assert {n: back.manifest[n] for n in ("action_mean", "action_std", "depth_range")} == {
+        n: whole.manifest[n] for n in ("action_mean", "action_std", "depth_range")
+    }
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(1, 6), st.integers(6, 9))
+def test_parts_are_of_one_size_and_together_the_whole(
+    tmp_path_factory: pytest.TempPathFactory, count: int, clips: int
+) -> None:
+    folder = tmp_path_factory.mktemp("parts")
+    clip_store(folder / "a", 0, clips)
+    parts = [numbers(store) for store in split(folder / "a", into_parts(count, folder / "parts")).values()]
+    assert sorted(chain(*parts)) == list(range(clips))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_a_store_is_moved_with_its_directory(tmp_path: Path) -> None:
+    clip_store(tmp_path / "a")
+    shutil.move(tmp_path / "a", tmp_path / "elsewhere")
+    assert numbers(open_store(tmp_path / "elsewhere")) == list(range(6))
+
+
+def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
+    clip_store(tmp_path / "a")
+    clip_store(tmp_path / "large", size=16)
+    clip_store(tmp_path / "tokens", kind="tokens")
+    clip_store(tmp_path / "deep", depth_range=[1.0, 2.0])
+    a = tmp_path / "a"
+    for paths, match in (
+        ([a], r"two stores or more"),
+        ([a, a], r"neither be merged with itself"),
+        ([a, tmp_path / "large"], r"large: rgb is uint8 \(4, 16, 16, 3\), in .*a uint8 \(4, 8, 8, 3\)"),
+        ([a, tmp_path / "tokens"], r"its kind is tokens, that of .*a is clips"),
+        ([a, tmp_path / "deep"], r"deep: depth is float32 \(4, 8, 8\), in .*a none"),
+    ):
+        with pytest.raises(StoreError, match=match):
+            merge(paths, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    with pytest.raises(StoreError, match=r"nor into itself"):
+        merge([a, tmp_path / "deep"], a)
+    with pytest.raises(StoreError, match=r"no label 'colour'; it has task, difficulty"):
+        by_label(a, "colour", tmp_path)
+    with pytest.raises(StoreError, match=r"no record of .* is chosen"):
+        split(a, {tmp_path / "none": lambda name, number, words: False})
+
+
+def test_tokens_in_other_units_are_refused(tmp_path: Path) -> None:
+    clip_store(tmp_path / "a", 0, kind="tokens")
+    clip_store(tmp_path / "b", 10, kind="tokens")
+    with pytest.raises(StoreError, match=r"its action_mean is .*mixed in training"):
+        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
