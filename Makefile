@@ -4,7 +4,7 @@ VENV ?= .venv
 JOBS ?= 2
 python := $(VENV)/bin/python
 
-.PHONY: help setup train test lint clean
+.PHONY: help setup train test extras lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /make \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -18,6 +18,10 @@ train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
 
 test: setup  ## the tests
 	@$(python) -m pytest -n $(JOBS) $(ARGS)
+
+extras: setup  ## the optional packages (networks, PyTorch, Rerun), and the tests that want them
+	@scripts/extras.sh "$(VENV)"
+	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun)' tests) $(ARGS)
 
 lint: setup  ## ruff and mypy
 	@$(python) -m ruff check

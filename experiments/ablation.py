@@ -25,8 +25,10 @@ class Options:
     """Seeds of the world model's training (train.seed); every combination is run with each."""
     out: Path | None = None
     """Where the grid is kept, a run directory per cell; runs/ablation-PRESET if not given."""
+    store: Path | None = None
+    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
-    """Where data sets are kept, to be shared by runs."""
+    """Where simulated data sets are kept, to be shared by runs."""
     only: tuple[str, ...] = ()
     """Cells to run, by name or shell pattern ('model.depth=True,*'); all if not given."""
     skip: tuple[str, ...] = ()
@@ -44,6 +46,10 @@ def main() -> None:
     """Runs the cells that are not finished, then prints the table; exits with 1 where a cell failed."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
+    if options.store:
+        from rsjax.pipeline.own_data import on_store
+
+        config = on_store(config, options.store)
     out, data = options.out or Path("runs") / f"ablation-{config.name}", options.data_dir
     cells = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
     number = options.cell if options.cell is not None or options.list else task_number(os.environ)

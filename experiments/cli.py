@@ -85,6 +85,8 @@ def main_errors() -> Iterator[None]:
     disk or a missing permission, with 130 for an interrupt, and with 75 (to be started again) for SIGTERM. Any other
     exception is a bug and keeps its traceback.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
     try:
         with sigterm_stops():
             yield

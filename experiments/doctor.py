@@ -63,15 +63,20 @@ def main() -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if len(shown) < len(report.findings):
         console.print(f"… and {len(report.findings) - len(shown)} more; --lines 0 prints all", highlight=False)
+    for name, told in report.mended[: max(0, options.lines - len(shown)) if options.lines else None]:
+        console.print(f"{name}: mended: {told}", markup=False, highlight=False, soft_wrap=True)
     table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
     for kind, count in report.counts().items():
         table.add_row(kind, str(count), KINDS[kind])
     if report.findings:
         console.print(table)
-    bad = len(report.reasons())
-    console.print(
-        f"{len(report.refs)} episodes: {len(report.refs) - bad} without a finding, {bad} with", highlight=False
-    )
+    found, bad = len(report.refs), report.bad()
+    for kind, count in report.counts().items():
+        if count == found:
+            console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}", highlight=False)
+    console.print(f"{found} episodes: {found - bad} without a finding, {bad} with", highlight=False)
+    if report.mended:
+        console.print(f"mended when they were read, which is no finding: {len(report.mended)}", highlight=False)
     if options.fix is not None:
         about = f"{source.name} {options.path or options.what}"
         kept, out = write_selection(options.fix, about, report.refs, report.reasons())

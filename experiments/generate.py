@@ -19,7 +19,9 @@ class Options:
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
     data_dir: Path = Path("data")
-    """Where the run's data set is kept."""
+    """Where the run's data set is kept, if it was simulated."""
+    store: Path | None = None
+    """Where the run's store of clips lies now, if it was ingested and has moved since."""
     split: Literal["test", "train"] = "test"
     """Which clips the first frames come from."""
     clips: tuple[int, ...] = ()
@@ -67,7 +69,8 @@ def main() -> None:
     sample = {name: value for name, value in decoding.items() if value is not None}
     request = Request(options.split, options.clips, options.actions_from, options.actions, options.frames, sample)
     out = options.out or options.run / "generated"
-    for path in write_videos(options.run, options.data_dir, request, out, options.format, options.fps, options.scale):
+    how = (options.format, options.fps, options.scale, options.store)
+    for path in write_videos(options.run, options.data_dir, request, out, *how):
         print(path)
 
 

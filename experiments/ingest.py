@@ -29,6 +29,8 @@ class Options:
     """Pixels of a clip's side."""
     points: int = 256
     """Tracks of a clip."""
+    manifest: Path | None = None
+    """What experiments.doctor --fix wrote: the episodes that it leaves out are quarantined with its reasons."""
     camera: str = ""
     """The camera that is taken; the episode's first if not given."""
     difficulty: tuple[str, ...] = ()
@@ -42,7 +44,7 @@ class Options:
     motion: str = "dis"
     """dis, raft or none."""
     depth: str = "recorded"
-    """recorded, depth-anything, video-depth-anything or none."""
+    """recorded (or recorded:most_holes=0.8), depth-anything, video-depth-anything or none."""
     tracks: str = "lucas-kanade"
     """lucas-kanade, spatial-tracker, bootstapir or none."""
     semantics: str = "own"
@@ -50,9 +52,11 @@ class Options:
     runner: Literal["pool", "ray"] = "pool"
     """Processes of this machine, or a Ray cluster."""
     workers: int = -1
-    """Processes; 0: this one alone, -1: one per core. With Ray, of each stage at most."""
+    """Processes; 0: this one alone, -1: one per core. With Ray, of each stage at most; -1: as many as there is room."""
     ray_address: str = "local"
     """Of the cluster (auto: the one that this machine is part of)."""
+    cpus: float = 1.0
+    """Of each worker, on Ray; fractions share a core."""
     gpus: float = 0.0
     """Of each worker that has a network, on Ray; fractions share a GPU."""
     retry: bool = False
@@ -70,13 +74,18 @@ def main() -> None:
         raise ConfigError(f"name a source and its path first; usage: {PROG} SOURCE PATH --out STORE")
     name, place, rest = ("", "", argv) if asked else (argv[0], argv[1], argv[2:])
     options = parse_options(rest, f"{PROG} SOURCE PATH", "Reads, annotates, cuts and packs episodes.", Options())
-    from rsjax.annotate.ingest import ingest, listed
-    from rsjax.annotate.report import lines
+    from rsjax.annotate.ingest import ingest, is_made, listed
+    from rsjax.annotate.report import QUARANTINE, SUMMARY, WINDOWS, lines
     from rsjax.progress import Progress, note
 
     plan = make_plan(name, Path(place), options)
     found = listed(plan.job)
-    with Progress("ingest", len(found[0]) * len(plan.job.stages), "units") as progress:
+    if not options.retry and is_made(plan, found[0]):
+        note(f"{plan.out} is up to date: it was made of the same {len(found[0])} episodes in the same way")
+        return
+    stages = ", ".join(stage.name for stage in plan.job.stages)
+    print(f"{len(found[0])} episodes; steps of each: {stages}, packing", flush=True)
+    with Progress("ingest", plan.steps(found[0]), "steps") as progress:
         counts = ingest(
             plan,
             lambda: make_executor(plan.job, options),
@@ -86,42 +95,67 @@ def main() -> None:
             retry=options.retry,
         )
     if counts is None:
-        note("up to date: the store was made of the same episodes in the same way")
+        note("nothing is quarantined that could be tried again")
     else:
         print(*lines(counts), sep="\n")
-        print(f"what was left out, and why: {plan.job.folder.absolute()}/summary.json and quarantine.jsonl")
-    print(f"store: {plan.out.absolute()}")
+        print(f"what was left out, and why: {plan.job.folder}/{SUMMARY}, {QUARANTINE} and {WINDOWS}")
+    print(f"store: {plan.out}")
 
 
 def make_plan(name: str, place: Path, options: Options) -> Any:
     """What the arguments ask for, checked before anything is run."""
     from rsjax.annotate.categories import CategoryConfig, parse_table
-    from rsjax.annotate.choose import choose_annotators
+    from rsjax.annotate.choose import choose_annotators, choose_recorded
     from rsjax.annotate.clips import ClipConfig
     from rsjax.annotate.ingest import Plan
     from rsjax.annotate.stages import make_stages
     from rsjax.annotate.units import Job
     from rsjax.config import content_key, to_dict
     from rsjax.data.formats import open_source
+    from rsjax.data.selection import select
 
+    out = check(name, options)
+    words = {stage: getattr(options, stage) for stage in ("shots", "motion", "depth", "tracks", "semantics")}
+    recorded = choose_recorded(words["depth"])
+    config = ClipConfig(
+        options.windows,
+        options.image_size,
+        options.points,
+        options.camera,
+        recorded_depth=recorded is not None,
+        most_holes=recorded.most_holes if recorded else 0.0,
+        actions=options.actions,
+        categories=CategoryConfig(
+            parse_table("--difficulty", options.difficulty), parse_table("--scene", options.scene)
+        ),
+    )
+    stages = make_stages(choose_annotators(words), config, options.cpus, options.gpus)
+    settings = source_options(options.option)
+    source: Any = open_source(name, place.absolute(), **settings)
+    if options.manifest is not None:
+        source = select(source, options.manifest)
+    job = Job(source, content_key(json.dumps(settings, sort_keys=True)), stages, out.with_name(f"{out.name}.work"))
+    return Plan(job, out, options.test_share, {"config": to_dict(config) | {"methods": words, "source": settings}})
+
+
+def check(name: str, options: Options) -> Path:
+    """The store's absolute path.
+
+    Raises:
+        ConfigError: an option that cannot be, or that the runner would not heed.
+    """
     if not 0 <= options.test_share < 1:
         raise ConfigError(f"--test-share is {options.test_share}; it is a share of the episodes, 0 to below 1")
-    categories = CategoryConfig(
-        parse_table("--difficulty", options.difficulty),
-        parse_table("--scene", options.scene),
-    )
-    config = ClipConfig(
-        options.windows, options.image_size, options.points, options.camera, 0.5, options.actions, categories
-    )
-    words = {stage: getattr(options, stage) for stage in ("shots", "motion", "depth", "tracks", "semantics")}
-    stages = make_stages(choose_annotators(words), config, options.gpus)
-    settings = source_options(options.option)
-    source = open_source(name, place.absolute(), **settings)
-    out = options.out or Path("data") / name
-    job = Job(
-        source, content_key(json.dumps(settings, sort_keys=True)), stages, out.absolute().with_name(f"{out.name}.work")
-    )
-    return Plan(job, out, options.test_share, {"config": to_dict(config) | {"methods": words, "source": settings}})
+    if not (options.cpus > 0 and options.gpus >= 0):
+        raise ConfigError(f"--cpus is {options.cpus} and --gpus {options.gpus}; they cannot be negative, nor --cpus 0")
+    if options.runner != "ray":
+        for option in ("ray_address", "cpus", "gpus"):
+            if getattr(options, option) != getattr(Options(), option):
+                raise ConfigError(f"--{option.replace('_', '-')} is for Ray alone; add --runner ray or leave it out")
+    out = Path(os.path.abspath(options.out or Path("data") / name))
+    if not out.name:
+        raise ConfigError(f"--out is {options.out}; name a directory that the store is to be")
+    return out
 
 
 def make_executor(job: Any, options: Options) -> Any:
@@ -129,12 +163,12 @@ def make_executor(job: Any, options: Options) -> Any:
     from rsjax.annotate.pool import ProcessPool
     from rsjax.annotate.runner import Inline
 
-    cores = len(os.sched_getaffinity(0))
     if options.runner == "ray":
         from rsjax.annotate.ray_runner import RayExecutor
 
-        return RayExecutor(job, options.ray_address, most=cores if options.workers < 0 else max(1, options.workers))
-    return ProcessPool(job, cores if options.workers < 0 else options.workers) if options.workers else Inline(job)
+        return RayExecutor(job, options.ray_address, most=None if options.workers < 0 else max(1, options.workers))
+    workers = len(os.sched_getaffinity(0)) if options.workers < 0 else options.workers
+    return ProcessPool(job, workers) if workers else Inline(job)
 
 
 def source_options(words: tuple[str, ...]) -> dict[str, Any]:

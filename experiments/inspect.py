@@ -22,6 +22,8 @@ class Options:
     """Of the sheet, and of the viewer."""
     rerun: bool = False
     """Open clips with RGB, depth and tracks in the Rerun viewer (pip install 'rsjax[rerun]')."""
+    rerun_file: Path | None = None
+    """Write them here for the viewer instead; `rerun FILE` opens them."""
 
 
 @main_errors()
@@ -29,24 +31,31 @@ def main() -> None:
     """Prints, and writes a sheet of pictures."""
     argv = sys.argv[1:]
     if not argv or (argv[0].startswith("-") and not {"-h", "--help"} & {*argv}):
-        raise ConfigError(f"name a store first; usage: {PROG} STORE [--sheet FILE] [--rerun]")
+        raise ConfigError(f"name a store first; usage: {PROG} STORE [--sheet FILE] [--rerun | --rerun-file FILE]")
     place, argv = (None, argv) if argv[0].startswith("-") else (Path(argv[0]), argv[1:])
     options = parse_options(argv, f"{PROG} STORE", "Counts, shapes, histograms, and a sheet of pictures.", Options())
+    if options.sheet and options.sheet.suffix.lower() not in (".png", ".jpg", ".webp"):
+        raise ConfigError(f"--sheet is {options.sheet}; name a .png, .jpg or .webp file")
     assert place is not None
     from PIL import Image
 
-    from rsjax.data.guard import open_foreign
-    from rsjax.data.inspect import contact_sheet, look, render, rerun_view
+    from rsjax.data.inspect import contact_sheet, look, render
+    from rsjax.data.rerun_view import rerun_view
+    from rsjax.data.store import disk_guard, open_store
 
-    store = open_foreign(place)
+    store = open_store(place)
     contents = look(store, options.records)
     print(*[f"store     {place.absolute()} ({store.manifest.get('kind')})", *render(contents)], sep="\n")
     if store.manifest.get("kind") == "clips":
-        sheet = options.sheet or place.absolute().with_name(f"{place.absolute().name}-sheet.png")
-        Image.fromarray(contact_sheet(store, options.clips)).save(sheet)
-        print(f"sheet: {sheet.absolute()}")
-    if options.rerun:
-        rerun_view(store, options.clips)
+        sheet = (options.sheet or place.absolute().with_name(f"{place.absolute().name}-sheet.png")).absolute()
+        with disk_guard(sheet):
+            Image.fromarray(contact_sheet(store, options.clips)).save(sheet)
+        print(f"sheet: {sheet}")
+    if options.rerun or options.rerun_file:
+        for message in rerun_view(store, options.clips, options.rerun_file):
+            print(f"left out: {message}")
+    if options.rerun_file:
+        print(f"for the viewer: {options.rerun_file.absolute()}")
     if contents.damaged:
         raise SystemExit(1)
 

@@ -1,18 +1,23 @@
-"""Stores into one, or one into several. ``python -m experiments.store merge OUT A B`` or ``… split STORE``"""
+"""Stores into one, one into several, or into tokens. ``python -m experiments.store merge OUT A B``, ``… split A``"""
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
+from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.store"
-USAGE = f"usage: {PROG} merge OUT STORE STORE …, or {PROG} split STORE --into FOLDER [--by difficulty | --parts 4]"
+USAGE = (
+    f"usage: {PROG} merge OUT STORE STORE …, or {PROG} split STORE --into FOLDER [--by difficulty | --parts 4], "
+    f"or {PROG} tokenize STORE --run runs/tiny"
+)
 
 
 @dataclass(frozen=True)
-class Options:
+class Split:
     """Options of ``split``."""
 
     into: Path = Path("parts")
@@ -23,28 +28,55 @@ class Options:
     """So many stores of as many records each, instead."""
 
 
+@dataclass(frozen=True)
+class Tokenize:
+    """Options of ``tokenize``."""
+
+    run: Path = Path("runs/tiny")
+    """A run directory, whose tokenizer makes the tokens of every clip; they lie beside the clips."""
+
+
 @main_errors()
 def main() -> None:
-    """Merges or splits, and says what was made."""
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    what, places = (words[0] if words else ""), [Path(word) for word in words[1:]]
-    if {"-h", "--help"} & {*sys.argv[1:]}:
+    """Does one of them, and says what was made."""
+    argv = sys.argv[1:]
+    if {"-h", "--help"} & {*argv}:
         print(USAGE)
         return
-    from rsjax.data.merge import by_label, into_parts, merge, split
-
+    what, places = (argv[0] if argv else ""), [Path(word) for word in argv[1:]]
     if what == "merge" and len(places) >= 3:
+        from rsjax.data.merge import merge
+
         made = [merge(places[1:], places[0])]
     elif what == "split" and places:
-        rest = sys.argv[sys.argv.index(str(words[1])) + 1 :]
-        options = parse_options(rest, f"{PROG} split STORE", "One store into several.", Options())
-        parts = into_parts(options.parts, options.into) if options.parts else None
-        made = list(split(places[0], parts or by_label(places[0], options.by, options.into)).values())
+        made = split_store(places[0], parse_options(argv[2:], f"{PROG} split STORE", Split.__doc__ or "", Split()))
+    elif what == "tokenize" and places:
+        tune_process()
+        options = parse_options(argv[2:], f"{PROG} tokenize STORE", Tokenize.__doc__ or "", Tokenize())
+        made = [tokenize(places[0], options.run)]
     else:
         raise ConfigError(USAGE)
     for store in made:
         sizes = ", ".join(f"{name} {len(store.source(name))}" for name in store.splits)
         print(f"{store.path.absolute()}: {sizes}")
+
+
+def split_store(place: Path, options: Split) -> list[Any]:
+    """The parts."""
+    from rsjax.data.merge import by_label, into_parts, split
+
+    parts = into_parts(options.parts, options.into) if options.parts else None
+    return list(split(place, parts or by_label(place, options.by, options.into)).values())
+
+
+def tokenize(place: Path, run: Path) -> Any:
+    """The store of tokens."""
+    from rsjax.data.store import open_store
+    from rsjax.pipeline.tokens import tokenize_store
+    from rsjax.sample.generator import load_config, load_tokenizer
+
+    clips, config = open_store(place), load_config(run)
+    return open_store(tokenize_store(clips, config, load_tokenizer(config, run), place / "tokens"))
 
 
 if __name__ == "__main__":

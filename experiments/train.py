@@ -17,8 +17,10 @@ class Options:
 
     run_dir: Path | None = None
     """Where the run is kept; runs/PRESET if not given."""
+    store: Path | None = None
+    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
-    """Where data sets are kept, to be shared by runs."""
+    """Where simulated data sets are kept, to be shared by runs."""
     resume: bool = True
     """Go on from the checkpoints of an interrupted stage; --no-resume starts that stage over."""
     overwrite: bool = False
@@ -42,7 +44,10 @@ def main() -> None:
     config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
     config = config.with_loops(**{n: value for n in ("wandb", "profile") if (value := getattr(options, n))})
     # JAX is loaded only now, after arguments are known to be good.
+    from rsjax.pipeline.own_data import on_store
     from rsjax.train import distributed
+
+    config = on_store(config, options.store) if options.store else config
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
     from rsjax.pipeline.run import Run

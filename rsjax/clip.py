@@ -19,7 +19,8 @@ class Clip:
 
     Attributes:
         rgb: frames, 0–255, RGB order, upright (row 0 is the top).
-        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0.
+        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0; None where none was
+            recorded or estimated.
         actions: row t led from frame t-1 into frame t; row 0 is zeros (nothing led into the first frame).
         tracks: x (right) and y (down) of each keypoint in each frame; 0 and 1 are the image's outer edges, so the
             centre of pixel column i is (i + 0.5) / W. May leave [0, 1] when the point leaves the image.
@@ -30,7 +31,7 @@ class Clip:
     """
 
     rgb: UInt8[np.ndarray, "T H W 3"]
-    depth: Float32[np.ndarray, "T H W"]
+    depth: Float32[np.ndarray, "T H W"] | None
     actions: Float32[np.ndarray, "T A"]
     tracks: Float32[np.ndarray, "N0 T 2"]
     visible: Bool[np.ndarray, "N0 T"]
@@ -51,6 +52,8 @@ class Batch:
         visible: as in :class:`Clip`.
         weight: 1 for a clip that counts, 0 for padding.
         index: the clip's place in the global batch, so that its random masks don't depend on the device it is on.
+        has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
+            clips have it.
     """
 
     rgb: Int32[Array, "B T H W"]
@@ -60,3 +63,4 @@ class Batch:
     visible: Bool[Array, "B N0 T"]
     weight: Float[Array, " B"]
     index: Int32[Array, " B"]
+    has_depth: Float[Array, " B"] | None = None

@@ -150,7 +150,7 @@ def _kept(config: Config, model: ModelConfig) -> list[jax.ShapeDtypeStruct]:
 
 
 def _batch(config: Config, clips: int) -> Any:
-    model, tracks = config.model, config.sim.tracks
+    model, tracks = config.model, config.clips.tracks
     shape: Callable[..., Any] = lambda dtype, *axes: jax.ShapeDtypeStruct((clips, *axes), dtype)  # noqa: E731
     tokens = shape(jnp.int32, model.frames, model.grid, model.grid)
     return Batch(

@@ -7,11 +7,11 @@ from pathlib import Path
 from rsjax.ablation.fields import GridError
 from rsjax.ablation.figure import draw
 from rsjax.ablation.grid import Cell, Choice
-from rsjax.ablation.lock import lock
 from rsjax.ablation.record import FILE, Record, extend, read_record
 from rsjax.ablation.results import read_result
 from rsjax.ablation.table import Row, as_csv, as_json, markdown, tabulate
 from rsjax.config import Config
+from rsjax.data.lock import lock
 from rsjax.data.store import disk_guard, write_atomically
 
 

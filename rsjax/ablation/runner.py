@@ -11,12 +11,12 @@ from pathlib import Path
 import jax
 
 from rsjax.ablation.grid import Cell, Choice, idle
-from rsjax.ablation.lock import lock
 from rsjax.ablation.output import write_tables
 from rsjax.ablation.record import extend, keep_record, read_record
 from rsjax.ablation.results import ERROR, State, lock_of, read_metrics, run_of
 from rsjax.ablation.shared import share
 from rsjax.config import Config
+from rsjax.data.lock import lock
 from rsjax.data.store import write_atomically
 from rsjax.errors import Preempted, UserError
 from rsjax.pipeline.stages import run_all

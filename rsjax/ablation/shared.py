@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from rsjax.ablation.lock import lock
+from rsjax.data.lock import lock
 from rsjax.data.store import disk_guard
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run

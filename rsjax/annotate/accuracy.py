@@ -4,7 +4,8 @@ python -m rsjax.annotate.accuracy data/lift-4d419252e972e2e4 --split test
 """
 
 import argparse
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Bool, Float
 from rsjax.annotate.tracks import Follower, LucasKanade
 from rsjax.clip import Clip
 from rsjax.data.store import decode_clip, open_store
+from rsjax.errors import UserError
 from rsjax.tokenizer.depth_color import Scale, color_to_depth, depth_to_color
 
 
@@ -76,15 +78,19 @@ def single_steps(clip: Clip) -> Iterator[Clip]:
     for t in range(len(clip.rgb) - 1):
         there, both = clip.visible[:, t], slice(t, t + 2)
         tracks, visible = clip.tracks[there, both], clip.visible[there, both]
-        yield replace(clip, rgb=clip.rgb[both], depth=clip.depth[both], tracks=tracks, visible=visible)
+        depth = None if clip.depth is None else clip.depth[both]
+        yield replace(clip, rgb=clip.rgb[both], depth=depth, tracks=tracks, visible=visible)
 
 
 def color_round_trip(clips: Iterable[Clip], near: float, far: float, scale: Scale) -> tuple[float, float, float]:
-    """Depth to 8-bit colours and back: mean and greatest error in metres, and mean error relative to the depth."""
+    """Depth to 8-bit colours and back: mean and greatest error in metres, and mean error relative to the depth.
+
+    Clips without depth are passed over; one at least has some.
+    """
     total, greatest, relative, count = 0.0, 0.0, 0.0, 0
-    for clip in clips:
-        colors = depth_to_color(clip.depth, near, far, scale).astype(np.uint8)
-        wanted = clip.depth.clip(near, far)
+    for depth in (clip.depth for clip in clips if clip.depth is not None):
+        colors = depth_to_color(depth, near, far, scale).astype(np.uint8)
+        wanted = depth.clip(near, far)
         error = np.abs(color_to_depth(colors, near, far, scale) - wanted)
         total, greatest = total + float(error.sum(dtype=np.float64)), max(greatest, float(error.max()))
         relative, count = relative + float((error / wanted).sum(dtype=np.float64)), count + error.size
@@ -98,8 +104,12 @@ def main() -> None:
     parser.add_argument("--split", default="test")
     options = parser.parse_args()
     store = open_store(options.store)
+    if options.split not in store.splits:
+        raise UserError(f"{store.path}: no split {options.split!r}; it has {', '.join(store.splits)}")
     source = store.source(options.split)
     clips = [decode_clip(source[i]) for i in range(len(source))]
+    if not clips:
+        raise UserError(f"{store.path}: split {options.split!r} has no clips; name another with --split")
     print(f"{len(clips)} clips of {clips[0].rgb.shape[1]} × {clips[0].rgb.shape[2]} pixels")
     steps = [step for clip in clips for step in single_steps(clip)]
     parts = (
@@ -114,6 +124,9 @@ def main() -> None:
             f"{name}: median {made.median:.3f} px; within 1, 2, 4 px: {shares}; followed {made.followed:.1%} of the "
             f"visible; {made.false:.1%} of the followed are hidden in truth; {made.places} places"
         )
+    if store.manifest["depth_range"] is None or store.manifest.get("depth_unit", "metres") != "metres":
+        print("depth colours: not measured, the clips have no depth in metres")
+        return
     near, far = store.manifest["depth_range"]
     for scale in ("inverse", "linear"):
         mean, greatest, relative = color_round_trip(clips, near, far, scale)  # type: ignore[arg-type]
@@ -122,5 +135,14 @@ def main() -> None:
         )
 
 
+def one_line(command: Callable[[], None]) -> None:
+    """Runs a command; an error that the user can cure is one line, with exit status 2."""
+    try:
+        command()
+    except UserError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
 if __name__ == "__main__":
-    main()
+    one_line(main)

@@ -1,6 +1,6 @@
 """A stage's method as one word of a command line: ``lucas-kanade``, ``lucas-kanade:grid=32``, ``none``.
 
-Networks say where their files are: ``bootstapir:checkout=/opt/tapnet,weights=/opt/bootstapir.npy,device=cuda``.
+Networks say where their files are: ``bootstapir:checkout=/opt/tapnet,weights=bootstapir_checkpoint_v2.pt,device=cuda``.
 """
 
 import dataclasses
@@ -9,6 +9,7 @@ import typing
 from pathlib import Path
 from typing import Any, Literal
 
+from rsjax.annotate.depth import RecordedDepth
 from rsjax.annotate.stages import Annotators
 from rsjax.config import ConfigError
 from rsjax.errors import did_you_mean
@@ -41,6 +42,12 @@ def choose_annotators(words: dict[str, str]) -> Annotators:
     if words.get("depth", "").partition(":")[0] == "recorded":
         chosen["depth"] = None  # recorded depth is read where clips are cut
     return Annotators(**chosen)
+
+
+def choose_recorded(word: str) -> RecordedDepth | None:
+    """How depth that the data set has is read beside the depth stage of this word; None where it is not to be read."""
+    chosen = choose("depth", word)
+    return chosen if chosen is None or isinstance(chosen, RecordedDepth) else RecordedDepth()
 
 
 def choose(stage: str, text: str) -> Any:
@@ -82,7 +89,9 @@ def _value(where: str, hint: Any, text: str) -> Any:
         if text not in ("True", "False"):
             raise ConfigError(f"{where} is {text!r}; write True or False")
         return text == "True"
-    if hint not in (int, float, str, Path):
+    if hint is Path:
+        return Path(text).expanduser().absolute()  # workers may run in another directory
+    if hint not in (int, float, str):
         raise ConfigError(f"{where} cannot be set on the command line")
     try:
         return hint(text)

@@ -11,7 +11,7 @@ It reads what the stages before it left, as far as they were run, each record of
 Axes: N recorded frames, n of some part of them, T frames of a clip, P points, N₀ tracks of a clip, S×S a clip's pixels.
 """
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,9 +22,19 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from rsjax.annotate.categories import CategoryConfig
 from rsjax.annotate.depth import FilledDepths
 from rsjax.annotate.protocols import Tracked
+from rsjax.annotate.stored import StoredDepths, StoredTracks
 from rsjax.annotate.tracks import window_tracks
 from rsjax.annotate.units import Inputs, Summary, Work
-from rsjax.annotate.windows import Span, WindowConfig, cut_spans, index_windows, judge, segment_at, tally
+from rsjax.annotate.windows import (
+    Span,
+    WindowConfig,
+    cut_spans,
+    index_windows,
+    judge,
+    segment_at,
+    starts_by_reason,
+    tally,
+)
 from rsjax.config import require, to_dict
 from rsjax.data.actions import ActionConfig, Layout, Statistics, sampled_actions
 from rsjax.data.codec import Record
@@ -40,13 +50,15 @@ class ClipConfig:
     image_size: int = 64  # pixels; pictures of another shape are squeezed into the square
     tracks: int = 256  # N₀
     camera: str = ""  # none: the episode's first
+    recorded_depth: bool = True  # take the depth that the data set has
     most_holes: float = 0.5  # of a recorded depth map; holes are filled from the nearest measured pixel
     actions: ActionConfig = field(default_factory=ActionConfig)
     categories: CategoryConfig = field(default_factory=CategoryConfig)
 
     def __post_init__(self) -> None:
         require(8 <= self.image_size <= 4096, f"clips.image_size is {self.image_size}; choose one from 8 to 4096")
-        require(self.tracks >= 1, f"clips.tracks is {self.tracks}; it must be at least 1")
+        require(1 <= self.tracks <= 65536, f"clips.tracks is {self.tracks}; choose a number from 1 to 65536")
+        require(0 <= self.most_holes <= 1, f"most_holes is {self.most_holes}; it is a share of the pixels, 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -105,8 +117,10 @@ def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Sum
     """The clips of an episode, as records of :class:`rsjax.clip.Clip`; ``depth`` is None where there is none.
 
     Returns:
-        ``windows`` (kept and by reason left out), ``short_spans``, ``actions`` (statistics of the clips' actions),
-        ``action_dim``, ``depth`` (range in metres), ``success`` (clips that end so).
+        ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason),
+        ``short_spans``, ``actions`` (statistics of the clips' actions), ``action_dim``, ``depth`` (its range),
+        ``depth_unit`` ("metres" or "relative"; both None without depth), ``success`` (clips that end so;
+        None where the data set does not say).
 
     Raises:
         EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
@@ -118,11 +132,12 @@ def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Sum
     motion = _per_frame("motion", annotated.motion, episode)
     reasons = judge(index, episode.timestamps, motion, annotated.key_frames, windows)
     views = _Views(annotated, camera, config)
+    stored = None if annotated.tracks is None else StoredTracks(annotated.tracks)
     statistics: Statistics | None = None
     near, far, succeeded = np.inf, 0.0, 0
     for number in [number for number, reason in enumerate(reasons) if not reason]:
         frames = index.frames(number)
-        tracks = _tracks(annotated, frames, config.tracks)
+        tracks = _tracks(stored, frames, config.tracks)
         if tracks is None:
             reasons[number] = "no track"
             continue
@@ -146,11 +161,13 @@ def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Sum
         }
     return {
         "windows": tally(reasons),
+        "left_out": starts_by_reason(index, reasons),
         "short_spans": index.short,
         "actions": statistics.to_json() if statistics else None,
         "action_dim": len(statistics.mean) if statistics else None,
         "depth": [near, far] if far > 0 else None,
-        "success": succeeded,
+        "depth_unit": views.unit if far > 0 else None,
+        "success": succeeded if "success" in episode.meta else None,
     }
 
 
@@ -202,27 +219,24 @@ def _success(episode: Episode, frames: Int[np.ndarray, " T"]) -> Bool[np.ndarray
     return told[frames] if told.ndim else np.full(len(frames), bool(told))
 
 
-def _tracks(annotated: Annotated, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
+def _tracks(stored: StoredTracks | None, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
     """``count`` of the points seen in a window's first frame; None where there are none.
 
     Without a tracks stage they are zeros that are never visible.
     """
-    if annotated.tracks is None:
+    if stored is None:
         return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
-    for number in range(len(annotated.tracks)):
-        record = annotated.tracks[number]
-        places = frames - int(record["first"])
-        if places[0] >= 0 and places[-1] < record["points"].shape[1]:
-            tracked = Tracked(record["points"].astype(np.float32), record["visible"])
-            return window_tracks(tracked, places, count) if tracked.visible[:, places[0]].any() else None
-    return None
+    found = stored.at(frames)
+    if found is None or not found.visible[:, 0].any():
+        return None
+    return window_tracks(found, np.arange(len(frames)), count)
 
 
 class _Views:
     """Pictures and depth at the clips' size, each read once for the overlapping windows that need it, in order.
 
     Attributes:
-        unit: "metres" or "relative" (see :mod:`rsjax.annotate.depth`), of what was read last; "" without depth.
+        unit: "metres" or "relative" (see :mod:`rsjax.annotate.depth`); "" without depth.
     """
 
     def __init__(self, annotated: Annotated, camera: str, config: ClipConfig) -> None:
@@ -231,11 +245,11 @@ class _Views:
         self._rgb: dict[int, np.ndarray] = {}
         self._depth: dict[int, np.ndarray] = {}
         self._maps: Callable[[list[int]], Iterable[np.ndarray]] | None = None
-        if camera in episode.depth:  # what was measured counts before what was estimated
+        if camera in episode.depth and config.recorded_depth:  # what was measured counts before what was estimated
             where = f"episode {episode.id}: depth of {camera}"
             self._maps, self.unit = FilledDepths(episode.depth[camera], config.most_holes, where).read, "metres"
         elif annotated.depth is not None and len(annotated.depth):
-            estimated = _Estimated(annotated.depth, episode.id)
+            estimated = StoredDepths(annotated.depth, episode)
             self._maps, self.unit = estimated.read, estimated.unit
 
     def read(
@@ -257,26 +271,6 @@ class _Views:
         later = {frame: picture for frame, picture in kept.items() if frame >= frames[0]}
         new = read(missing) if missing else ()
         return later | {frame: resized(picture, self._size) for frame, picture in zip(missing, new, strict=True)}
-
-
-class _Estimated:
-    """The depth stage's maps; the record that was read last is kept, as frames come in order."""
-
-    def __init__(self, records: Source, episode: str) -> None:
-        self._records, self._episode = records, episode
-        self._number, self._record = 0, records[0]
-        self.unit = str(self._record["unit"])
-
-    def read(self, frames: list[int]) -> Iterator[Float32[np.ndarray, "H W"]]:
-        for frame in frames:
-            for number in [*range(self._number, len(self._records)), *range(self._number)]:
-                if number != self._number:
-                    self._number, self._record = number, self._records[number]
-                if 0 <= frame - int(self._record["first"]) < len(self._record["depth"]):
-                    break
-            else:
-                raise EpisodeError(f"depth: no map of frame {frame} of episode {self._episode}; annotate it again")
-            yield self._record["depth"][frame - int(self._record["first"])].astype(np.float32)
 
 
 def resized(picture: np.ndarray, size: int) -> np.ndarray:

@@ -6,18 +6,19 @@ colour map over [1, RELATIVE_FAR] then has even steps in what the network said, 
 stretching.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from rsjax.annotate.protocols import CHUNK, ArrayDepths, DepthMaps
 from rsjax.data.episode import Depths, Episode, EpisodeError
 
 RELATIVE_FAR = 10.0
+_NEAR_SHARE = 1 / RELATIVE_FAR  # of the nearest point's 1/depth, at the farthest
 
 
 @dataclass(frozen=True)
@@ -81,45 +82,60 @@ def fill_holes(depth: Float32[np.ndarray, "H W"], holes: np.ndarray) -> Float32[
     return np.where(holes, by_label[nearest], depth)
 
 
-def relative_depth(inverse: Float[np.ndarray, "N H W"]) -> DepthMaps:
+@dataclass(frozen=True)
+class ConvertedDepths:
+    """A network's maps, converted as they are read: the whole video is held once."""
+
+    given: Float32[np.ndarray, "N H W"]
+    convert: Callable[[Float32[np.ndarray, "n H W"]], Float32[np.ndarray, "n H W"]]
+
+    def __len__(self) -> int:
+        return len(self.given)
+
+    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
+        return self.convert(self.given[np.asarray(indices, int)])
+
+
+def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
     """A whole video's 1/depth, up to scale and shift, as :class:`DepthMaps` of unit "relative".
 
     Raises:
         ValueError: a value is not finite.
     """
-    low, high = float(inverse.min()), float(inverse.max())
-    if not np.isfinite([low, high]).all():
-        raise ValueError("1/depth is not finite everywhere")
-    position = (inverse - low) / (high - low) if high > low else np.zeros_like(inverse)
-    near_share = 1 / RELATIVE_FAR
-    return DepthMaps(
-        ArrayDepths((1 / (near_share + (1 - near_share) * position)).astype(np.float32)), "relative", (low, high)
-    )
+    low, high = _extent(ArrayDepths(inverse))
+
+    def stretch(part: Float32[np.ndarray, "n H W"]) -> Float32[np.ndarray, "n H W"]:
+        position = (part - low) / (high - low) if high > low else np.zeros_like(part)
+        return (1 / (_NEAR_SHARE + (1 - _NEAR_SHARE) * position)).astype(np.float32)
+
+    return DepthMaps(ConvertedDepths(inverse, stretch), "relative", (low, high))
 
 
 def inverse_of(maps: DepthMaps, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
     """The 1/depth that :func:`relative_depth` was given."""
     low, high = maps.extent
-    near_share = 1 / RELATIVE_FAR
-    position = (1 / maps.maps.read(indices) - near_share) / (1 - near_share)
+    position = (1 / maps.maps.read(indices) - _NEAR_SHARE) / (1 - _NEAR_SHARE)
     return (low + position * (high - low)).astype(np.float32)
 
 
-def metric_depth(depth: Float[np.ndarray, "N H W"]) -> DepthMaps:
+def metric_depth(depth: Float32[np.ndarray, "N H W"]) -> DepthMaps:
     """A network's depth in metres as :class:`DepthMaps`; less than a millimetre, also behind the camera, becomes one.
 
     Raises:
         ValueError: a value is not finite.
     """
-    if not np.isfinite(depth).all():
-        raise ValueError("depth is not finite everywhere")
-    maps = ArrayDepths(np.maximum(depth, 1e-3).astype(np.float32))
-    return DepthMaps(maps, "metres", _extent(maps))
+    low, high = _extent(ArrayDepths(depth))
+    least = np.float32(1e-3)
+    maps = ConvertedDepths(depth, lambda part: np.maximum(part, least))
+    return DepthMaps(maps, "metres", (max(low, float(least)), max(high, float(least))))
 
 
 def _extent(maps: Depths) -> tuple[float, float]:
-    low, high = np.inf, 0.0
+    """Least and greatest value; :class:`ValueError` where one is not finite."""
+    low, high = np.inf, -np.inf
     for start in range(0, len(maps), CHUNK):
         chunk = maps.read(range(start, min(start + CHUNK, len(maps))))
+        if not np.isfinite(chunk).all():
+            raise ValueError("depth is not finite everywhere")
         low, high = min(low, float(chunk.min())), max(high, float(chunk.max()))
     return low, high

@@ -1,25 +1,23 @@
 """A data set of any format into a store of clips: stages over its episodes, then one pass that packs what they left."""
 
 import hashlib
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rsjax.annotate.clips import words
-from rsjax.annotate.runner import QUARANTINE, SUMMARY, Counts, Executor, count, run, write_tables
-from rsjax.annotate.units import Job, Mark, Unit, mark_path
+from rsjax.annotate.packing import CLIPS, choose_contents, cuts_of, fitting, pack
+from rsjax.annotate.report import QUARANTINE, SUMMARY, Counts, count, write_tables, write_windows
+from rsjax.annotate.runner import Executor, run
+from rsjax.annotate.units import Job, Unit, mark_path
 from rsjax.config import content_key
-from rsjax.data.actions import Statistics
-from rsjax.data.codec import Record
 from rsjax.data.episode import EpisodeRef
-from rsjax.data.guard import open_foreign
-from rsjax.data.store import StoreError, disk_guard, open_store, write_store
+from rsjax.data.lock import lock
+from rsjax.data.store import MANIFEST, StoreError, disk_guard, open_store
 
-CLIPS = "clips"  # the last stage
-Refused = list[tuple[EpisodeRef, str]]
+LOCK = "lock"
 Found = tuple[list[EpisodeRef], list[EpisodeRef]]
+Report = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -38,11 +36,15 @@ class Plan:
     test_share: float
     meta: dict[str, Any]
 
+    def steps(self, refs: Sequence[EpisodeRef]) -> int:
+        """How many units there are, and as many more as episodes are packed."""
+        return len(refs) * (len(self.job.stages) + 1)
+
 
 def ingest(
     plan: Plan,
     start: Callable[[], Executor],
-    report: Callable[[int, int], None],
+    report: Report,
     found: Found | None = None,
     *,
     keep_clips: bool = False,
@@ -52,7 +54,7 @@ def ingest(
 
     Args:
         start: makes the workers, closed here.
-        report: called with (units finished, units in all).
+        report: called with (steps finished, :meth:`Plan.steps`).
         found: what :func:`listed` gave, if that was asked before.
         keep_clips: keep the cut clips beside the store too, which saves time when episodes are added.
         retry: run what was quarantined again.
@@ -61,22 +63,54 @@ def ingest(
         What became of every episode; None where the store is there already, made of the same.
 
     Raises:
-        UserError: the source cannot be listed, nothing can be written, or no episode gave a clip.
+        UserError: the source cannot be listed, nothing can be written, no episode gave a clip, another process is at
+            the same store, or the place holds something else.
     """
     refs, duplicates = found or listed(plan.job)
-    key = store_key(plan, refs)
-    again = retry and forget_failures(plan.job, refs)
-    if not again and _present(plan.out) == key:
+    made = is_made(plan, refs)
+    if made and not retry:
         return None
+    with lock(plan.job.folder / LOCK) as held:
+        if not held:
+            raise StoreError(f"{plan.out}: another process is making it; wait for that one or stop it")
+        if retry and not forget_failures(plan.job, refs) and made:
+            return None
+        return _ingest(plan, start, report, refs, duplicates, keep_clips)
+
+
+def is_made(plan: Plan, refs: Sequence[EpisodeRef]) -> bool:
+    """Whether the store is there already, made of the same episodes in the same way.
+
+    Raises:
+        StoreError: something else is there, which is not to be replaced.
+    """
+    return _present(plan) == store_key(plan, refs)
+
+
+def _ingest(
+    plan: Plan,
+    start: Callable[[], Executor],
+    report: Report,
+    refs: list[EpisodeRef],
+    duplicates: list[EpisodeRef],
+    keep_clips: bool,
+) -> Counts:
+    steps = plan.steps(refs)
     executor = start()
     try:
-        run(plan.job, refs, executor, report)
+        ran = run(plan.job, refs, executor, lambda done, _: report(done, steps))
     finally:
         executor.close()
-    fitting, refused = _fitting(plan.job, refs)
+    cuts, odd = fitting(cuts_of(plan.job, refs))
+    refused = [(cut.ref, why) for cut, why in odd]
     refused += [(ref, f"id: another episode is called {ref.id} too; rename one") for ref in duplicates]
-    counts = count(plan.job, fitting, refused)
+    unfit = {cut.ref.id for cut, _ in odd}
+    counts = count(plan.job, [ref for ref in refs if ref.id not in unfit], refused)
+    contents = choose_contents(cuts, plan.test_share)
+    left_out = sum(cut.records for cut in contents.made() if cut.depth_unit not in (None, contents.depth_unit))
+    counts = replace(counts, depth_left_out=left_out, ran=ran)
     write_tables(plan.job.folder, counts)
+    write_windows(plan.job, refs)
     if not counts.done:
         reasons = [row["error"] for row in counts.quarantined] + list(counts.filtered.values())
         raise StoreError(
@@ -84,18 +118,41 @@ def ingest(
             f"not readable), the first one for: {reasons[0]}; {plan.job.folder} has all of them in {QUARANTINE} and "
             f"{SUMMARY}"
         )
-    pack(plan, fitting, counts, key)
-    if not keep_clips:
-        shutil.rmtree(plan.job.folder / "units" / CLIPS, ignore_errors=True)
+    pack(
+        plan.job,
+        plan.out,
+        contents,
+        counts,
+        plan.meta | {"key": store_key(plan, refs)},
+        lambda packed: report(steps - counts.done + packed, steps),
+    )
+    _clean(plan.job.folder / "units", keep_clips)
     return counts
 
 
-def _present(out: Path) -> str | None:
-    """The content key of the store that is there already, if one is."""
+def _present(plan: Plan) -> str | None:
+    """The content key of the store that is there already, if one is; errors as in :func:`is_made`."""
+    out, name = plan.out, plan.job.source.name
+    if out.exists() and not (out / MANIFEST).exists():
+        raise StoreError(f"{out}: exists and is not a store; move it away or choose another --out")
     try:
-        return open_foreign(out).manifest.get("key")
-    except StoreError:
+        manifest = open_store(out).manifest
+    except StoreError:  # nothing, or something damaged
         return None
+    ours = "counts" in manifest and manifest.get("source") == name  # merging and splitting leave the counts out
+    if not ours or manifest.get("kind") != "clips":
+        what = f"{manifest.get('kind')} of {manifest.get('source', 'another origin')}"
+        raise StoreError(f"{out}: holds {what}, not what this makes of {name}; move it away or choose another --out")
+    return manifest.get("key")
+
+
+def _clean(units: Path, keep_clips: bool) -> None:
+    """Deletes what killed workers left half written, and clips that are packed; marks of failures stay."""
+    for path in units.rglob("*.tmp"):
+        path.unlink(missing_ok=True)
+    for path in () if keep_clips else (units / CLIPS).rglob("*.array_record"):
+        mark_path(path).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
 
 def forget_failures(job: Job, refs: Sequence[EpisodeRef]) -> int:
@@ -129,83 +186,3 @@ def store_key(plan: Plan, refs: Sequence[EpisodeRef]) -> str:
     for ref in refs:
         digest.update(plan.job.keys(ref)[CLIPS].encode())
     return content_key("ingest", digest.hexdigest(), plan.test_share)
-
-
-def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
-    """``train`` and ``test``, in order; chosen by a hash of the ids, at least one each where there are two or more."""
-    ranked = sorted(refs, key=lambda ref: hashlib.sha256(ref.id.encode()).digest())
-    held = min(len(refs) - 1, max(1, round(test_share * len(refs)))) if test_share > 0 else 0
-    test = {ref.id for ref in ranked[:held]}
-    return {"train": [r for r in refs if r.id not in test], "test": [r for r in refs if r.id in test]}
-
-
-def pack(plan: Plan, refs: Sequence[EpisodeRef], counts: Counts, key: str) -> None:
-    """Writes the store out of the clips that the units left.
-
-    Its manifest has the train split's action statistics and depth range (None without depth), the episodes of each
-    split, what was left out and why, and what every clip is called.
-    """
-    job = plan.job
-    made = [ref for ref in refs if _done(job, ref)["records"]] if refs else []
-    splits = split_episodes(made, plan.test_share)
-    marks = [_done(job, ref)["summary"] for ref in splits["train"]]
-    depth_range = _range([mark["depth"] for mark in marks if mark["depth"]])
-    clips = sum(_done(job, ref)["records"] for ref in made)
-    meta = {
-        "key": key,
-        "source": job.source.name,
-        **_statistics(marks),
-        "depth_range": depth_range,
-        "episodes": {split: [ref.id for ref in chosen] for split, chosen in splits.items()},
-        "success_share": sum(_done(job, ref)["summary"]["success"] for ref in made) / clips,
-        "counts": {"found": counts.found, "done": counts.done, "windows": counts.windows},
-        "filtered": counts.filtered,
-        "quarantine": {row["episode"]: f"{row['stage']}: {row['error']}" for row in counts.quarantined},
-    }
-    records = {split: _records(job, chosen, depth_range) for split, chosen in splits.items()}
-    write_store(plan.out, "clips", records, meta | plan.meta, words)
-    open_store(plan.out)
-
-
-def _records(job: Job, refs: Sequence[EpisodeRef], depth_range: list[float] | None) -> Iterator[Record]:
-    """The clips of these episodes, one at a time, with the depth range in their provenance."""
-    for ref in refs:
-        unit = Unit(ref, CLIPS)
-        source = job.records(unit, _done(job, ref))
-        for number in range(len(source)):
-            record = source[number]
-            yield record | {"provenance": record["provenance"] | {"depth_range": depth_range}}
-
-
-def _done(job: Job, ref: EpisodeRef) -> Mark:
-    mark = job.mark(Unit(ref, CLIPS))
-    if mark is None or mark["status"] != "done":
-        return {"records": 0}
-    return mark
-
-
-def _fitting(job: Job, refs: Sequence[EpisodeRef]) -> tuple[list[EpisodeRef], Refused]:
-    """The episodes whose actions are as long as those of the first that has any, and the others."""
-    fitting: list[EpisodeRef] = []
-    refused: Refused = []
-    width: int | None = None
-    for ref in refs:
-        there = _done(job, ref).get("summary", {}).get("action_dim")
-        width = width or there
-        if there in (None, width):
-            fitting.append(ref)
-        else:
-            refused.append((ref, f"actions: {there} dimensions, those of the others have {width}; ingest it alone"))
-    return fitting, refused
-
-
-def _statistics(summaries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    total: Statistics | None = None
-    for summary in summaries:
-        rows = Statistics.from_json(summary["actions"])
-        total = total.merged(rows) if total else rows
-    return total.to_json() if total else {}
-
-
-def _range(ranges: Sequence[list[float]]) -> list[float] | None:
-    return [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.annotate.protocols import FlowEstimator, Motion, in_chunks
+from rsjax.config import require
 from rsjax.data.episode import Frames
 
 WIDTH = 256  # pixels of the picture that motion is told in; wider ones are made smaller before it is measured
@@ -29,6 +30,9 @@ class DISFlow:
     name: ClassVar[str] = "dis"
     version: ClassVar[int] = 1
     preset: int = 1
+
+    def __post_init__(self) -> None:
+        require(self.preset in (0, 1, 2), f"dis: preset is {self.preset}; choose 0, 1 or 2")
 
     def __call__(
         self, before: UInt8[np.ndarray, "T H W 3"], after: UInt8[np.ndarray, "T H W 3"]

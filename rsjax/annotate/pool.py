@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from rsjax.annotate.runner import Outcome, opened
+from rsjax.annotate.runner import Outcome, limit_threads, opened
 from rsjax.annotate.units import Job, Mark, Unit, Work, run_unit
 from rsjax.errors import UserError
 
@@ -34,6 +34,7 @@ class ProcessPool:
     def __init__(self, job: Job, workers: int) -> None:
         self._job = job
         self._context = multiprocessing.get_context("spawn")  # a forked JAX or PyTorch does not work
+        self._threads = max(1, len(os.sched_getaffinity(0)) // workers)
         self._workers = [self._start() for _ in range(workers)]
 
     def pids(self) -> list[int]:
@@ -76,7 +77,7 @@ class ProcessPool:
 
     def _start(self) -> _Worker:
         here, there = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(self._job, there), daemon=False)
+        process = self._context.Process(target=_serve, args=(self._job, there, self._threads), daemon=False)
         process.start()
         there.close()
         return _Worker(process, here)
@@ -95,11 +96,12 @@ class ProcessPool:
         return answer
 
 
-def _serve(job: Job, pipe: Connection) -> None:
+def _serve(job: Job, pipe: Connection, threads: int) -> None:
     """In a worker: units in, marks out, until the pipe is closed; signals are its parent's to answer."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    limit_threads(threads)
     works: dict[str, Work] = {}
     while True:
         try:

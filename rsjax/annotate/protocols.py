@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from rsjax.config import require
 from rsjax.data.episode import Depths, Episode, Frames, fingerprint
 from rsjax.errors import UserError
 
@@ -214,6 +215,13 @@ def in_chunks(
         indices = range(start, min(start + size, len(frames)))
         if indices:
             yield start, frames.read(indices)
+
+
+def require_counts(annotator: Annotator, *names: str) -> None:
+    """Asks of these fields to be at least 1; :class:`rsjax.config.ConfigError` says which one is not."""
+    for name in names:
+        value = getattr(annotator, name)
+        require(value >= 1, f"{annotator.name}: {name} is {value}; it must be at least 1")
 
 
 def prepare(annotator: Annotator) -> None:

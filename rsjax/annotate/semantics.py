@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.annotate.protocols import Semantic, Semantics
+from rsjax.annotate.protocols import Semantic, Semantics, require_counts
 from rsjax.data.actions import Layout
 from rsjax.data.episode import Episode, Segment
 
@@ -29,6 +29,9 @@ class OwnSemantics:
     version: ClassVar[int] = 1
     least_grip: float = 0.1
     smooth: int = 5
+
+    def __post_init__(self) -> None:
+        require_counts(self, "smooth")
 
     def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
         changes = gripper_changes(episode, self.least_grip)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.annotate.protocols import in_chunks
+from rsjax.annotate.protocols import in_chunks, require_counts
 from rsjax.data.episode import Frames
 
 _BINS = (16, 4, 4)  # hue, saturation, value
@@ -34,6 +34,9 @@ class HistogramShots:
     prominence: float = 2.0
     around: int = 3
     shortest: int = 8
+
+    def __post_init__(self) -> None:
+        require_counts(self, "around", "shortest")
 
     def __call__(self, frames: Frames) -> list[tuple[int, int]]:
         changes = histogram_changes(frames)

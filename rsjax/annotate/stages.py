@@ -4,15 +4,15 @@ Shots are found first; tracks are followed within each. Pictures are read in par
 length of an episode.
 """
 
-import json
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from rsjax.annotate.clips import ClipConfig, ClipStage
+from rsjax.annotate.depth import FilledDepths
 from rsjax.annotate.motion import DISFlow, measure_motion
 from rsjax.annotate.protocols import (
     CHUNK,
@@ -23,9 +23,11 @@ from rsjax.annotate.protocols import (
     ShotDetector,
     Tracker,
     parameters,
+    prepare,
 )
 from rsjax.annotate.semantics import OwnSemantics
 from rsjax.annotate.shots import HistogramShots
+from rsjax.annotate.stored import StoredDepths
 from rsjax.annotate.tracks import LucasKanade
 from rsjax.annotate.units import Inputs, Stage, Summary, Work
 from rsjax.data.codec import Record
@@ -65,10 +67,10 @@ class AnnotatorStage:
     version: int = 1
 
     def params(self) -> dict[str, Any]:
-        # A network may have another method among its fields.
-        return json.loads(json.dumps({"camera": self.camera} | parameters(self.annotator), default=asdict))
+        return {"camera": self.camera} | parameters(self.annotator)
 
     def open(self) -> Work:
+        prepare(self.annotator)
         return self._work
 
     def _work(self, episode: Episode, inputs: Inputs) -> Records:
@@ -78,23 +80,30 @@ class AnnotatorStage:
         return (yield from self.write(self.annotator, episode, camera, inputs))
 
 
-def make_stages(annotators: Annotators, config: ClipConfig, gpus: float = 0.0) -> tuple[Stage, ...]:
+def make_stages(annotators: Annotators, config: ClipConfig, cpus: float = 1.0, gpus: float = 0.0) -> tuple[Stage, ...]:
     """The stages of a job, in order, the last of which makes the clips.
 
     Args:
         annotators: what is run.
         config: of the clips.
-        gpus: of a worker of those stages that have a network, for a Ray cluster; fractions share a GPU.
+        cpus: of a worker of each stage, for a Ray cluster; fractions share a core.
+        gpus: likewise, of a worker of those stages that have a network.
     """
-    after = {"tracks": ("shots",), "semantics": ("motion",)}
+    after: dict[str, tuple[str, ...]] = {"tracks": ("shots",), "semantics": ("motion",)}
+    if _is_network(annotators.tracks):  # some look at depth
+        after["tracks"] = ("shots", "depth")
     stages: list[AnnotatorStage] = []
     for name, write in _WRITERS.items():
         annotator = getattr(annotators, name)
         if annotator is not None:
             needs = tuple(need for need in after.get(name, ()) if getattr(annotators, need) is not None)
-            stages.append(AnnotatorStage(name, annotator, write, config.camera, needs))
-    heavy = [replace(s, gpus=gpus) if hasattr(s.annotator, "device") else s for s in stages]
-    return (*heavy, ClipStage(config, tuple(stage.name for stage in heavy)))
+            share = gpus if _is_network(annotator) else 0.0
+            stages.append(AnnotatorStage(name, annotator, write, config.camera, needs, cpus, share))
+    return (*stages, ClipStage(config, tuple(stage.name for stage in stages), cpus=cpus))
+
+
+def _is_network(annotator: Annotator | None) -> bool:
+    return hasattr(annotator, "device")
 
 
 @dataclass(frozen=True)
@@ -139,11 +148,15 @@ def _depth(estimate: DepthEstimator, episode: Episode, camera: str, inputs: Inpu
 
 def _tracks(track: Tracker, episode: Episode, camera: str, inputs: Inputs) -> Records:
     frames: Frames = episode.cameras[camera]
-    depth: Depths | None = episode.depth.get(camera)
+    depth: Depths | None = None
+    if camera in episode.depth:
+        depth = FilledDepths(episode.depth[camera], 1.0, f"episode {episode.id}: depth of {camera}")
+    elif "depth" in inputs and len(inputs["depth"]):
+        depth = StoredDepths(inputs["depth"], episode)
     spans = inputs["shots"][0]["spans"].tolist() if "shots" in inputs else [(0, len(frames))]
     points = 0
     for first, end in spans:
-        tracked = track(Part(frames, first, end), depth and Part(depth, first, end))
+        tracked = track(Part(frames, first, end), None if depth is None else Part(depth, first, end))
         points += len(tracked.points)
         yield {"first": int(first), "points": tracked.points.astype(np.float16), "visible": tracked.visible}
     return {"points": points}

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from rsjax.annotate.protocols import Tracked
+from rsjax.annotate.protocols import Tracked, require_counts
+from rsjax.config import require
 from rsjax.data.episode import Depths, Frames
 
 Followed = tuple[Float32[np.ndarray, "P T 2"], Bool[np.ndarray, "P T"]]
@@ -59,6 +60,11 @@ class LucasKanade:
     tolerance: float = 0.5
     likeness: float = 0.8
     still: float = 8.0
+
+    def __post_init__(self) -> None:
+        require_counts(self, "grid", "span")
+        require(self.window >= 3, f"lucas-kanade: window is {self.window}; it must be at least 3")
+        require(self.levels >= 0, f"lucas-kanade: levels is {self.levels}; it must be at least 0")
 
     def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
         return track_in_spans(frames, self.follow, self.grid, self.span)

@@ -23,8 +23,8 @@ from rsjax.config import content_key
 from rsjax.data.codec import Record, encode
 from rsjax.data.episode import Episode, EpisodeRef, EpisodeSource, safe_id
 from rsjax.data.store import WRITER_OPTIONS, Source, disk_guard, write_atomically
-from rsjax.errors import Preempted
 
+RECENT = 256  # episodes whose keys are kept
 Summary = dict[str, Any]  # what a stage says of its output, JSON-ready, without the output being read
 # status, stage, episode, key, seconds, cpu_seconds; done: records, bytes, summary; failed: error, traceback
 Mark = dict[str, Any]
@@ -98,12 +98,23 @@ class Job:
 
     def keys(self, ref: EpisodeRef) -> dict[str, str]:
         """The key of each of an episode's units."""
+        known = self._recent.get((ref.id, ref.fingerprint))
+        if known is not None:
+            return known
         what = (ref.id, ref.fingerprint, self.source.name, self.reading)
         keys: dict[str, str] = {}
         for stage in self.stages:
             needed = tuple(keys[name] for name in stage.needs)
             keys[stage.name] = content_key(*what, stage.name, stage.version, self._params[stage.name], needed)
+        if len(self._recent) >= RECENT:
+            self._recent.clear()
+        self._recent[ref.id, ref.fingerprint] = keys
         return keys
+
+    @cached_property
+    def _recent(self) -> dict[tuple[str, str], dict[str, str]]:
+        """Keys by id and fingerprint: each is asked for several times while its episode is under way."""
+        return {}
 
     @cached_property
     def _params(self) -> dict[str, str]:
@@ -195,8 +206,6 @@ def _working(job: Job, unit: Unit, work: Work) -> Generator[Record, None, Summar
                 raise FileNotFoundError(f"{job.output(earlier)}: the output of {name} is gone; run again")
             inputs[name] = job.records(earlier, mark)
         return (yield from work(job.source.read(unit.ref), inputs))
-    except Preempted:
-        raise
     except Exception as error:
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             raise

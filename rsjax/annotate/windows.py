@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from rsjax.config import require
 from rsjax.data.episode import EpisodeError, Segment
 
+MAX_STEP = 2**20  # recorded frames from one frame of a window to the next
 Span = tuple[int, int]  # first frame, and the one after the last
 
 
@@ -37,7 +38,7 @@ class WindowConfig:
     most_gap: float = 1.5  # of the time between two frames of a window, relative to 1 / rate; a recording may stop
 
     def __post_init__(self) -> None:
-        require(self.frames >= 2, f"windows.frames is {self.frames}; a clip needs at least 2 frames")
+        require(2 <= self.frames <= 4096, f"windows.frames is {self.frames}; a clip has 2 to 4096 frames")
         require(self.rate >= 0, f"windows.rate is {self.rate}; it must be positive, or 0 for the recorded rate")
         require(self.hop >= 1, f"windows.hop is {self.hop}; it must be at least 1")
         require(
@@ -78,9 +79,11 @@ def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
     """The recorded frames nearest to even steps of ``1 / rate`` seconds, from 0 on, increasing.
 
     Raises:
-        EpisodeError: it was recorded at a lower rate than asked for.
+        EpisodeError: it was recorded at a lower rate than asked for, or at one that no camera has.
     """
     step = fps / config.rate if config.rate else 1.0
+    if not step < MAX_STEP:
+        raise EpisodeError(f"fps: recorded at {fps:g} fps, which no camera does; mend the file's rate or times")
     if step < 1 - 1e-6:
         raise EpisodeError(f"fps: recorded at {fps:g} fps, windows take {config.rate:g}; lower windows.rate")
     return np.floor(np.arange(config.frames) * step + 0.5 + 1e-9).astype(np.int64)
@@ -181,6 +184,15 @@ def tally(reasons: Sequence[str]) -> dict[str, int]:
     """How many windows each reason leaves out; ``kept`` is the rest. The numbers add up to all windows."""
     counts = Counter(reasons)
     return {"kept": counts.pop("", 0), **dict(sorted(counts.items()))}
+
+
+def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, list[int]]:
+    """The first frames of the windows that each reason leaves out."""
+    found: dict[str, list[int]] = {}
+    for start, reason in zip(index.starts.tolist(), reasons, strict=True):
+        if reason:
+            found.setdefault(reason, []).append(start)
+    return found
 
 
 def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:

@@ -15,7 +15,7 @@ from rsjax.config import Config
 from rsjax.data.curriculum import plan
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
-from rsjax.pipeline.transforms import token_batch, token_clip
+from rsjax.pipeline.transforms import token_batch
 from rsjax.train.objectives import WorldModelObjective
 from rsjax.train.placement import Placement
 from rsjax.train.state import create_state
@@ -39,7 +39,7 @@ def feed(config: Config, budget: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": (inputs.record(config, rng) for _ in range(CLIPS))}, {})
-        loop, make = plan(loop, open_store(path), lambda store: token_clip, Path(folder))
+        loop, make = plan(loop, open_store(path), lambda store: inputs.transform(config), Path(folder))
         placement = Placement.create(loop)
         step = placement.compile(objective, loop)
         state = jax.jit(partial(create_state, objective, loop))()

@@ -3,6 +3,7 @@
 Axes: B clips, T frames, H×W token cells, A action dimensions, N₀ tracks.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,21 +12,23 @@ import numpy as np
 
 from rsjax.clip import Batch
 from rsjax.config import Config, ModelConfig
+from rsjax.data.order import Transform
 from rsjax.data.store import Record
+from rsjax.data.units import Units
 from rsjax.model.world_model import WorldModel, branches
-from rsjax.pipeline.transforms import token_batch
+from rsjax.pipeline.transforms import token_batch, token_clip
 
 
 def record(config: Config, rng: np.random.Generator) -> Record:
     """A token record as stage 3 writes it, with random contents."""
-    frames, grid = config.sim.frames, config.model.grid
+    frames, grid = config.clips.frames, config.model.grid
     tokens = rng.integers(0, 2**config.model.code_bits, (2, frames, grid, grid), np.int32)
     return {
         "rgb": tokens[0],
         "depth": tokens[1],
-        "actions": rng.normal(size=(frames, config.model.action_dim)).astype(np.float32),
-        "tracks": rng.random((config.sim.tracks, frames, 2), np.float32),
-        "visible": rng.random((config.sim.tracks, frames)) < 0.9,
+        "actions": rng.normal(size=(frames, config.clips.action_dim)).astype(np.float32),
+        "tracks": rng.random((config.clips.tracks, frames, 2), np.float32),
+        "visible": rng.random((config.clips.tracks, frames)) < 0.9,
         "task": "",
         "provenance": {},
     }
@@ -34,9 +37,14 @@ def record(config: Config, rng: np.random.Generator) -> Record:
 def batch(config: Config, size: int) -> Batch:
     """A batch of ``size`` clips, on the device."""
     rng = np.random.default_rng(0)
-    records = [record(config, rng) for _ in range(size)]
-    arrays = {name: np.stack([r[name] for r in records]) for name in ("rgb", "depth", "actions", "tracks", "visible")}
-    return jax.device_put(token_batch(arrays))
+    rows = [transform(config)(record(config, rng), rng) for _ in range(size)]
+    return jax.device_put(token_batch({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
+
+
+def transform(config: Config) -> Transform:
+    """From token records to arrays, as training has it, with units that change nothing."""
+    width = config.clips.action_dim
+    return partial(token_clip, Units((0.0,) * width, (1.0,) * width, (0.1, 1.0)), config.model.integrate_actions)
 
 
 def prompt(model: ModelConfig, size: int, frames: int) -> dict[str, Any]:

@@ -19,10 +19,11 @@ from rsjax.bench.timing import median_seconds
 from rsjax.config import Config
 from rsjax.data import loader
 from rsjax.data.store import open_store, write_store
+from rsjax.data.units import Units
 from rsjax.model.flops import train_flops
 from rsjax.model.world_model import branches
-from rsjax.pipeline.transforms import token_batch, token_clip
-from rsjax.sample.generator import Codec, Units
+from rsjax.pipeline.transforms import token_batch
+from rsjax.sample.generator import Codec
 from rsjax.sample.rollout import rollout
 from rsjax.tokenizer.magvit2 import Tokenizer
 from rsjax.train.objectives import WorldModelObjective
@@ -72,7 +73,7 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
         return state, metrics
 
     seconds = median_seconds(run, budget)
-    frames, cells = config.sim.frames, config.model.grid**2
+    frames, cells = config.clips.frames, config.model.grid**2
     flops = train_flops(config.model, frames, batch)
     return {
         "train_step_s": seconds,
@@ -114,7 +115,7 @@ def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
     units = Units((0.0,), (1.0,), (0.1, 1.0))  # of depth and actions, which are not coded here
     codec = Codec(config, params, units)
     size, rng = config.tokenizer.image_size, np.random.default_rng(0)
-    images = rng.integers(0, 256, (batch * config.sim.frames, size, size, 3), np.uint8)
+    images = rng.integers(0, 256, (batch * config.clips.frames, size, size, 3), np.uint8)
     tokens = codec.encode_rgb(images)
     return {
         "tokenizer_encode_frames_per_s": len(images) / median_seconds(lambda: codec.encode_rgb(images), budget),
@@ -131,6 +132,6 @@ def load(config: Config, batch: int, budget: float) -> Numbers:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": records}, {})
         source = open_store(path).source("train")
-        with loader.batches(source, token_clip, batch, config.train.seed) as clips:
+        with loader.batches(source, inputs.transform(config), batch, config.train.seed) as clips:
             seconds = median_seconds(lambda: [token_batch(next(clips)) for _ in range(LOADER_BATCHES)], budget)
     return {"loader_clips_per_s": batch * LOADER_BATCHES / seconds}

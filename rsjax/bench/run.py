@@ -114,7 +114,7 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
         "blocks": config.model.blocks,
         "width": config.model.width,
         "branches": 2 if config.model.depth else 1,
-        "frames": config.sim.frames,
+        "frames": config.clips.frames,
         "dtype": config.model.compute_dtype,
         "remat": config.model.remat,
         "device": _cpu_model() if device.platform == "cpu" else device.device_kind,

@@ -45,7 +45,7 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     def draw(frames: int) -> torch.Tensor:
         return torch.randint(0, 2**config.model.code_bits, (batch, frames, config.model.grid**2), device=device)
 
-    tokens = draw(config.sim.frames)
+    tokens = draw(config.clips.frames)
     mask = torch.rand(tokens.shape, device=device) < 0.5
     window = draw(min(horizon, config.model.frames))
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None

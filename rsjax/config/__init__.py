@@ -7,6 +7,7 @@ A field made with :func:`runtime` changes how fast or how talkatively a run goes
 it is left out of content keys, so changing it never invalidates finished work.
 """
 
+from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import ConfigError, content_key, from_dict, require, runtime, to_dict
 from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
 from rsjax.config.run import Config, EvalConfig, SampleConfig
@@ -15,8 +16,10 @@ from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig, PartConfig, StageConfig
 
 __all__ = [
+    "ClipShape",
     "Config",
     "ConfigError",
+    "DataConfig",
     "EvalConfig",
     "LoopConfig",
     "LossConfig",

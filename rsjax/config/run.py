@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import require
 from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
 from rsjax.config.sim import SimConfig
@@ -50,13 +51,14 @@ class SampleConfig:
 class EvalConfig:
     """Evaluation on held-out clips."""
 
-    clips: int = 20
+    clips: int = 20  # spread evenly over the test split
+    loss_clips: int = 1000  # of the test split, likewise, over which the loss is taken while training
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind, for ΔPSNR
     report_clips: int = 4  # clips shown in the report
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "action_draws", "report_clips"):
+        for name in ("loss_clips", "batch_size", "action_draws", "report_clips"):
             require(getattr(self, name) > 0, f"eval.{name} is {getattr(self, name)}; it must be positive")
 
 
@@ -65,7 +67,8 @@ class Config:
     """One run. Built from a preset; never changed while it runs."""
 
     name: str
-    sim: SimConfig = SimConfig()
+    sim: SimConfig = SimConfig()  # not looked at where data names a store
+    data: DataConfig = DataConfig()
     tokenizer: TokenizerConfig = TokenizerConfig()
     tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
     model: ModelConfig = ModelConfig()
@@ -76,24 +79,26 @@ class Config:
     eval: EvalConfig = EvalConfig()
 
     def __post_init__(self) -> None:
+        clips, at = self.clips, "data" if self.data.key else "sim"
         require(
-            self.sim.frames <= self.model.frames,
-            f"sim.frames is {self.sim.frames} but model.frames holds positions for {self.model.frames}; "
+            clips.frames <= self.model.frames,
+            f"{at}.frames is {clips.frames} but model.frames holds positions for {self.model.frames}; "
             f"shorten the clips or enlarge model.frames",
         )
         require(
-            self.mask.prompt_frames < self.sim.frames,
-            f"mask.prompt_frames is {self.mask.prompt_frames} of {self.sim.frames} frames; "
+            self.mask.prompt_frames < clips.frames,
+            f"mask.prompt_frames is {self.mask.prompt_frames} of {clips.frames} frames; "
             f"at least one frame must be left to predict",
         )
+        test_clips = "data.test_clips" if self.data.key else "sim.test_episodes"
         require(
-            min(self.eval.clips, self.sim.test_episodes) >= 2,
-            f"eval.clips is {self.eval.clips} of sim.test_episodes {self.sim.test_episodes}; both must be at least 2, "
+            min(self.eval.clips, clips.test_clips) >= 2,
+            f"eval.clips is {self.eval.clips} of {test_clips} {clips.test_clips}; both must be at least 2, "
             f"so that a clip can be generated under another one's actions",
         )
         self.sample.check(self.model)
         pairs = [
-            ("sim.image_size", self.sim.image_size, "tokenizer.image_size", self.tokenizer.image_size),
+            (f"{at}.image_size", clips.image_size, "tokenizer.image_size", self.tokenizer.image_size),
             ("tokenizer grid", self.tokenizer.grid, "model.grid", self.model.grid),
             ("tokenizer.code_bits", self.tokenizer.code_bits, "model.code_bits", self.model.code_bits),
             ("tokenizer.vocabularies", self.tokenizer.vocabularies, "model.vocabularies", self.model.vocabularies),
@@ -105,8 +110,8 @@ class Config:
         for left, left_value, right, right_value in pairs:
             require(left_value == right_value, f"{left} is {left_value} but {right} is {right_value}; make them equal")
         require(
-            not self.loss.keypoints or self.loss.num_keypoints <= self.sim.tracks,
-            f"loss.num_keypoints is {self.loss.num_keypoints} but only sim.tracks = {self.sim.tracks} are tracked",
+            not self.loss.keypoints or self.loss.num_keypoints <= clips.tracks,
+            f"loss.num_keypoints is {self.loss.num_keypoints} but only {at}.tracks = {clips.tracks} are tracked",
         )
 
     def with_loops(self, **changes: Any) -> "Config":
@@ -115,6 +120,11 @@ class Config:
         return replace(self, train=replace(self.train, **changes), tokenizer_train=tokenizer_train)
 
     @property
+    def clips(self) -> ClipShape:
+        """What the clips are like that the run learns from."""
+        return self.data.clips if self.data.key else self.sim.clips
+
+    @property
     def action_inputs(self) -> int:
-        """Width of what the action encoder sees: 7 × control_steps, and as much again for their sums if given."""
-        return self.sim.action_dim * (2 if self.model.integrate_actions else 1)
+        """Width of what the action encoder sees: that of a frame's action, and as much again for sums if given."""
+        return self.clips.action_dim * (2 if self.model.integrate_actions else 1)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from rsjax.config.data import ClipShape
 from rsjax.config.fields import require, runtime
 
 
@@ -33,3 +34,8 @@ class SimConfig:
     def action_dim(self) -> int:
         """Width of one frame's action: ``control_steps`` controls of 7 (6-D pose delta, gripper)."""
         return 7 * self.control_steps
+
+    @property
+    def clips(self) -> ClipShape:
+        """What its clips are like; an episode is one."""
+        return ClipShape(self.frames, self.image_size, self.tracks, self.action_dim, self.test_episodes)

@@ -61,9 +61,8 @@ class StageConfig:
 
     parts: tuple[PartConfig, ...] = (PartConfig(),)
     epochs: float = 1.0  # as many clips are drawn as the parts have, this many times
-    restart: bool = (
-        False  # the learning rate's schedule starts again here, and ends where the next restart or the run does
-    )
+    # The learning rate's schedule starts again here, and ends where the next restart or the run does.
+    restart: bool = False
 
     def __post_init__(self) -> None:
         require(self.epochs > 0, f"a curriculum's stage has {self.epochs} epochs; it must have more than 0")

@@ -167,9 +167,9 @@ class Statistics:
 
 
 def _check(layout: Layout, width: int) -> None:
-    dims = [*layout.held, *(first + 3 for first in layout.quaternions)]
-    if dims and max(dims) >= width:
-        raise EpisodeError(f"meta.actions names dimension {max(dims)}, but actions have {width}; mend the source")
+    dims = [*layout.held, *layout.quaternions, *(first + 3 for first in layout.quaternions)]
+    for wrong in (dim for dim in dims if not 0 <= dim < width):
+        raise EpisodeError(f"meta.actions names dimension {wrong}, but actions have {width}; mend the source")
 
 
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
@@ -191,7 +191,8 @@ def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np
     before = np.concatenate([rows[:1], rows[:-1]])
     for first in layout.quaternions:
         part = slice(first, first + 4)
-        steps[:, part] = _product(_inverse(_unit(before[:, part])), _unit(rows[:, part]))
+        turns = _product(_inverse(_unit(before[:, part])), _unit(rows[:, part]))
+        steps[:, part] = np.where(turns[:, 3:] < 0, -turns, turns)  # the shorter way round
     for held in layout.held:
         steps[:, held] = rows[:, held]
     return steps

@@ -17,7 +17,7 @@ def encode(record: Record) -> bytes:
         if isinstance(value, np.ndarray)
     }
     values = {name: value for name, value in record.items() if name not in arrays}
-    body = msgpack.packb((arrays, values))
+    body = msgpack.packb((arrays, values), unicode_errors="surrogatepass")
     return zlib.crc32(body).to_bytes(4, "little") + body
 
 
@@ -29,7 +29,7 @@ def decode(payload: bytes) -> Record:
     """
     if len(payload) < 4 or zlib.crc32(payload[4:]) != int.from_bytes(payload[:4], "little"):
         raise ValueError("its checksum is wrong")
-    arrays, values = msgpack.unpackb(payload[4:], strict_map_key=False)
+    arrays, values = msgpack.unpackb(payload[4:], strict_map_key=False, unicode_errors="surrogatepass")
     return values | {
         name: np.frombuffer(raw, np.dtype(dtype)).reshape(shape).copy() for name, (dtype, shape, raw) in arrays.items()
     }

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from rsjax.data.episode import EpisodeError, EpisodeRef, EpisodeSource, SourceError
+from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError
 from rsjax.data.formats import FORMATS, open_source
 from rsjax.data.store import MANIFEST
 from rsjax.data.symptoms import KINDS, Finding, Thresholds, Vitals, look_at
@@ -25,7 +25,7 @@ from rsjax.errors import did_you_mean
 FEWEST = 5  # episodes from which on there is something usual
 _CHUNK = 8  # episodes that a process is given at a time
 
-Look = tuple[EpisodeRef, list[Finding], Vitals | None]
+Look = tuple[EpisodeRef, list[Finding], Vitals | None, str]
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,25 @@ class Report:
     Attributes:
         refs: every episode's id and fingerprint, in order.
         findings: in the order of the episodes.
+        mended: of episodes in which the reader put something right: (id, what).
     """
 
     refs: tuple[tuple[str, str], ...]
     findings: tuple[Finding, ...]
+    mended: tuple[tuple[str, str], ...] = ()
 
     def counts(self) -> dict[str, int]:
         """How many episodes have each kind of finding, in the order of :data:`KINDS`."""
-        affected = Counter(kind for _, kind in {(finding.episode, finding.kind) for finding in self.findings})
+        episodes = Counter(name for name, _ in self.refs)  # several may have one id
+        affected: Counter[str] = Counter()
+        for name, kind in {(finding.episode, finding.kind) for finding in self.findings}:
+            affected[kind] += episodes[name]
         return {kind: affected[kind] for kind in KINDS if affected[kind]}
+
+    def bad(self) -> int:
+        """How many episodes have a finding."""
+        affected = {finding.episode for finding in self.findings}
+        return sum(name in affected for name, _ in self.refs)
 
     def reasons(self) -> dict[str, list[str]]:
         """What is wrong with each episode that has something wrong, by its id."""
@@ -101,13 +111,16 @@ def examine(
     findings: list[Finding] = []
     vitals: dict[str, Vitals] = {}
     known: set[str] = set()
-    for ref, told, seen in _looks(source, limits, workers):
+    mended: list[tuple[str, str]] = []
+    for ref, told, seen, notes in _looks(source, limits, workers):
         if ref.id in known:
             findings.append(Finding(ref.id, "duplicate", "another episode has the same id"))
         known.add(ref.id)
         findings += told
         if seen is not None:
-            vitals[ref.id] = seen
+            vitals.setdefault(ref.id, seen)
+        if notes:
+            mended.append((ref.id, notes))
         refs.append((ref.id, ref.fingerprint))
         report(len(refs))
     if not refs:
@@ -115,7 +128,7 @@ def examine(
     findings += compare(vitals, limits.unusual)
     place = {ref: number for number, (ref, _) in enumerate(refs)}
     findings = [finding for finding in findings if finding.kind not in ignored]
-    return Report(tuple(refs), tuple(sorted(findings, key=lambda finding: place[finding.episode])))
+    return Report(tuple(refs), tuple(sorted(findings, key=lambda finding: place[finding.episode])), tuple(mended))
 
 
 def _looks(source: EpisodeSource, limits: Thresholds, workers: int) -> Iterator[Look]:
@@ -138,11 +151,25 @@ def _looks(source: EpisodeSource, limits: Thresholds, workers: int) -> Iterator[
 
 def _look(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Look:
     try:
-        return ref, *look_at(source.read(ref), limits)
+        episode = source.read(ref)
+        return ref, *look_at(episode, limits), _mended(episode)
     except EpisodeError as error:
-        return ref, [Finding(ref.id, "unreadable", str(error))], None
+        return ref, [Finding(ref.id, error.kind, _line(error))], None, ""
     except Exception as error:  # a surprise about one episode must not hide what is wrong with the others
-        return ref, [Finding(ref.id, "unreadable", f"{type(error).__name__}: {error}")], None
+        return ref, [Finding(ref.id, "unreadable", f"{type(error).__name__}: {_line(error)}")], None, ""
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _mended(episode: Episode) -> str:
+    """What the episode's reader noted that it put right."""
+    told = []
+    for name, value in episode.meta.get("notes", {}).items():
+        parts = [f"{key} {number}" for key, number in value.items()] if isinstance(value, dict) else value
+        told.append(f"{name.replace('_', ' ')}: {', '.join(map(str, parts)) if isinstance(parts, list) else parts}")
+    return "; ".join(told)
 
 
 def compare(vitals: dict[str, Vitals], unusual: float) -> Iterator[Finding]:

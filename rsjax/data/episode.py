@@ -28,7 +28,15 @@ class SourceError(UserError):
 
 
 class EpisodeError(UserError):
-    """One episode cannot be read: the message names the file, the field and the cure. A run quarantines it."""
+    """One episode cannot be read: the message names the file, the field and the cure. A run quarantines it.
+
+    Attributes:
+        kind: of :data:`rsjax.data.symptoms.KINDS`, as far as it is known what is wrong.
+    """
+
+    def __init__(self, message: str, kind: str = "unreadable") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 @dataclass(frozen=True)
@@ -156,31 +164,38 @@ def checked(episode: Episode, where: Path | str) -> Episode:
     """
     count = len(episode.timestamps)
     if count == 0:
-        raise EpisodeError(f"{where}: episode {episode.id} has no frames; leave it out")
+        raise EpisodeError(f"{where}: episode {episode.id} has no frames; leave it out", "length")
     if not episode.cameras:
-        raise EpisodeError(f"{where}: episode {episode.id} has no camera; leave it out or add its pictures")
+        raise EpisodeError(f"{where}: episode {episode.id} has no camera; leave it out or add its pictures", "camera")
     arrays = {"actions": episode.actions} | ({} if episode.states is None else {"states": episode.states})
     lengths = {name: len(array) for name, array in arrays.items()}
     lengths |= {f"camera {name}": len(frames) for name, frames in episode.cameras.items()}
     lengths |= {f"depth {name}": len(maps) for name, maps in episode.depth.items()}
     for name, length in lengths.items():
         if length != count:
-            raise EpisodeError(f"{where}: {name} has {length} rows, timestamps {count}; mend it or leave it out")
+            raise EpisodeError(f"{where}: {name} has {length} rows, timestamps {count}; mend or leave it out", "length")
     for name, array in ({"timestamps": episode.timestamps} | arrays).items():
         if not np.isfinite(array).all():
             row = int(np.flatnonzero(~np.isfinite(array.reshape(count, -1)).all(1))[0])
-            raise EpisodeError(f"{where}: {name} of frame {row} is not finite; mend the value or leave the episode out")
+            told = f"{where}: {name} of frame {row} is not finite; mend the value or leave the episode out"
+            raise EpisodeError(told, "not-finite")
     if (back := np.flatnonzero(np.diff(episode.timestamps) <= 0)).size:
-        raise EpisodeError(f"{where}: timestamps do not increase at frame {back[0] + 1}; mend them or leave it out")
+        told = f"{where}: timestamps do not increase at frame {back[0] + 1}; mend them or leave it out"
+        raise EpisodeError(told, "time")
     if not np.isfinite(episode.fps) or episode.fps <= 0:
-        raise EpisodeError(f"{where}: fps is {episode.fps}; it must be positive")
+        raise EpisodeError(f"{where}: fps is {episode.fps}; it must be positive", "time")
     return episode
 
 
 def safe_id(text: str) -> str:
     """A file name for any text: itself where it is one, otherwise what can be kept of it and a hash."""
     kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip(".-")[:100]
-    return kept if kept and kept == text else f"{kept or 'episode'}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    return kept if kept and kept == text else f"{kept or 'episode'}-{hashlib.sha256(_bytes(text)).hexdigest()[:8]}"
+
+
+def _bytes(text: str) -> bytes:
+    """UTF-8; of a file's name also the bytes that are none."""
+    return text.encode("utf-8", "surrogatepass")
 
 
 def fingerprint(paths: Sequence[Path], *more: object) -> str:
@@ -205,7 +220,7 @@ def _stamp(path: Path) -> tuple[Path, int, int]:
 @lru_cache(maxsize=1024)  # one file may hold hundreds of episodes
 def _file_digest(path: Path, size: int, modified: int) -> bytes:
     large = size > _WHOLE
-    digest = hashlib.sha256(f"{path.name} {size} {modified if large else ''}".encode())
+    digest = hashlib.sha256(_bytes(f"{path.name} {size} {modified if large else ''}"))
     try:
         with path.open("rb") as file:
             digest.update(file.read(_EDGE if large else _WHOLE))

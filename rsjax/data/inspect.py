@@ -1,4 +1,4 @@
-"""What is in a store: counts, shapes, histograms, a sheet of pictures, and the Rerun viewer.
+"""What is in a store: counts, shapes, histograms, and a sheet of pictures.
 
 Axes: T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
@@ -6,7 +6,6 @@ Axes: T frames, H×W pixels, A action dimensions, N₀ tracks.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +14,6 @@ from jaxtyping import UInt8
 from rsjax.data.codec import Record
 from rsjax.data.merge import NONE, shapes
 from rsjax.data.store import Store, StoreError
-from rsjax.errors import UserError
 from rsjax.tokenizer.depth_color import depth_to_color
 
 BARS = " ▁▂▃▄▅▆▇█"
@@ -59,7 +57,7 @@ def look(store: Store, most: int = 200) -> Contents:
     sums = np.zeros(2)  # values and their number
     low, high, width = np.inf, -np.inf, 0
     looked = 0
-    for record in _sample(store, most, damaged):
+    for record in sampled(store, most, damaged):
         looked += 1
         lengths[len(record["actions"])] += 1
         motion.append(motion_of(record))
@@ -121,7 +119,7 @@ def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96
         StoreError: the store has no readable clip with pictures.
     """
     rows, damaged = [], list[str]()
-    for record in _sample(store, clips, damaged):
+    for record in sampled(store, clips, damaged):
         if record["rgb"].ndim != 4:
             raise StoreError(f"{store.path}: holds tokens, not pictures; inspect the store of clips that they are of")
         times = np.linspace(0, len(record["rgb"]) - 1, frames).round().astype(int)
@@ -136,34 +134,7 @@ def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96
     return np.concatenate(rows)
 
 
-def rerun_view(store: Store, clips: int = 4) -> None:
-    """Opens some clips in the Rerun viewer: RGB, depth in metres, tracks and actions over frames.
-
-    Raises:
-        UserError: the extra is not installed.
-    """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise UserError("--rerun needs the viewer: pip install 'rsjax[rerun]'") from error
-    rr.init("rsjax", spawn=True)
-    for number, record in enumerate(_sample(store, clips, [])):
-        for frame in range(len(record["rgb"])):
-            rr.set_time("frame", sequence=frame)
-            _log_frame(rr, f"clip_{number:03d}", record, frame)
-
-
-def _log_frame(rr: Any, name: str, record: Record, frame: int) -> None:
-    rgb = record["rgb"][frame]
-    rr.log(f"{name}/camera", rr.Image(rgb))
-    if record.get("depth") is not None:
-        rr.log(f"{name}/depth", rr.DepthImage(record["depth"][frame], meter=1.0))
-    seen = record["visible"][:, frame]
-    rr.log(f"{name}/camera/tracks", rr.Points2D(record["tracks"][seen, frame] * (rgb.shape[1], rgb.shape[0])))
-    rr.log(f"{name}/actions", rr.Scalars(record["actions"][frame]))
-
-
-def _sample(store: Store, most: int, damaged: list[str]) -> Iterator[Record]:
+def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[Record]:
     """Records spread evenly over all splits; what cannot be read is added to ``damaged``."""
     sources = [store.source(name) for name in store.splits]
     ends = np.cumsum([len(source) for source in sources])

@@ -12,11 +12,12 @@ from rsjax.config import content_key
 from rsjax.data.actions import Statistics
 from rsjax.data.codec import Record
 from rsjax.data.episode import safe_id
-from rsjax.data.guard import open_foreign
 from rsjax.data.labels import Labels
-from rsjax.data.store import MANIFEST, Store, StoreError, write_store
+from rsjax.data.store import MANIFEST, Store, StoreError, open_store, write_store
+from rsjax.data.token_sets import FOLDER, token_sets, tokens_key
 
 UNITS = ("action_mean", "action_std", "depth_range")  # what a store's numbers are told in
+LEFT_OUT = ("filtered", "quarantine")  # by episode, why
 OF_ALL = ("format", "splits", "key", "counts", "episodes", "success_share")  # of a manifest: not true of a part
 Words = dict[str, str]
 Chosen = Callable[[str, int, Words], bool]
@@ -26,36 +27,64 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
     """One store of all records of several, split by split, in the order given.
 
     Units that differ are made those of all train records together; records say their depth range, so that is set anew.
+    Tokens that lie beside all of the clips come along, unless depth ranges differ, on which depth tokens depend.
 
     Raises:
-        StoreError: fewer than two, one twice, stores of other kinds or shapes, tokens in other units or of another
-            tokenizer, or ``out`` cannot be written or is one of them.
+        StoreError: fewer than two, one twice, stores of other kinds or shapes, tokens of another tokenizer or depth
+            range, or ``out`` cannot be written or is one of them.
     """
-    stores = [open_foreign(path) for path in paths]
+    stores = [open_store(path) for path in paths]
     _check_mergeable(stores, out)
+    key = content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores))
+    merged = _write_merged(stores, out, key)
+    if all(_depth_range(store) == _depth_range(merged) for store in stores):
+        sets = [token_sets(store) for store in stores]
+        for tokenizer in set.intersection(*(set(one) for one in sets)):
+            _write_merged([one[tokenizer] for one in sets], out / FOLDER / tokenizer, tokens_key(key, tokenizer))
+    return merged
+
+
+def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
+    """What the stores left out; an episode of the same name in two of them is told with its store."""
+    told: dict[str, str] = {}
+    for store in stores:
+        for episode, why in store.manifest.get(name, {}).items():
+            told[f"{episode} ({store.path})" if episode in told else episode] = why
+    return told
+
+
+def _depth_range(store: Store) -> Any:
+    return store.manifest.get("depth_range")
+
+
+def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
     first = stores[0].manifest
-    units = _units(stores)
     meta = {name: value for name, value in first.items() if name not in OF_ALL}
-    meta |= units | {
-        "key": content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores)),
-        "merged": [{"path": str(store.path), "key": store.manifest.get("key")} for store in stores],
-        "quarantine": {k: v for store in stores for k, v in store.manifest.get("quarantine", {}).items()},
-    }
-    if all("success_share" in store.manifest for store in stores):
+    meta |= (
+        _units(stores)
+        | {
+            "key": key,
+            "merged": [{"path": str(store.path), "key": store.manifest.get("key")} for store in stores],
+        }
+        | {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
+    )
+    if all(store.manifest.get("success_share") is not None for store in stores):
         meta["success_share"] = _weighted(stores, "success_share")
-    stamp = units["depth_range"]
-    restamp = first["kind"] == "clips" and any(store.manifest.get("depth_range") != stamp for store in stores)
+    stamp = meta["depth_range"]
+    restamp = first["kind"] == "clips" and any(_depth_range(store) != stamp for store in stores)
     writer = _Copy(labels=all(_labelled(store, split) for store in stores for split in store.splits))
     splits = {}
     for split in dict.fromkeys(split for store in stores for split in store.splits):
         parts = [(store, split, None) for store in stores if split in store.splits]
         splits[split] = writer.records(parts, stamp if restamp else _KEEP)
     write_store(out, first["kind"], splits, meta, writer.label if writer.labels else None)
-    return open_foreign(out)
+    return open_store(out)
 
 
 def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
     """Stores of chosen records of one, which keep its units: what was learnt on the whole can read the parts.
+
+    Tokens that lie beside the clips are split with them.
 
     Args:
         outs: for each new store, whether it takes a record: of (split, number there, words of its labels).
@@ -63,17 +92,24 @@ def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
     Raises:
         StoreError: nothing is chosen for one of them, or it cannot be written.
     """
-    store = open_foreign(path)
-    meta = {name: value for name, value in store.manifest.items() if name not in (*OF_ALL, "action_count")}
+    store = open_store(path)
+    sets = token_sets(store)
     for out, chosen in outs.items():
         numbers = {name: _chosen(store, name, chosen) for name in store.splits}
         if not any(numbers.values()):
             raise StoreError(f"{out}: no record of {path} is chosen for it; choose otherwise")
         key = content_key("split", store.manifest.get("key") or str(path), *(f"{n}{v}" for n, v in numbers.items()))
-        writer = _Copy(labels=all(_labelled(store, name) for name in store.splits))
-        splits = {name: writer.records([(store, name, numbers[name])], _KEEP) for name in store.splits}
-        write_store(out, store.manifest["kind"], splits, meta | {"key": key}, writer.label if writer.labels else None)
-    return {out: open_foreign(out) for out in outs}
+        _write_part(store, numbers, out, key)
+        for tokenizer, tokens in sets.items():
+            _write_part(tokens, numbers, out / FOLDER / tokenizer, tokens_key(key, tokenizer))
+    return {out: open_store(out) for out in outs}
+
+
+def _write_part(store: Store, numbers: Mapping[str, list[int]], out: Path, key: str) -> None:
+    meta = {name: value for name, value in store.manifest.items() if name not in (*OF_ALL, "action_count")}
+    writer = _Copy(labels=all(_labelled(store, name) for name in store.splits))
+    splits = {name: writer.records([(store, name, numbers[name])], _KEEP) for name in store.splits}
+    write_store(out, store.manifest["kind"], splits, meta | {"key": key}, writer.label if writer.labels else None)
 
 
 def by_label(path: Path, column: str, folder: Path) -> dict[Path, Chosen]:
@@ -82,7 +118,7 @@ def by_label(path: Path, column: str, folder: Path) -> dict[Path, Chosen]:
     Raises:
         StoreError: the store has no such labels.
     """
-    store = open_foreign(path)
+    store = open_store(path)
     found: dict[str, None] = {}
     for name in store.splits:
         if len(store.source(name)):
@@ -160,21 +196,31 @@ def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
     one = stores[0]
     tokens = one.manifest.get("kind") == "tokens"
     columns = _columns(one)
+    told = {store.manifest["depth_unit"]: store.path for store in stores if store.manifest.get("depth_unit")}
+    if len(told) > 1:
+        units = "; ".join(f"{unit} in {path}" for unit, path in told.items())
+        raise StoreError(f"depth_unit: {units}; such depth does not mix: ingest one of them with --depth none")
     for other in stores[1:]:
-        for name in ("kind", "tokenizer", *(UNITS if tokens else ())):
+        for name in ("kind", "tokenizer", *(("depth_range",) if tokens else ())):
             if other.manifest.get(name) != one.manifest.get(name):
                 raise StoreError(
                     f"{other.path}: its {name} is {other.manifest.get(name)}, that of {one.path} is "
                     f"{one.manifest.get(name)}; such stores can be mixed in training (docs/training.md), not merged"
                 )
-        if (there := shapes(other)) != (here := shapes(one)):
-            differing = next(name for name in here | there if here.get(name) != there.get(name))
+        there, here = shapes(other), shapes(one)
+        differing = next((name for name in here | there if _differ(here.get(name), there.get(name))), None)
+        if differing:
             raise StoreError(
                 f"{other.path}: {differing} is {there.get(differing)}, in {one.path} {here.get(differing)}; make both "
                 f"with the same settings"
             )
         if columns is not None and _columns(other) not in (None, columns):
             raise StoreError(f"{other.path}: its labels are {_columns(other)}, those of {one.path} {columns}")
+
+
+def _differ(here: str | None, there: str | None) -> bool:
+    """Whether two shapes of one array cannot be in one store. Depth may be missing from any clip."""
+    return here != there and NONE not in (here, there)
 
 
 def _columns(store: Store) -> list[str] | None:
@@ -210,7 +256,8 @@ def _units(stores: Sequence[Store]) -> dict[str, Any]:
     assert total is not None
     ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
     merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
-    return total.to_json() | {"depth_range": merged}
+    unit = next((manifest["depth_unit"] for manifest in manifests if manifest.get("depth_unit")), None)
+    return total.to_json() | {"depth_range": merged, "depth_unit": unit}
 
 
 def _measured(store: Store) -> Statistics:

@@ -10,6 +10,7 @@ from jaxtyping import Float32, UInt8
 from rsjax.data.episode import MAX_PIXELS, EpisodeError
 
 _CURE = "fetch the file again or leave the episode out"
+_NO_FRAME = (0xC4, 0xC8, 0xCC)  # JPEG markers between those of frame headers: tables
 
 
 class PictureFiles:
@@ -56,23 +57,26 @@ class DepthFiles:
 
 
 def decode_picture(payload: bytes, where: Path | str) -> UInt8[np.ndarray, "H W 3"]:
-    """An encoded picture (PNG, JPEG …) as RGB, turned as its EXIF data says.
+    """An encoded picture (PNG or JPEG) as RGB, turned as its EXIF data says.
 
     Args:
         where: what a message names.
 
     Raises:
-        EpisodeError: it is damaged, or its sides are impossible.
+        EpisodeError: it is damaged, neither PNG nor JPEG, or its sides are impossible.
     """
     return _decode(payload, cv2.IMREAD_COLOR, where)[..., ::-1].copy()
 
 
 def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
-    sides = _png_sides(payload)
-    if sides is not None and not 0 < sides[0] * sides[1] <= MAX_PIXELS:
+    sides = _sides(payload)
+    if sides is None:
+        told = f"{where}: not a readable picture ({len(payload)} bytes): neither a whole PNG nor a JPEG; {_CURE}"
+        raise EpisodeError(told, "undecodable")
+    if not 0 < sides[0] * sides[1] <= MAX_PIXELS:
         raise EpisodeError(f"{where}: its header says {sides[0]} × {sides[1]} pixels; {_CURE}")
     try:
-        picture = cv2.imdecode(np.frombuffer(payload, np.uint8), flags) if payload else None
+        picture = cv2.imdecode(np.frombuffer(payload, np.uint8), flags)
     except cv2.error as error:
         raise EpisodeError(f"{where}: not a readable picture ({error.err}); {_CURE}") from error
     if picture is None:
@@ -80,11 +84,41 @@ def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
     return picture
 
 
+def _sides(payload: bytes) -> tuple[int, int] | None:
+    """Width and height of a PNG or JPEG, before memory is taken for it: a few bytes can name a picture of gigabytes."""
+    if payload.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png_sides(payload)
+    return _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
+
+
 def _png_sides(payload: bytes) -> tuple[int, int] | None:
-    """Width and height of a PNG; a few bytes can name a picture of gigabytes."""
-    if not payload.startswith(b"\x89PNG\r\n\x1a\n") or len(payload) < 24:
-        return None
-    return int.from_bytes(payload[16:20], "big"), int.from_bytes(payload[20:24], "big")
+    """None where a chunk is longer than the file: OpenCV takes as much memory as a chunk says that it is long."""
+    place = 8
+    while place + 12 <= len(payload):
+        end = place + 12 + int.from_bytes(payload[place : place + 4], "big")
+        if end > len(payload):
+            return None
+        if payload[place + 4 : place + 8] == b"IEND":
+            return int.from_bytes(payload[16:20], "big"), int.from_bytes(payload[20:24], "big")
+        place = end
+    return None
+
+
+def _jpeg_sides(payload: bytes) -> tuple[int, int] | None:
+    """Those of the largest frame header: a second one would be decoded in place of the first."""
+    most: tuple[int, int] | None = None
+    place = payload.find(b"\xff", 2)
+    while 0 <= place < len(payload) - 9:
+        marker = payload[place + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
+            height, width = (int.from_bytes(payload[place + at : place + at + 2], "big") for at in (5, 7))
+            most = max(most or (0, 0), (width, height), key=lambda sides: sides[0] * sides[1])
+        if marker == 0xDA:
+            break
+        has_length = marker not in (0x00, 0x01, 0xFF) and not 0xD0 <= marker <= 0xD8
+        step = 2 + int.from_bytes(payload[place + 2 : place + 4], "big") if has_length else 1
+        place = payload.find(b"\xff", place + step)
+    return most
 
 
 def _bytes(path: Path) -> bytes:

@@ -72,21 +72,29 @@ def select(source: EpisodeSource, path: Path) -> Selected:
     """The source without what the list at ``path`` leaves out.
 
     Raises:
-        SourceError: the list cannot be read, or is about other episodes.
+        SourceError: the list cannot be read, or is about other episodes or about these with other options.
     """
     try:
         content = json.loads(path.read_text())
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']}, this code reads format {FORMAT}")
-        listed = {str(entry["id"]) for entry in [*content["kept"], *content["left_out"]]}
+        listed = {(str(entry["id"]), str(entry["fingerprint"])) for entry in [*content["kept"], *content["left_out"]]}
         reasons = {
             (str(entry["id"]), str(entry["fingerprint"])): "; ".join(map(str, entry["reasons"]))
             for entry in content["left_out"]
         }
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SourceError(
             f"{path}: not a manifest of experiments.doctor ({error}); make it again with --fix"
         ) from error
-    if not any(ref.id in listed for ref in source.episodes()):
-        raise SourceError(f"{path}: names no episode of this data set; give the manifest that was made for it")
-    return Selected(source, reasons, source.name)
+    names, known = {name for name, _ in listed}, False
+    for ref in source.episodes():
+        known = known or ref.id in names
+        if (ref.id, ref.fingerprint) in listed:
+            return Selected(source, reasons, source.name)
+    if known:
+        raise SourceError(
+            f"{path}: the data set was read with other options then, or all its files have changed; run "
+            f"experiments.doctor --fix again, with the same --option"
+        )
+    raise SourceError(f"{path}: names no episode of this data set; give the manifest that was made for it")

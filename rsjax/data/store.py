@@ -19,6 +19,7 @@ from array_record.python.array_record_module import ArrayRecordWriter
 
 from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
+from rsjax.data.guard import ManifestError, check_manifest
 from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.errors import UserError
 
@@ -148,28 +149,36 @@ class Store:
 
 
 def open_store(path: Path | str) -> Store:
-    """Open a store and check that its files are all there and whole.
+    """Open a store, which may be somebody else's, and check that its files are all there and whole.
 
     Raises:
-        StoreError: if the manifest or a shard is missing, truncated or of another format.
+        StoreError: the manifest or a shard is missing, truncated, of another format or cannot be reached (permissions,
+            a loop of links), or the manifest names a file outside the store or an impossible size.
     """
     path = Path(path)
-    cure = f"delete {path} and make it again"
+    place, cure = path / MANIFEST, f"delete {path} and make it again"
     try:
-        manifest = json.loads((path / MANIFEST).read_text())
+        manifest = json.loads(place.read_text())
+        check_manifest(manifest, FORMAT)
     except FileNotFoundError as error:
-        raise StoreError(f"{path / MANIFEST}: missing, so {path} is not a (whole) store; {cure}") from error
-    except ValueError as error:
-        raise StoreError(f"{path / MANIFEST}: not JSON ({error}); {cure}") from error
-    if manifest.get("format") != FORMAT:
-        raise StoreError(f"{path / MANIFEST}: format {manifest.get('format')}, this code reads format {FORMAT}; {cure}")
+        raise StoreError(f"{place}: missing, so {path} is not a (whole) store; {cure}") from error
+    except OSError as error:
+        raise StoreError(f"{place}: cannot be read ({error.strerror}); mend the link or permission") from error
+    except ManifestError as error:
+        raise StoreError(f"{place}: {error}; {cure}") from error
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{place}: not JSON ({error}); {cure}") from error
     for entry in manifest["splits"].values():
         for file in entry["files"] + ([entry["labels"]] if "labels" in entry else []):
             shard = path / file["name"]
-            if not shard.exists():
-                raise StoreError(f"{shard}: missing; {cure}")
-            if shard.stat().st_size != file["bytes"]:
-                raise StoreError(f"{shard}: {shard.stat().st_size} bytes, should be {file['bytes']}; {cure}")
+            try:
+                size = shard.stat().st_size
+            except FileNotFoundError as error:
+                raise StoreError(f"{shard}: missing; {cure}") from error
+            except OSError as error:
+                raise StoreError(f"{shard}: cannot be read ({error.strerror}); mend the link or permission") from error
+            if size != file["bytes"]:
+                raise StoreError(f"{shard}: {size} bytes, should be {file['bytes']}; {cure}")
     return Store(path, manifest)
 
 

@@ -15,9 +15,9 @@ from rsjax.data.actions import Layout
 from rsjax.data.episode import Depths, Episode, EpisodeError, Frames
 
 KINDS = {
-    "unreadable": "the reader refuses the episode",
+    "unreadable": "the reader refuses the episode for another reason",
     "camera": "pictures are missing that other episodes have, or are blank, or never change",
-    "undecodable": "a picture or depth map cannot be decoded",
+    "undecodable": "a video, picture or depth map is missing or cannot be decoded",
     "length": "actions, states or pictures are not as many as the timestamps",
     "not-finite": "values are NaN or infinite",
     "time": "time stands still, jumps, or does not go with fps",
@@ -173,11 +173,12 @@ def _actions(episode: Episode) -> Iterator[tuple[str, str]]:
 
 
 def _flips(episode: Episode) -> Iterator[tuple[str, str]]:
-    arrays = [("actions", 1, episode.actions[1:])]
+    held = Layout.from_json(episode.meta.get("actions", {})).held
+    arrays = [("actions", 1, episode.actions[1:], held)]
     if episode.states is not None:
-        arrays.append(("states", 0, episode.states))
-    for name, offset, rows in arrays:
-        for first in quaternions(rows):
+        arrays.append(("states", 0, episode.states, ()))
+    for name, offset, rows, others in arrays:
+        for first in (first for first in quaternions(rows) if not {*range(first, first + 4)} & {*others}):
             part = rows[:, first : first + 4]
             if (flips := np.flatnonzero((part[1:] * part[:-1]).sum(1) < 0)).size:
                 where = f"frame {flips[0] + 1 + offset} ({len(flips)} such)"
@@ -185,11 +186,15 @@ def _flips(episode: Episode) -> Iterator[tuple[str, str]]:
 
 
 def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
-    """Where four columns in a row are a unit quaternion in every row, as far as one can see."""
+    """Where four columns in a row are a unit quaternion in every row, as far as one can see.
+
+    A gripper's 1 or -1 after a turn of three zeros is none, though it is as long.
+    """
     found: list[int] = []
     for first in range(rows.shape[1] - 3 if len(rows) else 0):
-        free = not found or first >= found[-1] + 4
-        if free and (np.abs(np.linalg.norm(rows[:, first : first + 4], axis=1) - 1) < _UNIT).all():
+        free, part = not found or first >= found[-1] + 4, rows[:, first : first + 4]
+        turns = (np.abs(part).max(1) < 1 - _UNIT).any()
+        if free and turns and (np.abs(np.linalg.norm(part, axis=1) - 1) < _UNIT).all():
             found.append(first)
     return found
 
@@ -219,7 +224,7 @@ def _pictures(
             blank += [number for number, one_colour in zip(numbers, flat, strict=True) if one_colour]
             changes = changes or bool((pictures != first).any())
     except EpisodeError as error:
-        return [("undecodable", f"{name}: {error}")], first
+        return [("undecodable", f"{name}: {' '.join(str(error).split())}")], first
     if blank:
         return [
             ("camera", f"{name}: frame {blank[0]} is of one colour ({len(blank)} of {len(chosen)} looked at)")

@@ -24,6 +24,8 @@ from rsjax.data.episode import MAX_PIXELS, EpisodeError
 
 OPEN_FILES = 8  # decoders that one process keeps; each holds a few decoded pictures
 _CURE = "fetch the file again or leave the episode out"
+# A playlist that calls itself .mp4 would otherwise make FFmpeg open the files that it names.
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,12 @@ class VideoFrames:
             raise IndexError(f"{self.path}: frames {chosen.min()} … {chosen.max()} of {len(self)}")
         wanted, places = np.unique(chosen if self._numbers is None else self._numbers[chosen], return_inverse=True)
         with _opened(self.path) as decoder:
-            pictures = np.stack([decoder.picture(int(number)) for number in wanted])
-        return pictures[places]
+            pictures = [decoder.picture(int(number)) for number in wanted]
+        for number, picture in zip(wanted, pictures, strict=True):
+            if picture.shape != pictures[0].shape:
+                sizes = f"{picture.shape[1]} × {picture.shape[0]}, frame {wanted[0]} {pictures[0].shape[1::-1]}"
+                raise EpisodeError(f"{self.path}: frame {number}: pictures of several sizes ({sizes}); {_CURE}")
+        return np.stack(pictures)[places]
 
 
 def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> VideoFrames:
@@ -96,14 +102,17 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
     before = np.maximum(after - 1, 0)
     numbers = np.where(np.abs(times[before] - seconds) <= np.abs(times[after] - seconds), before, after)
     away = np.abs(times[numbers] - seconds)
-    if (far := np.flatnonzero(away > tolerance)).size:
+    if (far := np.flatnonzero(~(away <= tolerance))).size:
         first = far[0]
         raise EpisodeError(
             f"{path}: no frame at {seconds[first]:.4f} s, row {first} of the table: the nearest is {away[first]:.2g} s "
-            f"away, {tolerance:g} s are allowed; {_CURE}"
+            f"away, {tolerance:.2g} s are allowed; {_CURE}",
+            "time",
         )
     if (twice := np.flatnonzero(np.diff(numbers) <= 0)).size:
-        raise EpisodeError(f"{path}: rows {twice[0]} and {twice[0] + 1} of the table show the same frame; {_CURE}")
+        raise EpisodeError(
+            f"{path}: rows {twice[0]} and {twice[0] + 1} of the table show the same frame; {_CURE}", "time"
+        )
     return VideoFrames(path, numbers.astype(np.int64))
 
 
@@ -146,17 +155,17 @@ def _scan(path: Path) -> VideoIndex:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
         if not 0 < height * width <= MAX_PIXELS:
-            raise EpisodeError(f"{path}: its header says pictures of {width} × {height}; {_CURE}")
-        promised = stream.frames
-        try:
-            shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
-        except av.FFmpegError as error:
-            raise _unreadable(path, error) from error
-        time_base = stream.time_base
+            raise EpisodeError(f"{path}: its header says pictures of {width} × {height}; {_CURE}", "undecodable")
+        promised, time_base = stream.frames, stream.time_base
+        shown = _packets(path, container)
     if not shown or time_base is None:
-        raise EpisodeError(f"{path}: holds no pictures; {_CURE}")
+        raise EpisodeError(f"{path}: holds no pictures; {_CURE}", "undecodable")
     if len(shown) < promised:
-        raise EpisodeError(f"{path}: truncated: {len(shown)} of the {promised} frames that its header names; {_CURE}")
+        with _container(path, ignore_editlist="1") as container:  # an edit list may hide frames that are there
+            there = len(_packets(path, container))
+        if there < promised:
+            told = f"{path}: truncated: {there} of the {promised} frames that its header names; {_CURE}"
+            raise EpisodeError(told, "undecodable")
     if any(stamp is None for stamp, _ in shown):
         raise EpisodeError(f"{path}: has frames without a time, so they cannot be found; rewrite it as MP4")
     shown.sort()
@@ -166,24 +175,37 @@ def _scan(path: Path) -> VideoIndex:
     return VideoIndex(stamps, np.array([key for _, key in shown]), time_base, height, width)
 
 
-def _container(path: Path) -> Any:
+def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
+    """Time, and whether decoding can begin there, of each packet that becomes a picture which is shown."""
+    try:
+        packets = container.demux(container.streams.video[0])
+        return [(packet.pts, packet.is_keyframe) for packet in packets if packet.size and not packet.is_discard]
+    except av.FFmpegError as error:
+        raise _unreadable(path, error) from error
+
+
+def _container(path: Path, **options: str) -> Any:
     """Opens a file; for one that names itself like a protocol of FFmpeg's, still only that file."""
     try:
         with path.open("rb"):
-            container = av.open(f"file:{path}", metadata_errors="replace")
+            container = av.open(
+                f"file:{path}",
+                metadata_errors="replace",
+                options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"} | options,
+            )
     except (OSError, av.FFmpegError) as error:
         raise _unreadable(path, error) from error
     if not container.streams.video or container.streams.video[0].codec_context is None:
         container.close()
-        raise EpisodeError(f"{path}: has no video stream that can be decoded; {_CURE}")
+        raise EpisodeError(f"{path}: has no video stream that can be decoded; {_CURE}", "undecodable")
     return container
 
 
 def _unreadable(path: Path, error: Exception) -> EpisodeError:
     if isinstance(error, OSError) and error.errno == errno.ENOENT:
-        return EpisodeError(f"{path}: missing; {_CURE}")
+        return EpisodeError(f"{path}: missing; {_CURE}", "undecodable")
     reason = getattr(error, "strerror", None) or str(error)
-    return EpisodeError(f"{path}: not a readable video ({reason}); {_CURE}")
+    return EpisodeError(f"{path}: not a readable video ({reason}); {_CURE}", "undecodable")
 
 
 @contextlib.contextmanager
@@ -217,7 +239,10 @@ class _Decoder:
         self._container = _container(path)
         self._stream = self._container.streams.video[0]
         self._stream.codec_context.thread_count = 1  # many processes decode at once, one a core
-        self._stream.codec_context.options = {"err_detect": "explode"}  # H.264 would paint over damage and say nothing
+        self._stream.codec_context.options = {
+            "err_detect": "explode",  # H.264 would paint over damage and say nothing
+            "max_pixels": str(MAX_PIXELS),  # pictures may be of another size than the header says
+        }
         self._starts = np.flatnonzero(index.keys)
         self._frames: Iterator[Any] = iter(())
         self._next = len(index.stamps)  # number of the frame that comes next; at the end, so the first read seeks

@@ -57,6 +57,7 @@ class WorldModel(nn.Module):
         start: Any = 0,
         cache: Cache | None = None,
         drop_actions: Bool[Array, " B"] | None = None,
+        no_depth: Bool[Array, " B"] | None = None,
     ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
         """Logits of every cell of frames start … start + T - 1, by branch.
 
@@ -68,6 +69,8 @@ class WorldModel(nn.Module):
                 where positions are learned.
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
             drop_actions: True for clips that see the null action instead of theirs; needs ``config.action_dropout``.
+            no_depth: True for clips without depth: to the depth branch all their cells are hidden, in every frame. Not
+                read by a model without that branch.
 
         Returns:
             float32 logits by branch, and the cache with these frames written in (None where none was given).
@@ -88,9 +91,12 @@ class WorldModel(nn.Module):
         position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
         position = position if rotary else jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
         shared = position + self._action(actions, drop_actions) if cfg.action_dim else position
+        hidden = dict.fromkeys(branches(cfg), cells(mask))
+        if cfg.depth and no_depth is not None:
+            hidden["depth"] = hidden["depth"] | no_depth[:, None, None]  # not in place: the mask is the caller's
         x = {
-            branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), cells(mask)) + shared
-            for branch in branches(cfg)
+            branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), unseen) + shared
+            for branch, unseen in hidden.items()
         }
         blocks = nn.scan(
             _rematerialised(cfg),

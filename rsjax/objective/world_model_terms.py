@@ -15,19 +15,24 @@ def world_model_terms(
 ) -> dict[str, losses.Term]:
     """Masks the batch, runs the model, and returns each term's (weighted sum, weight).
 
+    Clips without depth have no part in the depth term, which is (0, 0) where none has it, and all their depth is hidden
+    from the model.
+
     Args:
         key: the step's key; the same on all devices.
     """
     clean = {branch: getattr(batch, branch) for branch in branches(model)}
     given = masking.corrupt(mask, model.code_bits, model.vocabularies, key, clean, batch.index)
     drop = masking.dropped_actions(model.action_dropout, key, batch.index) if model.action_dropout else None
+    no_depth = None if batch.has_depth is None else batch.has_depth == 0
     inputs = (given.tokens, given.mask, batch.actions)
-    logits, _ = WorldModel(model).apply({"params": params}, *inputs, drop_actions=drop)
+    logits, _ = WorldModel(model).apply({"params": params}, *inputs, drop_actions=drop, no_depth=no_depth)
     entropy = {b: losses.token_cross_entropy(logits[b], clean[b], model.code_bits) for b in clean}
 
     terms = {"rgb": losses.rgb_term(entropy["rgb"], given.mask, batch.weight)}
     if model.depth:
-        terms["depth"] = losses.depth_term(entropy["depth"], given.mask, batch.weight)
+        counts = batch.weight if batch.has_depth is None else batch.weight * batch.has_depth
+        terms["depth"] = losses.depth_term(entropy["depth"], given.mask, counts)
     if loss.keypoints:
         points = kp.select(batch.tracks, batch.visible, loss.num_keypoints, model.grid)
         attention = kp.attention_map(points, model.grid, loss.gamma)

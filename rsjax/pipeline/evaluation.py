@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Float32, Num, UInt8
 
 from rsjax.data.store import Store, StoreError, decode, encode, write_atomically
 from rsjax.metrics import control, pixels
 from rsjax.metrics.depth import depth_scores, result_key
 from rsjax.metrics.statistics import bootstrap, over_predicted_frames
+from rsjax.pipeline.clips import Clips, spread
 from rsjax.progress import Progress
 from rsjax.sample.generator import Generated, Generator, Tokens
+
+RANGE_CLIPS = 1000  # of the train split, out of whose actions the range of uniform random ones is taken
 
 
 @dataclass(frozen=True)
@@ -28,33 +31,26 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out clips, stacked: fields of :class:`rsjax.clip.Clip` with a leading axis, and what tokens keep of them."""
+    """Held-out clips, their tokens, and what those keep of them."""
 
-    rgb: np.ndarray
-    depth: np.ndarray
-    actions: np.ndarray
-    tracks: np.ndarray
-    visible: np.ndarray
-    success: np.ndarray
+    clips: Clips
     tokens: Tokens
-    reconstruction: np.ndarray
-    depth_reconstruction: np.ndarray
+    reconstruction: UInt8[np.ndarray, "B T H W 3"]
+    depth_reconstruction: Float32[np.ndarray, "D T H W"]  # of the clips that have depth
 
     @classmethod
-    def load(cls, generator: Generator, clips: Store) -> "HeldOut":
-        """The first ``eval.clips`` of the test split."""
-        source = clips.source("test")
-        records = [source[i] for i in range(min(generator.config.eval.clips, len(source)))]
-        names = ("rgb", "depth", "actions", "tracks", "visible", "success")
-        fields = {name: np.stack([record[name] for record in records]) for name in names}
-        codec = generator.codec
-        tokens = {"rgb": codec.encode_rgb(fields["rgb"]), "depth": codec.encode_depth(fields["depth"])}
-        return cls(
-            **fields,
-            tokens=tokens,
-            reconstruction=codec.decode_rgb(tokens["rgb"]),
-            depth_reconstruction=codec.decode_depth(tokens["depth"]),
-        )
+    def load(cls, generator: Generator, store: Store) -> "HeldOut":
+        """``eval.clips`` of the test split.
+
+        Raises:
+            StoreError: one of them is damaged.
+        """
+        source, codec = store.source("test"), generator.codec
+        numbers = spread(source, generator.config.eval.clips)
+        clips = Clips.stacked([source[number] for number in numbers], numbers)
+        tokens = clips.tokens(codec)
+        depth = codec.decode_depth(tokens["depth"][clips.has_depth]) if "depth" in tokens else clips.depth[:0]
+        return cls(clips, tokens, codec.decode_rgb(tokens["rgb"]), depth)
 
     def prompt(self, frames: int) -> Tokens:
         """The first frames' tokens."""
@@ -69,27 +65,29 @@ def evaluate(generator: Generator, clips: Store) -> Evaluation:
             uniform random actions.
     """
     held = HeldOut.load(generator, clips)
-    given = generator.config.mask.prompt_frames
-    plans = _plans(generator, held.actions, clips)
+    given, truth = generator.config.mask.prompt_frames, held.clips.rgb
+    plans = _plans(generator, held.clips.actions, clips)
     results: dict[str, list[Generated]] = {}
     rollouts = sum(len(draws) for draws in plans.values())
-    with Progress("evaluation", rollouts * len(held.rgb), "rollouts") as progress:
+    with Progress("evaluation", rollouts * len(truth), "rollouts") as progress:
         done = 0
         for kind, draws in plans.items():
             for actions in draws:
                 results.setdefault(kind, []).append(_generate(generator, held, actions, depth=kind == "own"))
-                progress.update(done := done + len(held.rgb))
+                progress.update(done := done + len(truth))
     own = results["own"][0]
 
     metrics = _pixel_metrics(held, own.rgb, given)
     for kind, suffix in (("other", ""), ("uniform", "_uniform")):
-        delta = np.stack([control.delta_psnr(held.rgb, own.rgb, drawn.rgb) for drawn in results[kind]])
+        delta = np.stack([control.delta_psnr(truth, own.rgb, drawn.rgb) for drawn in results[kind]])
         for name, per_clip in control.clip_means(delta, given).items():
             metrics |= bootstrap(per_clip).flat(f"delta_psnr{suffix}" + ("" if name == "mean" else f"_{name}"))
         metrics[f"delta_psnr{suffix}_repeat_first"] = 0.0  # it does not look at the actions
-    if own.depth is not None:
+    if own.depth is not None and held.clips.metric.any():
         metrics |= _depth_metrics(held, own.depth, given)
-    metrics |= {"success_share": float(clips.manifest["success_share"]), "clips": float(len(held.rgb))}
+    metrics["clips"] = float(len(truth))
+    if (share := clips.manifest.get("success_share")) is not None:
+        metrics["success_share"] = float(share)
     return Evaluation(metrics, _shown(generator, held, own, results["other"][0]))
 
 
@@ -97,7 +95,7 @@ def _plans(generator: Generator, actions: Float[np.ndarray, "B T A"], clips: Sto
     """The actions to generate under, by kind, each (R, B, T, A)."""
     draws = generator.config.eval.action_draws
     train = clips.source("train")
-    low, high = control.action_range(np.stack([train[i]["actions"] for i in range(len(train))]))
+    low, high = control.action_range(np.stack([train[i]["actions"] for i in spread(train, RANGE_CLIPS)]))
     return {
         "own": actions[None],
         "other": actions[control.other_clips(len(actions), draws, seed=0)],
@@ -112,13 +110,19 @@ def _generate(generator: Generator, held: HeldOut, actions: np.ndarray, depth: b
     for start in range(0, len(actions), cfg.eval.batch_size):
         rows = np.minimum(np.arange(start, start + cfg.eval.batch_size), len(actions) - 1)
         part = {name: grid[rows] for name, grid in prompt.items()}
-        parts.append(generator.generate(part, actions[rows], cfg.sample, depth, index=rows))
+        index, has_depth = held.clips.index[rows], held.clips.has_depth[rows]
+        parts.append(generator.generate(part, actions[rows], cfg.sample, depth, index, has_depth))
     join = lambda arrays: np.concatenate([np.asarray(a) for a in arrays])[: len(actions)]  # noqa: E731
     return Generated(
         {name: join(p.tokens[name] for p in parts) for name in parts[0].tokens},
         join(p.rgb for p in parts),
-        join(p.depth for p in parts) if depth and parts[0].depth is not None else None,
+        join(_depth_of(p) for p in parts) if any(p.depth is not None for p in parts) else None,
     )
+
+
+def _depth_of(made: Generated) -> np.ndarray:
+    """Generated depth; nothing known where none of these clips has any."""
+    return np.full(made.rgb.shape[:-1], np.nan, np.float32) if made.depth is None else made.depth
 
 
 def _repeat_first(frames: Num[np.ndarray, "B T *rest"], given: int) -> Num[np.ndarray, "B T *rest"]:
@@ -128,23 +132,27 @@ def _repeat_first(frames: Num[np.ndarray, "B T *rest"], given: int) -> Num[np.nd
 
 def _pixel_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
     metrics: dict[str, float] = {}
-    candidates = {"": predicted, "_repeat_first": _repeat_first(held.rgb, given), "_tokenizer": held.reconstruction}
+    truth = held.clips.rgb
+    candidates = {"": predicted, "_repeat_first": _repeat_first(truth, given), "_tokenizer": held.reconstruction}
     for name, score in (("psnr", pixels.psnr), ("ssim", pixels.ssim)):
         for suffix, frames in candidates.items():
-            per_clip = over_predicted_frames(np.asarray(score(held.rgb, frames)), given)
+            per_clip = over_predicted_frames(np.asarray(score(truth, frames)), given)
             metrics |= bootstrap(per_clip).flat(name + suffix)
     return metrics
 
 
 def _depth_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
+    """Of the clips whose depth is in metres."""
     metrics: dict[str, float] = {}
+    metric = held.clips.metric
+    truth = held.clips.depth[metric]
     candidates = {
-        "": predicted,
-        "_repeat_first": _repeat_first(held.depth, given),
-        "_tokenizer": held.depth_reconstruction,
+        "": predicted[metric],
+        "_repeat_first": _repeat_first(truth, given),
+        "_tokenizer": held.depth_reconstruction[metric[held.clips.has_depth]],
     }
     for suffix, depth in candidates.items():
-        scores = depth_scores(held.depth[:, given:], depth[:, given:], alignment="none")
+        scores = depth_scores(truth[:, given:], depth[:, given:], alignment="none")
         metrics |= bootstrap(scores.abs_rel).flat(result_key("absrel") + suffix)
         mean = scores.mean()
         metrics |= {result_key(name) + suffix: mean[name] for name in ("delta1", "delta2")}
@@ -153,19 +161,22 @@ def _depth_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str
 
 def _shown(generator: Generator, held: HeldOut, own: Generated, other: Generated) -> dict[str, np.ndarray]:
     """Arrays of the clips in the report: successes and failures by turns, in the split's order."""
-    ends = held.success[:, -1]
+    clips = held.clips
+    ends = clips.success[:, -1]
     good, bad = (list(np.flatnonzero(ends == outcome)) for outcome in (True, False))
     turns = [queue.pop(0) for _ in ends for queue in (good, bad) if queue]
     rows = np.array(turns[: generator.config.eval.report_clips])
     arrays: dict[str, Any] = {
-        "clip": rows,
-        "truth": held.rgb[rows],
+        "clip": clips.index[rows],
+        "task": np.array(clips.task)[rows],
+        "truth": clips.rgb[rows],
         "reconstruction": held.reconstruction[rows],
         "prediction": own.rgb[rows],
         "other_actions": other.rgb[rows],
-        "true_depth": held.depth[rows],
-        "tracks": held.tracks[rows],
-        "visible": held.visible[rows],
+        "has_depth": clips.has_depth[rows],
+        "true_depth": clips.depth[rows],
+        "tracks": clips.tracks[rows],
+        "visible": clips.visible[rows],
         "success": ends[rows],
     }
     return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})

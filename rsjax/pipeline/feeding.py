@@ -15,9 +15,9 @@ from rsjax.data.curriculum import Feed, plan
 from rsjax.data.order import Transform
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.store import Source, Store, StoreError
+from rsjax.data.units import Units
 from rsjax.pipeline import transforms
 from rsjax.progress import note
-from rsjax.sample.generator import Units
 from rsjax.train.distributed import is_lead
 
 
@@ -40,17 +40,13 @@ def token_transform(own: Store, integrate: bool, store: Store) -> Transform:
         integrate: whether the actions' sums follow them (see :meth:`rsjax.sample.generator.Units.action_inputs`).
         store: the one that is read.
     """
-    if store.path == own.path:
-        return transforms.token_clip
     units, there = Units.create(own), Units.create(store)
-    if units.depth_range != there.depth_range and is_lead():
+    if units.depth_range != there.depth_range and there.depth_range and is_lead():
         note(
             f"{store.path}: its depth tokens stand for {there.depth_range} m, this run's for {units.depth_range} m; "
             f"the model is not told"
         )
-    if (units.action_mean, units.action_std) == (there.action_mean, there.action_std):
-        return transforms.token_clip
-    return partial(transforms.token_clip_in, units, there, integrate)
+    return partial(transforms.token_clip, units, integrate)
 
 
 def readable(source: Source, split: str, directory: Path, max_damaged: float) -> Iterator[Record]:

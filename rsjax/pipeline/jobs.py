@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeVar
 from rsjax.config import LoopConfig
 from rsjax.data.curriculum import Feed
 from rsjax.data.order import Arrays
-from rsjax.data.store import open_store
 from rsjax.model.world_model import branches
 from rsjax.pipeline import transforms
 from rsjax.pipeline.feeding import planned, token_transform
@@ -66,7 +65,7 @@ def tokenizer_job(run: Run) -> Job[TokenizerObjective]:
         flip=train.flip,
     )
     directory = run.directory / "tokenizer"
-    loop, feed = planned(train, open_store(run.clips), lambda store: transform, directory)
+    loop, feed = planned(train, run.open_clips(), lambda store: transform, directory)
     return Job(
         TokenizerObjective(cfg.tokenizer, train),
         loop,
@@ -82,11 +81,11 @@ def tokenizer_job(run: Run) -> Job[TokenizerObjective]:
 def world_model_job(run: Run) -> Job[WorldModelObjective]:
     """Reads the run's tokens. Errors as of :func:`tokenizer_job`."""
     cfg, train = run.config, run.config.train
-    tokens = open_store(run.output("tokens"))
+    tokens = run.open_tokens()
     transform = partial(token_transform, tokens, cfg.model.integrate_actions)
     directory = run.directory / "world_model"
     loop, feed = planned(train, tokens, transform, directory)
-    tokens_per_step = train.batch_size * cfg.sim.frames * cfg.model.grid**2 * len(branches(cfg.model))
+    tokens_per_step = train.batch_size * cfg.clips.frames * cfg.model.grid**2 * len(branches(cfg.model))
     return Job(
         WorldModelObjective.create(cfg),
         loop,

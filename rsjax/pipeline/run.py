@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import Config, content_key, to_dict
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.data.store import Store, StoreError, disk_guard, open_store, write_atomically
 from rsjax.errors import UserError
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
 TRAINED = ("tokenizer", "world_model")  # never replaced unasked
 DECIDED_BY = {  # sections of the configuration that a trained stage depends on
-    "tokenizer": ("sim", "tokenizer", "tokenizer_train"),
-    "world_model": ("sim", "tokenizer", "tokenizer_train", "model", "mask", "loss", "train"),
+    "tokenizer": ("sim", "data", "tokenizer", "tokenizer_train"),
+    "world_model": ("sim", "data", "tokenizer", "tokenizer_train", "model", "mask", "loss", "train"),
 }
-OUTPUTS = {  # in the run directory; clips lie outside
+OUTPUTS = {  # in the run directory; clips lie outside, and so do the tokens that the link there leads to
     "tokenizer": "tokenizer/weights",
     "tokens": "tokens/store",
     "world_model": "world_model/weights",
@@ -49,15 +49,38 @@ class Run:
     @property
     def clips(self) -> Path:
         """The store of clips; shared by all runs that use the same episodes."""
-        return self.data_directory / f"lift-{self.keys()['collect']}"
+        return Path(self.config.data.store or self.data_directory / f"lift-{self.keys()['collect']}")
+
+    def open_clips(self) -> Store:
+        """The store of clips.
+
+        Raises:
+            StoreError: it is gone or damaged, or another one than the run was made for lies there.
+        """
+        store, key = open_store(self.clips), self.config.data.key
+        if key and store.manifest.get("key") != key:
+            raise StoreError(
+                f"{self.clips}: is not the store that the run began with (key {store.manifest.get('key')}, not {key}); "
+                f"train on it in another --run-dir, or put the old one back"
+            )
+        return store
+
+    def open_tokens(self) -> Store:
+        """The store of tokens, where it really lies.
+
+        Raises:
+            StoreError: it is gone or damaged.
+        """
+        return open_store(self.output("tokens").resolve())
 
     def keys(self) -> dict[str, str]:
         """Each stage's content key: its own settings and the key of the stage before."""
-        cfg, key = self.config, collection_key(self.config.sim)
+        cfg = self.config
+        key = content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.tokenizer, cfg.tokenizer_train),
-            "tokens": (cfg.model.integrate_actions,),
+            "tokens": (),
             "world_model": (cfg.model, cfg.mask, cfg.loss, cfg.train),
             "evaluation": (cfg.sample, cfg.eval),
             "report": (),

@@ -3,23 +3,21 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rsjax.config import ModelConfig, TokenizerConfig
-from rsjax.data.codec import Record
 from rsjax.data.curriculum import check_stages
 from rsjax.data.quarantine import NAME as QUARANTINE
-from rsjax.data.store import disk_guard, open_store, write_store
+from rsjax.data.store import disk_guard
+from rsjax.data.units import Units
 from rsjax.pipeline import evaluation
-from rsjax.pipeline.feeding import fingerprint, readable
 from rsjax.pipeline.jobs import tokenizer_job, world_model_job
 from rsjax.pipeline.provenance import record_data, record_start
 from rsjax.pipeline.run import STAGES, TRAINED, Run
 from rsjax.pipeline.summary import write_summary
+from rsjax.pipeline.tokens import link, tokenize_store
 from rsjax.progress import Progress, duration, note, stage
-from rsjax.sample.generator import Codec, Generator, Units, load_tokenizer
+from rsjax.sample.generator import Generator, load_tokenizer
 from rsjax.sim.collect import collect
-from rsjax.sim.expert import difficulty
 from rsjax.train.checkpoint import save_weights
 from rsjax.train.distributed import agree, barrier, is_lead, on_lead
 from rsjax.train.parts import check_part
@@ -47,7 +45,7 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         "report": partial(write_summary, command=command),
     }
     notes = {
-        "collect": f"simulating {run.config.sim.episodes} Lift episodes into {run.clips}",
+        "collect": _collecting(run),
         "tokenizer": "training the tokenizer",
         "tokens": "tokenizing all clips",
         "world_model": "training the world model",
@@ -92,6 +90,12 @@ def _check_starts(run: Run) -> None:
             find_wandb()
 
 
+def _collecting(run: Run) -> str:
+    if run.config.data.key:
+        return f"the clips of {run.clips}"
+    return f"simulating {run.config.sim.episodes} Lift episodes into {run.clips}"
+
+
 def _record_start(run: Run, command: str) -> None:
     changed = " and ".join(record_start(run, command))
     if changed and not all(map(run.finished, TRAINED)):
@@ -99,9 +103,17 @@ def _record_start(run: Run, command: str) -> None:
 
 
 def collect_clips(run: Run) -> None:
-    """Stage 1: episodes from the simulator, where another run has not collected them yet."""
-    with Progress("collect", run.config.sim.episodes, "episodes") as progress:
-        collect(run.config.sim, run.clips, lambda done, total: progress.update(done))
+    """Stage 1: episodes from the simulator, where another run has not collected them yet; or a store that is there."""
+    cfg = run.config
+    if cfg.data.key:
+        if cfg.model.depth and not run.open_clips().manifest.get("depth_range"):
+            note(
+                "no clip has depth, so the depth branch trains with its loss masked; "
+                "--model.depth False leaves it out, in half of the time"
+            )
+        return
+    with Progress("collect", cfg.sim.episodes, "episodes") as progress:
+        collect(cfg.sim, run.clips, lambda done, total: progress.update(done))
 
 
 def train_tokenizer(run: Run, resume: bool) -> None:
@@ -110,7 +122,7 @@ def train_tokenizer(run: Run, resume: bool) -> None:
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
     # Before the tokenizer is trained, whose clips the world model's stages choose from.
-    check_stages(run.config.train, open_store(run.clips))
+    check_stages(run.config.train, run.open_clips())
     job = tokenizer_job(run)
     state = job.fit(resume)
     if is_lead():
@@ -118,46 +130,14 @@ def train_tokenizer(run: Run, resume: bool) -> None:
 
 
 def tokenize(run: Run) -> None:
-    """Stage 3: both token grids of every clip, with the actions in the model's units."""
-    clips = open_store(run.clips)
-    units = Units.create(clips)
-    tokenizer = load_tokenizer(run.config, run.directory)
-    codec = Codec(run.config, tokenizer, units)
-    total = sum(len(clips.source(split)) for split in clips.splits)
-    folder = run.directory / "tokens"
-    (folder / QUARANTINE).unlink(missing_ok=True)  # all clips are read again
-
-    with Progress("tokens", total, "clips") as progress:
-        done = 0
-
-        def tokenized(split: str) -> Any:
-            nonlocal done
-            for clip in readable(clips.source(split), split, folder, run.config.train.max_damaged):
-                yield _token_record(codec, clip)
-                done += 1
-                progress.update(done)
-
-        meta = {name: clips.manifest[name] for name in ("action_mean", "action_std", "depth_range")}
-        key = {"key": run.keys()["tokens"], "source": str(run.clips), "tokenizer": fingerprint(tokenizer)}
-        splits = {split: tokenized(split) for split in clips.splits}
-        write_store(run.output("tokens"), "tokens", splits, meta | key, label=_labels)
-
-
-def _labels(record: Record) -> dict[str, str]:
-    return {name: record[name] for name in ("task", "difficulty")}
-
-
-def _token_record(codec: Codec, clip: Record) -> Record:
-    return {
-        "rgb": codec.encode_rgb(clip["rgb"]),
-        "depth": codec.encode_depth(clip["depth"]),
-        "actions": codec.units.action_inputs(clip["actions"], codec.config.model.integrate_actions),
-        "tracks": clip["tracks"],
-        "visible": clip["visible"],
-        "task": clip["task"],
-        "difficulty": difficulty(clip["provenance"]),
-        "provenance": clip["provenance"],
-    }
+    """Stage 3: both token grids of every clip, beside the clips, for all runs that have this tokenizer."""
+    clips, folder = run.open_clips(), run.directory / "tokens"
+    (folder / QUARANTINE).unlink(missing_ok=True)
+    out = tokenize_store(clips, run.config, load_tokenizer(run.config, run.directory), folder)
+    with disk_guard(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        Units.create(clips).save(folder)
+        link(out, run.output("tokens"))
 
 
 def train_world_model(run: Run, resume: bool) -> None:
@@ -176,5 +156,5 @@ def train_world_model(run: Run, resume: bool) -> None:
 def evaluate(run: Run) -> None:
     """Stage 5: metrics and the arrays that the report shows."""
     with disk_guard(run.directory):
-        result = evaluation.evaluate(Generator.load(run.directory), open_store(run.clips))
+        result = evaluation.evaluate(Generator.load(run.directory), run.open_clips())
         evaluation.save(run.output("evaluation"), result)

@@ -43,7 +43,7 @@ def write_summary(run: Run, command: str) -> None:
         versions=_versions(),
         seconds=seconds,
         command=command,
-        show_targets=cfg.name == "tiny",
+        show_targets=cfg.name == "tiny" and not cfg.data.key,  # they are those of the simulated clips
     )
     with disk_guard(run.directory):
         write_report(run.output("report"), report)
@@ -51,18 +51,18 @@ def write_summary(run: Run, command: str) -> None:
 
 
 def _figure(shown: dict[str, np.ndarray], row: int, given: int, loss: LossConfig) -> ClipFigure:
-    arrays: dict[str, Any] = {
-        name: shown[name][row]
-        for name in ("truth", "prediction", "reconstruction", "other_actions", "true_depth", "predicted_depth")
-        if name in shown
-    }
+    names = ["truth", "prediction", "reconstruction", "other_actions"]
+    names += ["true_depth", "predicted_depth"] if shown["has_depth"][row] else []
+    arrays: dict[str, Any] = {name: shown[name][row] for name in names if name in shown}
     if loss.keypoints:
         tracks, visible = shown["tracks"][row], shown["visible"][row]
         motion = np.asarray(motion_magnitude(tracks, visible))
         chosen = np.argsort(-motion)[: loss.num_keypoints]
         arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
-    outcome = "the cube is lifted" if shown["success"][row] else "the cube is not lifted"
-    return ClipFigure(title=f"held-out clip {int(shown['clip'][row])}: {outcome}", prompt_frames=given, **arrays)
+    title = f"held-out clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
+    if shown["success"].any():  # otherwise it may be that nobody said
+        title += ", and it succeeds" if shown["success"][row] else ", and it fails"
+    return ClipFigure(title=title, prompt_frames=given, **arrays)
 
 
 def _versions() -> dict[str, str]:

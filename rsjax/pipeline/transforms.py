@@ -1,16 +1,14 @@
 """Records to training arrays, run inside the loader. Plain numpy, picklable."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rsjax.clip import Batch
 from rsjax.data.codec import Record
 from rsjax.data.order import Arrays
+from rsjax.data.units import Units
 from rsjax.tokenizer.depth_color import depth_to_color
-
-if TYPE_CHECKING:  # the loader's worker processes have no need of the models
-    from rsjax.sample.generator import Units
 
 
 def tokenizer_images(
@@ -24,6 +22,8 @@ def tokenizer_images(
 ) -> Arrays:
     """``count`` random frames of a clip, each as RGB or, with probability ``depth_share``, as colourised depth.
 
+    A clip without depth gives RGB alone.
+
     Args:
         flip: mirror each image left to right with probability ½.
 
@@ -33,9 +33,10 @@ def tokenizer_images(
     chosen = rng.choice(len(record["rgb"]), count, replace=count > len(record["rgb"]))
     images = record["rgb"][chosen]
     as_depth = rng.random(count) < depth_share
-    near, far = record["provenance"]["depth_range"]
-    colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, scale)
-    images[as_depth] = colors.astype(np.uint8)
+    if record["depth"] is not None:
+        near, far = record["provenance"]["depth_range"]
+        colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, scale)
+        images[as_depth] = colors.astype(np.uint8)
     if flip:
         mirrored = rng.random(count) < 0.5
         images[mirrored] = images[mirrored, :, ::-1]
@@ -48,26 +49,25 @@ def image_batch(arrays: Arrays) -> np.ndarray:
     return images.reshape(-1, *images.shape[2:])
 
 
-TOKEN_ARRAYS = ("rgb", "depth", "actions", "tracks", "visible")
+TOKEN_ARRAYS = ("rgb", "depth", "actions", "tracks", "visible", "has_depth")
 
 
-def token_clip(record: Record, rng: np.random.Generator) -> Arrays:
-    """The arrays of a token record that a training step reads."""
-    return {name: record[name] for name in TOKEN_ARRAYS}
-
-
-def token_clip_in(units: "Units", there: "Units", integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
-    """The same of a record whose actions are in another store's units.
+def token_clip(units: Units, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
+    """The arrays of a token record that a training step reads.
 
     Args:
-        units: those of the model's own data.
-        there: those of the record's store.
+        units: those of the model's own data, whichever store the record is from.
         integrate: whether the actions' sums follow them (see ``Units.action_inputs``).
     """
-    inputs = record["actions"]
-    scaled = inputs[..., : inputs.shape[-1] // 2] if integrate else inputs
-    actions = units.action_inputs(there.actions(scaled), integrate)
-    return token_clip(record | {"actions": actions}, rng)
+    has_depth = record["depth"] is not None
+    return {
+        "rgb": record["rgb"],
+        "depth": record["depth"] if has_depth else np.zeros_like(record["rgb"]),
+        "actions": units.action_inputs(record["actions"], integrate),
+        "tracks": record["tracks"],
+        "visible": record["visible"],
+        "has_depth": np.array(has_depth, np.float32),
+    }
 
 
 def token_batch(arrays: Arrays) -> Batch:

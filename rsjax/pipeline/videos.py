@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rsjax.config import Config, SampleConfig
-from rsjax.data.store import Record, Source, open_store
+from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
+from rsjax.pipeline.clips import Clips
+from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.report.figures import ClipFigure, animation
 from rsjax.report.video import write_gif, write_mp4
@@ -41,11 +43,24 @@ class Request:
 
 
 def write_videos(
-    run: Path, data: Path, request: Request, out: Path, kind: Literal["mp4", "gif"], fps: float, scale: int
+    run: Path,
+    data: Path,
+    request: Request,
+    out: Path,
+    kind: Literal["mp4", "gif"],
+    fps: float,
+    scale: int,
+    store: Path | None = None,
 ) -> Iterator[Path]:
     """Generates and writes a video per clip: truth and prediction side by side, with depth where the model has it.
 
     Under foreign actions, or beyond a clip's end, there is no truth to show, only what was generated.
+
+    Args:
+        run, data: the run's directory, and where simulated data sets are kept.
+        out: where the files go.
+        scale: pixels per pixel, where prediction alone is shown.
+        store: where the run's store of clips lies now, if it was ingested and has moved since.
 
     Yields:
         Each file's path, once it is written.
@@ -55,7 +70,8 @@ def write_videos(
     """
     generator = Generator.load(run)
     sample = dataclasses.replace(generator.config.sample, **request.sample)
-    source = open_store(Run(generator.config, run, data).clips).source(request.split)
+    config = relocated(generator.config, store) if store else generator.config
+    source = Run(config, run, data).open_clips().source(request.split)
     clips = request.clips or tuple(range(min(4, len(source))))
     for flag, numbers in (("--clips", clips), ("--actions-from", (request.actions_from or 0,))):
         for number in numbers:
@@ -87,7 +103,7 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
         actions = np.load(request.actions, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
-    width, shortest = config.sim.action_dim, config.mask.prompt_frames + 1
+    width, shortest = config.clips.action_dim, config.mask.prompt_frames + 1
     if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
         fits = f"(T, {width}) with T at least {shortest}"
         raise UserError(f"{request.actions}: shape {actions.shape}; this model takes {fits}")
@@ -107,11 +123,7 @@ def _lasting(actions: Float[np.ndarray, "T A"], request: Request, config: Config
 
 
 def _generate(generator: Generator, clip: Record, actions: np.ndarray, sample: SampleConfig, number: int) -> Generated:
-    given = generator.config.mask.prompt_frames
-    prompt = {
-        "rgb": generator.codec.encode_rgb(clip["rgb"][None, :given]),
-        "depth": generator.codec.encode_depth(clip["depth"][None, :given]),
-    }
+    prompt = Clips.stacked([clip], [number]).tokens(generator.codec, generator.config.mask.prompt_frames)
     return generator.generate(prompt, actions[None], sample, index=np.array([number]))
 
 

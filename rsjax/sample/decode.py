@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import ModelConfig, SampleConfig
@@ -28,6 +28,7 @@ class Decoder:
         apply: the model, :func:`rsjax.sample.guidance.apply_guided` with its first arguments given.
         actions: into all frames.
         keys: one per clip.
+        no_depth: True for clips without depth; ``apply`` knows of them too.
     """
 
     model: ModelConfig
@@ -35,6 +36,7 @@ class Decoder:
     apply: Callable[..., Any]
     actions: Float[Array, "B T A"]
     keys: Key[Array, " B"]
+    no_depth: Bool[Array, " B"] | None
 
     def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Cache]) -> tuple[Cells, Cache]:
         """Puts frame t into the tokens, from the cache of frames before t-1: a pass over (t-1, t), then over t alone.
@@ -96,7 +98,7 @@ class Decoder:
         return jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, t), self.sample.steps))(self.keys)
 
     def _unmask(self, keys: Array, step: Array | int, frame: Frame, logits: dict[str, Array]) -> Frame:
-        return unmask_step(self.sample, self.model.code_bits, keys, step, frame, logits)
+        return unmask_step(self.sample, self.model.code_bits, keys, step, frame, logits, self.no_depth)
 
 
 def _put(tokens: Cells, frame: Frame, t: Array) -> Cells:

@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.clip import Array
 from rsjax.config import Config, SampleConfig, from_dict
-from rsjax.data.store import Store, open_store
+from rsjax.data.units import Units
 from rsjax.errors import UserError
 from rsjax.model.world_model import WorldModel, branches
 from rsjax.sample.rollout import encode_prompt, rollout, rollout_from
@@ -24,45 +24,6 @@ from rsjax.train.checkpoint import load_weights
 Tokens = dict[str, Int[Array, "B T h w"]]
 
 CHUNK = 128  # images per pass of the tokenizer at the most: bounded memory
-
-
-@dataclass(frozen=True)
-class Units:
-    """What turns a data set's units into the model's, and back.
-
-    Attributes:
-        action_mean: of each action dimension over the training split, (A,).
-        action_std: likewise.
-        depth_range: near and far end of the depth colour map, metres.
-    """
-
-    action_mean: tuple[float, ...]
-    action_std: tuple[float, ...]
-    depth_range: tuple[float, float]
-
-    @classmethod
-    def create(cls, store: Store) -> "Units":
-        """The units in a store's manifest."""
-        return cls(*(tuple(store.manifest[name]) for name in ("action_mean", "action_std", "depth_range")))
-
-    def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
-        """What the action encoder sees: actions at zero mean and unit variance; row 0, into the first frame, is zero.
-
-        A dimension that hardly varies is not blown up: its deviation counts as at least 0.001.
-
-        Args:
-            actions: in the data's units.
-            integrate: append their sum over the frames so far, at a quarter of its size.
-        """
-        scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
-        scaled[..., 0, :] = 0.0
-        if integrate:
-            scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
-        return scaled.astype(np.float32)
-
-    def actions(self, scaled: Float[np.ndarray, "*B T A"]) -> Float[np.ndarray, "*B T A"]:
-        """Actions in the data's units, out of what :meth:`action_inputs` gives without sums."""
-        return scaled * np.maximum(self.action_std, 1e-3) + np.asarray(self.action_mean)
 
 
 @dataclass(frozen=True)
@@ -78,8 +39,12 @@ class Codec:
         return self._chunked(_encode, frames, 3)
 
     def encode_depth(self, depth: Float[np.ndarray, "*B H W"]) -> Int[np.ndarray, "*B h w"]:
-        """Depth in metres to the tokens of its colour map."""
-        colors = depth_to_color(depth, *self.units.depth_range, self.config.tokenizer.depth_scale)
+        """Depth in metres to the tokens of its colour map.
+
+        Raises:
+            UserError: the clips of these units have no depth.
+        """
+        colors = depth_to_color(depth, *self._depth_range(), self.config.tokenizer.depth_scale)
         return self._chunked(_encode, colors.astype(np.uint8), 3)
 
     def decode_rgb(self, tokens: Int[Array, "*B h w"]) -> UInt8[np.ndarray, "*B H W 3"]:
@@ -87,9 +52,22 @@ class Codec:
         return np.round(self._chunked(_decode, np.asarray(tokens), 2)).astype(np.uint8)
 
     def decode_depth(self, tokens: Int[Array, "*B h w"]) -> Float32[np.ndarray, "*B H W"]:
-        """Tokens of a depth colour map to metres."""
+        """Tokens of a depth colour map to metres.
+
+        Raises:
+            UserError: the clips of these units have no depth.
+        """
+        near, far = self._depth_range()
         colors = self._chunked(_decode, np.asarray(tokens), 2)
-        return color_to_depth(colors, *self.units.depth_range, self.config.tokenizer.depth_scale)
+        return color_to_depth(colors, near, far, self.config.tokenizer.depth_scale)
+
+    def _depth_range(self) -> tuple[float, float]:
+        if self.units.depth_range is None:
+            raise UserError(
+                "depth_range is null: none of the clips that this run was trained on has depth, so a depth map has no "
+                "tokens; give RGB alone, or train on clips with depth"
+            )
+        return self.units.depth_range
 
     def _chunked(self, function: Any, images: np.ndarray, item_axes: int) -> np.ndarray:
         lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
@@ -120,7 +98,8 @@ class Generated:
 
     tokens: Tokens
     rgb: UInt8[np.ndarray, "B T H W 3"]
-    depth: Float32[np.ndarray, "B T H W"] | None  # metres; None without a depth branch or where not asked for
+    # Metres, NaN in clips without depth; None without a depth branch, where no clip has depth, or where not asked for.
+    depth: Float32[np.ndarray, "B T H W"] | None
 
 
 @dataclass(frozen=True)
@@ -138,7 +117,7 @@ class Generator:
         Raises:
             UserError: the run is missing, unfinished or damaged.
         """
-        config, units = load_config(run), Units.create(open_store(run / "tokens" / "store"))
+        config, units = load_config(run), Units.load(run / "tokens")
         return cls(config, Codec(config, load_tokenizer(config, run), units), load_world_model(config, run))
 
     def generate(
@@ -148,19 +127,32 @@ class Generator:
         sample: SampleConfig,
         depth: bool = True,
         index: Int[np.ndarray, " B"] | None = None,
+        has_depth: Bool[np.ndarray, " B"] | None = None,
     ) -> Generated:
         """The video that follows the prompt under these actions; T may exceed ``model.frames``.
 
         Args:
-            prompt: tokens of the given frames by branch, (B, P, h, w).
+            prompt: tokens of the given frames by branch, (B, P, h, w); without "depth", no clip has it.
             actions: in the data's units; row t leads into frame t, row 0 is not used.
             depth: decode depth too; it costs as much as the frames.
             index: each clip's number, which with ``sample.seed`` decides its draws; 0, 1, … if not given.
+            has_depth: which clips have depth; the prompt's depth tokens of the others are not read. All, if not given.
+
+        Raises:
+            ValueError: ``has_depth`` is not of B clips, or names some where the prompt has no depth.
         """
-        inputs, key = self._action_inputs(actions), jax.random.key(sample.seed)
-        tokens = rollout(self.config.model, sample, self.params, self._given(prompt), inputs, key, index=index)
-        metres = self.codec.decode_depth(tokens["depth"]) if depth and "depth" in tokens else None
+        given, key = self._given(prompt), jax.random.key(sample.seed)
+        has = np.full(len(given["rgb"]), "depth" in given) if has_depth is None else np.asarray(has_depth, bool)
+        inputs = self._action_inputs(actions)
+        tokens = rollout(self.config.model, sample, self.params, given, inputs, key, index=index, no_depth=~has)
+        metres = self._metres(tokens["depth"], has) if depth and "depth" in tokens and has.any() else None
         return Generated(tokens, self.codec.decode_rgb(tokens["rgb"]), metres)
+
+    def _metres(self, tokens: Int[Array, "B T h w"], has: Bool[np.ndarray, " B"]) -> Float32[np.ndarray, "B T H W"]:
+        of_some = self.codec.decode_depth(np.asarray(tokens)[has])
+        metres = np.full((len(has), *of_some.shape[1:]), np.nan, np.float32)
+        metres[has] = of_some
+        return metres
 
     def plan(self, prompt: Tokens, actions: Float[np.ndarray, "N T A"], sample: SampleConfig) -> Tokens:
         """Tokens of the videos that follow one prompt under N action sequences; the prompt is encoded once.
@@ -168,7 +160,7 @@ class Generator:
         All candidates draw alike: they differ by their actions alone. ``codec`` decodes those that are worth it.
 
         Args:
-            prompt: tokens of the given frames by branch, (1, P, h, w).
+            prompt: tokens of the given frames by branch, (1, P, h, w); without "depth", the clip has none.
             actions: in the data's units; row t leads into frame t, row 0 is not used.
 
         Raises:
@@ -184,7 +176,7 @@ class Generator:
         return rollout_from(self.config.model, sample, self.params, start, inputs[:, past:], key, alike)
 
     def _given(self, prompt: Tokens) -> Tokens:
-        return {name: jnp.asarray(prompt[name]) for name in branches(self.config.model)}
+        return {name: jnp.asarray(prompt[name]) for name in branches(self.config.model) if name in prompt}
 
     def _action_inputs(self, actions: Float[np.ndarray, "B T A"]) -> Float32[Array, "B T A2"]:
         return jnp.asarray(self.codec.units.action_inputs(actions, self.config.model.integrate_actions))

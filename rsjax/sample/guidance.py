@@ -25,19 +25,22 @@ def apply_guided(
     actions: Float[Array, "B T A"],
     start: Any,
     cache: Cache | None,
+    no_depth: Bool[Array, " B"] | None = None,
 ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
     """Logits without + g·(with - without the actions), g = ``sample.guidance``; and the cache.
 
     Args:
         start: position of the first given frame (may be traced).
         cache: from :func:`guided_cache` or an earlier call.
+        no_depth: True for clips whose depth is hidden, as in :class:`rsjax.model.world_model.WorldModel`.
     """
     if sample.guidance == 1:
-        return _apply(model, params, tokens, mask, actions, start, cache, None)
+        return _apply(model, params, tokens, mask, actions, start, cache, None, no_depth)
     b = len(mask)
     twice = lambda x: jnp.concatenate([x, x])  # noqa: E731
     drop = jnp.arange(2 * b) >= b
-    logits, cache = _apply(model, params, jax.tree.map(twice, tokens), twice(mask), twice(actions), start, cache, drop)
+    tokens, mask, actions, no_depth = jax.tree.map(twice, (tokens, mask, actions, no_depth))
+    logits, cache = _apply(model, params, tokens, mask, actions, start, cache, drop, no_depth)
     return {name: x[b:] + sample.guidance * (x[:b] - x[b:]) for name, x in logits.items()}, cache
 
 
@@ -61,8 +64,17 @@ def _copies(sample: SampleConfig) -> int:
 
 
 def _apply(
-    model: ModelConfig, params: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any, drop: Any
+    model: ModelConfig,
+    params: Any,
+    tokens: Any,
+    mask: Any,
+    actions: Any,
+    start: Any,
+    cache: Any,
+    drop: Any,
+    no_depth: Any,
 ) -> Any:
     shape = (*mask.shape[:2], model.grid, model.grid)
     grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
-    return WorldModel(model).apply({"params": params}, grids, mask.reshape(shape), actions, start, cache, drop)
+    inputs = (grids, mask.reshape(shape), actions, start, cache)
+    return WorldModel(model).apply({"params": params}, *inputs, drop, no_depth)

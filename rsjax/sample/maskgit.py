@@ -66,28 +66,36 @@ def unmask_step(
     step: Array | int,
     frame: Frame,
     logits: dict[str, Float[Array, "B S n V"]],
+    no_depth: Bool[Array, " B"] | None = None,
 ) -> Frame:
     """One decoding step: fill the masked cells, then mask again those that the schedule leaves open.
 
     Both branches share their mask. Which cells stay open is drawn at random, or, for "greedy", it is those in which the
-    branches together are least sure.
+    branches together are least sure; in a clip without depth, those in which RGB is.
 
     Args:
         keys: one per clip.
         logits: of this frame, by branch.
+        no_depth: True for clips without depth; what is drawn for them there means nothing.
     """
-    return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits)
+    return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth)
 
 
 def _unmask_clip(
-    config: SampleConfig, code_bits: int, step: Array | int, key: Array, frame: Frame, logits: dict[str, Array]
+    config: SampleConfig,
+    code_bits: int,
+    step: Array | int,
+    key: Array,
+    frame: Frame,
+    logits: dict[str, Array],
+    no_depth: Array | None,
 ) -> Frame:
     order_key, *branch_keys = jax.random.split(key, len(logits) + 1)
     tokens, confidence = {}, jnp.zeros(frame.mask.shape)
     for branch_key, (branch, branch_logits) in zip(branch_keys, logits.items(), strict=True):
         drawn, log_p = sample_tokens(branch_key, branch_logits, config.temperature, code_bits, config.top_k)
         tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
-        confidence += log_p
+        confidence += log_p if branch == "rgb" or no_depth is None else jnp.where(no_depth, 0.0, log_p)
     if config.unmask == "random":
         confidence = jax.random.uniform(order_key, frame.mask.shape)
     # Cells that are already decided stay so: they rank as surest.

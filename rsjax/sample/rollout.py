@@ -17,8 +17,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Float, Int, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import ModelConfig, SampleConfig
@@ -37,6 +38,7 @@ class Prompt:
     tokens: Tokens
     actions: Float[Array, "B P A"]
     cache: Cache  # of all frames but the last, whose commit is fused with the next frame's first step
+    no_depth: Bool[Array, " B"] | None  # as of :func:`rollout`; it holds for all that follows too
     # What the cache was made with, as SampleConfig has it; the stride resolved. Rollouts from here must agree.
     guided: bool = struct.field(pytree_node=False)
     window_stride: int = struct.field(pytree_node=False)
@@ -60,49 +62,61 @@ def rollout(
     key: Key[Array, ""],
     cached: bool = True,
     index: Int[Array, " B"] | None = None,
+    no_depth: Bool[Array, " B"] | None = None,
 ) -> Tokens:
     """Generates the frames after the prompt.
 
     Args:
-        prompt: the given frames' tokens by branch, P of them.
+        prompt: the given frames' tokens by branch, P of them. Without "depth", for a model that has that branch: no
+            clip has depth.
         actions: of all T frames, normalised; row t led into frame t, row 0 is not read by anything that matters.
         key: of the draws; the same key with other actions draws alike.
         cached: False recomputes all frames of the window at every step, for comparison.
         index: each clip's number, which with ``key`` decides its draws; 0, 1, … if not given.
+        no_depth: True for clips without depth, None where all have it. Their depth stays hidden from the first frame to
+            the last, as in training, and is nothing but zeros in what is returned.
 
     Returns:
         Tokens of all T frames by branch; the first P are the prompt's.
 
     Raises:
         ConfigError: the model cannot be sampled like this.
-        ValueError: T leaves nothing to generate, or prompt and actions are of different numbers of clips.
+        ValueError: T leaves nothing to generate; prompt, actions and ``no_depth`` are of different numbers of clips; or
+            the prompt lacks the depth of clips that have it.
     """
     sample.check(model)
     clips, given = prompt["rgb"].shape[:2]
     _check_lengths(given, actions.shape[1])
     if clips != len(actions):
         raise ValueError(f"{clips} prompts and {len(actions)} action sequences; encode_prompt shares one among many")
-    start = {name: prompt[name] for name in branches(model)}
+    start, no_depth = _start(model, prompt, no_depth)
     arguments = _arguments(model, sample, actions, key, index)
-    tokens = _rollout(model, replace(sample, seed=0), cached, params, start, *arguments)
+    tokens = _rollout(model, replace(sample, seed=0), cached, params, start, no_depth, *arguments)
     return {name: grid[:, : actions.shape[1]] for name, grid in tokens.items()}
 
 
 def encode_prompt(
-    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, actions: Float[Array, "B P A"]
+    model: ModelConfig,
+    sample: SampleConfig,
+    params: Any,
+    prompt: Tokens,
+    actions: Float[Array, "B P A"],
+    no_depth: Bool[Array, " B"] | None = None,
 ) -> Prompt:
     """Runs the prompt once, for :func:`rollout_from`.
 
     Args:
-        prompt: the given frames' tokens by branch.
+        prompt: the given frames' tokens by branch, as for :func:`rollout`.
         actions: that led into them, normalised.
+        no_depth: as for :func:`rollout`.
 
     Raises:
         ConfigError: the model cannot be sampled like this.
+        ValueError: ``no_depth`` is of another number of clips, or the prompt lacks the depth of clips that have it.
     """
     sample.check(model)
-    start = {name: prompt[name] for name in branches(model)}
-    return _encode_jit(model, replace(sample, seed=0), params, start, actions)
+    start, no_depth = _start(model, prompt, no_depth)
+    return _encode_jit(model, replace(sample, seed=0), params, start, no_depth, actions)
 
 
 def rollout_from(
@@ -151,6 +165,22 @@ def _made_with(model: ModelConfig, sample: SampleConfig) -> dict[str, Any]:
     }
 
 
+def _start(model: ModelConfig, prompt: Tokens, no_depth: Any) -> tuple[Tokens, Array | None]:
+    """The prompt's tokens of the branches that the model has, and ``no_depth`` where the model reads it."""
+    if not model.depth:
+        return {"rgb": prompt["rgb"]}, None
+    clips = len(prompt["rgb"])
+    if no_depth is not None and np.shape(no_depth) != (clips,):
+        raise ValueError(f"no_depth has shape {np.shape(no_depth)}; the prompt has {clips} clips, each needs one value")
+    if "depth" in prompt:
+        if isinstance(no_depth, np.ndarray) and not no_depth.any():  # the program without it is the smaller one
+            no_depth = None
+        return {name: prompt[name] for name in branches(model)}, no_depth
+    if no_depth is not None and not np.all(no_depth):
+        raise ValueError('no_depth says that clips have depth, but the prompt has no tokens "depth"')
+    return {"rgb": prompt["rgb"], "depth": jnp.zeros_like(prompt["rgb"])}, jnp.ones(clips, bool)
+
+
 def _check_lengths(given: int, frames: int) -> None:
     if not 0 < given < frames:
         raise ValueError(f"{frames} frames asked for with {given} given; at least one must be given and one left")
@@ -172,19 +202,20 @@ def _rollout(
     cached: bool,
     params: Any,
     prompt: Tokens,
+    no_depth: Array | None,
     actions: Array,
     frames: Array,
     keys: Array,
 ) -> Tokens:
     given = prompt["rgb"].shape[1]
-    apply = partial(apply_guided, model, sample, params)
-    decoder = Decoder(model, sample, apply, actions, keys)
+    apply = partial(apply_guided, model, sample, params, no_depth=no_depth)
+    decoder = Decoder(model, sample, apply, actions, keys, no_depth)
     tokens = _tokens(prompt, actions)
     if cached:
-        start = _encode(model, sample, params, prompt, actions[:, :given])
-        return _grids(model, _decode_cached(decoder, tokens, start.cache, given, frames))
+        start = _encode(model, sample, params, prompt, no_depth, actions[:, :given])
+        return _grids(model, _decode_cached(decoder, tokens, start.cache, given, frames), no_depth)
     tokens = jax.lax.fori_loop(given, frames, decoder.uncached, tokens)
-    return _grids(model, tokens)
+    return _grids(model, tokens, no_depth)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -192,12 +223,16 @@ def _resume(
     model: ModelConfig, sample: SampleConfig, params: Any, prompt: Prompt, actions: Array, frames: Array, keys: Array
 ) -> Tokens:
     (clips, given), n = prompt.actions.shape[:2], len(actions)
-    decoder = Decoder(model, sample, partial(apply_guided, model, sample, params), actions, keys)
+    no_depth = None if prompt.no_depth is None else jnp.broadcast_to(prompt.no_depth, n)
+    apply = partial(apply_guided, model, sample, params, no_depth=no_depth)
+    decoder = Decoder(model, sample, apply, actions, keys, no_depth)
     cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
-    return _grids(model, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, given, frames))
+    return _grids(model, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, given, frames), no_depth)
 
 
-def _encode(model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, actions: Array) -> Prompt:
+def _encode(
+    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, no_depth: Array | None, actions: Array
+) -> Prompt:
     b, given = prompt["rgb"].shape[:2]
     cache: Any = guided_cache(model, sample, b, cache_slots(model, given))
     base = int(window_start(model, sample, given))
@@ -205,8 +240,8 @@ def _encode(model: ModelConfig, sample: SampleConfig, params: Any, prompt: Token
         tokens = {name: grid[:, base : given - 1].reshape(b, known, -1) for name, grid in prompt.items()}
         seen = window_actions(model, actions, base, base, known)
         mask = jnp.zeros((b, known, model.grid**2), bool)
-        _, cache = apply_guided(model, sample, params, tokens, mask, seen, 0, cache)
-    return Prompt(prompt, actions, cache, **_made_with(model, sample))
+        _, cache = apply_guided(model, sample, params, tokens, mask, seen, 0, cache, no_depth)
+    return Prompt(prompt, actions, cache, no_depth, **_made_with(model, sample))
 
 
 _encode_jit = jax.jit(_encode, static_argnums=(0, 1))
@@ -240,5 +275,7 @@ def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
     return out
 
 
-def _grids(model: ModelConfig, tokens: dict[str, Int[Array, "B T S"]]) -> Tokens:
+def _grids(model: ModelConfig, tokens: dict[str, Int[Array, "B T S"]], no_depth: Array | None) -> Tokens:
+    if no_depth is not None:
+        tokens = tokens | {"depth": jnp.where(no_depth[:, None, None], 0, tokens["depth"])}
     return {name: cells.reshape(*cells.shape[:2], model.grid, model.grid) for name, cells in tokens.items()}

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.annotate.choose import METHODS, choose, choose_annotators
+from rsjax.annotate.choose import METHODS, choose, choose_annotators, choose_recorded
+from rsjax.annotate.depth import RecordedDepth
 from rsjax.annotate.networks.tracks import BootsTapir
 from rsjax.annotate.stages import Annotators
 from rsjax.annotate.tracks import LucasKanade
@@ -14,9 +15,22 @@ from rsjax.config import ConfigError
 def test_a_word_is_a_method_and_its_fields() -> None:
     assert choose("tracks", "lucas-kanade") == LucasKanade()
     assert choose("tracks", "lucas-kanade:grid=32,tolerance=0.25") == LucasKanade(grid=32, tolerance=0.25)
-    network = choose("tracks", "bootstapir:checkout=/a,weights=/b.npy,device=cuda")
-    assert network == BootsTapir(Path("/a"), Path("/b.npy"), device="cuda")
+    network = choose("tracks", "bootstapir:checkout=/a,weights=/b.pt,device=cuda")
+    assert network == BootsTapir(Path("/a"), Path("/b.pt"), device="cuda")
     assert choose("shots", "none") is None
+
+
+def test_files_are_named_from_the_root_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    network = choose("tracks", "bootstapir:checkout=~/tapnet,weights=here/b.pt")
+    assert (network.checkout, network.weights) == (Path("/home/me/tapnet"), tmp_path / "here" / "b.pt")
+
+
+def test_recorded_depth_is_read_unless_there_is_to_be_none() -> None:
+    assert choose_recorded("recorded") == choose_recorded("depth-anything:model=/a") == RecordedDepth()
+    assert choose_recorded("recorded:most_holes=0.8") == RecordedDepth(0.8)
+    assert choose_recorded("none") is None
 
 
 def test_the_default_words_are_the_default_methods() -> None:

@@ -1,8 +1,11 @@
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rsjax.annotate.categories import CategoryConfig
 from rsjax.annotate.clips import Annotated, ClipConfig, cut, words
@@ -10,7 +13,7 @@ from rsjax.annotate.windows import WindowConfig
 from rsjax.clip import Clip
 from rsjax.data.actions import ActionConfig
 from rsjax.data.codec import Record
-from rsjax.data.episode import Episode, EpisodeError
+from rsjax.data.episode import Episode, EpisodeError, Segment
 from rsjax.data.store import decode_clip
 from tests.annotate.toy import Pictures, episode
 
@@ -41,9 +44,10 @@ def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
         assert record["provenance"]["frames"] == frames.tolist()
         assert clip.rgb.shape == (4, 8, 8, 3)
         np.testing.assert_array_equal(clip.rgb[:, 0, 0, 1], frames)
+        assert clip.depth is not None
         np.testing.assert_allclose(clip.depth[:, 3, 3], 1 + frames / 10, rtol=1e-6)
         np.testing.assert_array_equal(clip.actions, np.stack([[0, *frames[1:]], [0, *-frames[1:]]], 1))
-    assert summary["depth"] == pytest.approx([1.0, 1 + 35 / 10])
+    assert summary["depth"] == pytest.approx([1.0, 1 + 35 / 10]) and summary["depth_unit"] == "metres"
     assert summary["action_dim"] == 2 and summary["actions"]["action_count"] == 15
 
 
@@ -52,10 +56,45 @@ def test_actions_between_frames_are_joined() -> None:
     assert found[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]
 
 
+@settings(deadline=None, max_examples=40)
+@given(
+    st.sampled_from([5.0, 7.5, 10, 24, 29.97, 30]),
+    st.sampled_from([0.0, 1, 2, 3, 5]),
+    st.integers(2, 6),
+    st.integers(0, 2**32 - 1),
+)
+def test_joined_actions_are_the_sums_over_the_frames_between(fps: float, rate: float, count: int, seed: int) -> None:
+    actions = np.random.default_rng(seed).normal(size=(160, 3)).astype(np.float32)
+    made = episode("a", 160, fps=fps, timestamps=np.arange(160) / fps, actions=actions)
+    found, summary = clips(made, ClipConfig(WindowConfig(frames=count, rate=rate, hop=5), 8, 1))
+    assert len(found) == summary["windows"]["kept"] > 0
+    for record in (found[0], found[-1]):
+        at = record["provenance"]["frames"]
+        between = [actions[before + 1 : after + 1].sum(0) for before, after in pairwise(at)]
+        np.testing.assert_allclose(record["actions"], [np.zeros(3), *between], rtol=1e-4, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.integers(1, 119), max_size=5), st.sampled_from([0.0, 2.0, 3.0]), st.booleans())
+def test_no_clip_reaches_across_a_cut(cuts: list[int], rate: float, within: bool) -> None:
+    edges = [0, *sorted(set(cuts)), 120]
+    shots = list(pairwise(edges))
+    made = episode("a", 120, segments=(Segment(10, 50, "reach"), Segment(50, 110, "grasp")))
+    config = ClipConfig(WindowConfig(frames=4, rate=rate, within_segments=within), 8, 1)
+    found, summary = clips(made, config, shots=shots)
+    assert len(found) == sum(summary["windows"].values())
+    for record in found:
+        at = record["provenance"]["frames"]
+        assert not any(at[0] < cut <= at[-1] for cut in edges[1:-1])
+        assert not within or (at[0] >= 10 and at[-1] < 50) or (at[0] >= 50 and at[-1] < 110)
+
+
 def test_without_depth_a_clip_has_none() -> None:
-    found, summary = clips(episode("a"))
-    assert found[0]["depth"] is None and summary["depth"] is None
-    assert found[0]["provenance"]["depth_unit"] == ""
+    unread = ClipConfig(CONFIG.windows, 8, 6, recorded_depth=False)
+    for made, config in ((episode("a"), CONFIG), (episode("a", depth=True), unread)):
+        found, summary = clips(made, config)
+        assert found[0]["depth"] is None and summary["depth"] is None and summary["depth_unit"] is None
+        assert found[0]["provenance"]["depth_unit"] == ""
 
 
 def test_estimated_depth_is_found_in_its_parts() -> None:
@@ -83,6 +122,21 @@ def test_tracks_are_those_of_the_windows_shot() -> None:
     seen[:, 0] = False
     found, summary = clips(episode("a"), shots=shots, tracks=records)
     assert not found and summary["windows"] == {"kept": 0, "no track": 2}
+
+
+def test_the_tracks_of_a_shot_are_read_once() -> None:
+    read: list[int] = []
+
+    class Counting(Records):
+        def __getitem__(self, index: Any) -> Any:
+            read.append(index)
+            return super().__getitem__(index)
+
+    points = np.zeros((3, 20, 2), np.float16)
+    shots = [(0, 20), (20, 40)]
+    records = Counting({"first": first, "points": points, "visible": np.ones((3, 20), bool)} for first, _ in shots)
+    found, _ = clips(episode("a"), ClipConfig(WindowConfig(frames=4, rate=0), 8, 6), shots=shots, tracks=records)
+    assert len(found) == 34 and read == [0, 1]
 
 
 def test_words_are_the_tasks_and_the_segments() -> None:

@@ -2,7 +2,10 @@
 
 import json
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -10,11 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import ingest, inspect, store
+from experiments import doctor, ingest, inspect, store
 from rsjax.data.store import open_store
+from tests.bridge import BRIDGE, needs_bridge
 from tests.data.clips import clip_store, numbers
-
-BRIDGE = Path("/work/shared/data/bridge")
 
 
 class Command:
@@ -43,22 +45,73 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     return Command(monkeypatch, capsys)
 
 
-@pytest.mark.skipif(not BRIDGE.exists(), reason="the bundled Bridge episodes are not here")
+@needs_bridge
 def test_the_bundled_bridge_episodes_become_a_store(command: Command, tmp_path: Path) -> None:
     out = tmp_path / "bridge"
     line = ["rlds", BRIDGE, "--out", out, "--windows.frames", 4, "--windows.rate", 0, "--windows.hop", 4]
     line += ["--workers", 0, "--difficulty", "put*=simple", "*=difficult", "--shots", "none", "--motion", "none"]
     told = command(ingest, *line)
-    assert "episodes 25 found = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
+    assert "episodes  25 found = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
     opened = open_store(out)
     counts = opened.labels("train").counts()["difficulty"]
     assert set(counts) == {"simple", "difficult"}
-    assert "up to date" in command(ingest, *line)
+    assert f"{out} is up to date" in command(ingest, *line)
+    assert "nothing is quarantined" in command(ingest, *line, "--retry")
 
     told = command(inspect, out)
     assert "float32 (4, 7)" in told and "put carrot on plate" in told
     sheet = cv2.imread(str(tmp_path / "bridge-sheet.png"))
     assert sheet is not None and sheet.shape[1] == 8 * 100 and sheet.std() > 20
+
+
+def folder_of_episodes(place: Path, count: int, copies: tuple[int, ...] = ()) -> Path:
+    """Episodes of 12 pictures at 10 fps; those in ``copies`` are the first one again."""
+    for number in range(count):
+        rng = np.random.default_rng(0 if number in copies else number)
+        pictures = place / f"episode_{number:02d}" / "front"
+        pictures.mkdir(parents=True)
+        for frame in range(12):
+            cv2.imwrite(str(pictures / f"{frame:06d}.png"), rng.integers(0, 255, (24, 32, 3), np.uint8))
+        np.save(pictures.parent / "actions.npy", rng.normal(size=(12, 2)).astype(np.float32))
+    (place / "dataset.json").write_text('{"task": "fold the towel", "fps": 10}')
+    return place
+
+
+SMALL = ["--windows.rate", 0, "--windows.frames", 4]
+
+
+def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Command, tmp_path: Path) -> None:
+    source = folder_of_episodes(tmp_path / "source", 4, copies=(2,))
+    with pytest.raises(SystemExit, match="1"):
+        command(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
+    line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL]
+    told = command(ingest, *line, "--manifest", tmp_path / "fixed.json")
+    assert "episodes  4 found = 3 with clips + 0 without + 1 quarantined" in told
+    rows = [json.loads(row) for row in (tmp_path / "store.work" / "quarantine.jsonl").read_text().splitlines()]
+    assert [row["episode"] for row in rows] == ["episode_02"]
+    assert "left out by the manifest: duplicate" in rows[0]["error"]
+    manifest = open_store(tmp_path / "store").manifest
+    assert "left out by the manifest" in manifest["quarantine"]["episode_02"]
+    assert "episodes  4 found = 4 with clips" in command(ingest, *line)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
+def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, number: int, status: int) -> None:
+    source = folder_of_episodes(tmp_path / "source", 40)
+    line = ["folder", source, "--out", tmp_path / "store", *SMALL]
+    words = [sys.executable, "-m", "experiments.ingest", *map(str, line), "--workers", "2"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        while not list(tmp_path.rglob("units/**/*.json")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, told = process.communicate()
+    assert process.returncode == status and told.count("\n") == 1 and "the same command resumes" in told
+    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/**/*.json")}
+    assert 0 < len(marks) < 200 and not (tmp_path / "store").exists()
+    told = command(ingest, *line, "--workers", 0, "--keep-clips")
+    assert f"this run  {200 - len(marks)} units" in told
+    assert {path: path.stat().st_mtime_ns for path in marks} == marks
 
 
 def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
@@ -93,9 +146,15 @@ def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Comman
         (ingest, ["folder", ".", "--difficulty", "simple"], "--difficulty 'simple': write PATTERN=WORD"),
         (ingest, ["folder", ".", "--tracks", "magic"], "tracks: no method 'magic'"),
         (ingest, ["folder", ".", "--test-share", "1"], "--test-share is 1.0"),
+        (ingest, ["folder", ".", "--gpus", "0.5"], "--gpus is for Ray alone; add --runner ray"),
+        (ingest, ["folder", ".", "--runner", "ray", "--cpus", "0"], "--cpus is 0.0"),
+        (ingest, ["folder", ".", "--out", "/"], "--out is /; name a directory"),
+        (ingest, ["folder", ".", "--depth", "recorded:most_holes=2"], "most_holes is 2.0"),
+        (ingest, ["folder", ".", "--manifest", "nowhere.json"], "nowhere.json: not a manifest of experiments.doctor"),
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
         (ingest, ["folder", ".", "--image-size", "1000000"], "image_size is 1000000"),
         (inspect, [], "name a store first"),
+        (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
         (inspect, ["nowhere"], "not a (whole) store"),
         (store, ["merge", "a", "b"], "usage"),
     ],

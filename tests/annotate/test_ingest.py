@@ -1,5 +1,7 @@
 import errno
 import hashlib
+import json
+import pickle
 import tracemalloc
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,19 +12,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.annotate import ingest as ingest_module
+from rsjax.annotate import packing
 from rsjax.annotate.categories import CategoryConfig
 from rsjax.annotate.clips import ClipConfig
-from rsjax.annotate.ingest import Plan, ingest, split_episodes
-from rsjax.annotate.report import lines
-from rsjax.annotate.runner import Counts, Inline
+from rsjax.annotate.ingest import LOCK, Plan, ingest
+from rsjax.annotate.packing import split_episodes
+from rsjax.annotate.protocols import AnnotationError
+from rsjax.annotate.report import Counts, lines
+from rsjax.annotate.runner import Inline, Outcome
 from rsjax.annotate.stages import Annotators, make_stages
 from rsjax.annotate.units import Job, Unit
 from rsjax.annotate.windows import WindowConfig
 from rsjax.data.codec import Record
 from rsjax.data.episode import Episode, EpisodeRef
+from rsjax.data.lock import lock
 from rsjax.data.store import Store, StoreError, decode_clip, open_store
-from tests.annotate.toy import Source, episode
+from tests.annotate.toy import ByDepth, Relative, Source, episode
 
 CONFIG = ClipConfig(
     WindowConfig(frames=4, rate=2), image_size=8, tracks=6, categories=CategoryConfig((("pick*", "simple"),))
@@ -58,8 +63,17 @@ def test_every_episode_is_a_clip_a_reason_or_a_row(tmp_path: Path) -> None:
     assert sum(len(store.source(split)) for split in store.splits) == 25
     assert store.manifest["quarantine"]["episode_001"].startswith("clips: EpisodeError: video_1.mp4")
     told = lines(counts)
-    assert told[0] == "episodes 8 found = 5 with clips + 1 without + 2 quarantined"
+    assert told[0] == "episodes  8 found = 5 with clips + 1 without + 2 quarantined"
     assert any(line.startswith("quarantined episode_001 at clips: ") for line in told)
+
+
+def test_which_windows_are_left_out_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = ClipConfig(WindowConfig(frames=4, rate=2, least_motion=1e6), image_size=8, tracks=6)
+    monkeypatch.setattr("tests.annotate.test_ingest.CONFIG", config)
+    with pytest.raises(StoreError, match=r"first one for: windows left out: 5 still"):
+        made(plan(tmp_path, Source(2), Annotators(shots=None)))
+    rows = [json.loads(row) for row in (tmp_path / "work" / "windows.jsonl").read_text().splitlines()]
+    assert rows == [{"episode": f"episode_{n:03d}", "left_out": {"still": [0, 5, 10, 15, 20]}} for n in range(2)]
 
 
 def test_a_store_has_units_and_labels_that_training_reads(tmp_path: Path) -> None:
@@ -71,7 +85,9 @@ def test_a_store_has_units_and_labels_that_training_reads(tmp_path: Path) -> Non
     np.testing.assert_allclose(store.manifest["action_mean"], rows.mean(0), rtol=1e-5)
     np.testing.assert_allclose(store.manifest["action_std"], rows.std(0), rtol=1e-5)
     low, high = store.manifest["depth_range"]
-    assert low == min(clip.depth.min() for clip in clips) and high == max(clip.depth.max() for clip in clips)
+    depths = [clip.depth for clip in clips if clip.depth is not None]
+    assert len(depths) == len(clips) and store.manifest["depth_unit"] == "metres"
+    assert low == min(depth.min() for depth in depths) and high == max(depth.max() for depth in depths)
     assert all(clip.provenance["depth_range"] == [low, high] for clip in clips)
     assert store.labels("train").counts()["difficulty"] == {"simple": len(clips)}
 
@@ -102,13 +118,16 @@ def test_the_same_again_does_nothing_and_more_episodes_reuse_annotations(tmp_pat
     counts = made(work)
     assert counts is not None and counts.done == 4 and len(before) == 6
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert not (tmp_path / "work" / "units" / "clips").exists()
+    assert not list((tmp_path / "work" / "units" / "clips").rglob("*.*"))
 
 
-def test_the_quarantined_are_tried_again_only_when_asked(tmp_path: Path) -> None:
-    made(plan(tmp_path, Source(3, broken=(1,))), keep_clips=True)
+@pytest.mark.parametrize("keep_clips", [False, True])
+def test_the_quarantined_are_tried_again_only_when_asked(tmp_path: Path, keep_clips: bool) -> None:
+    made(plan(tmp_path, Source(3, broken=(1,))), keep_clips=keep_clips)
     work = plan(tmp_path, Source(3))
     assert made(work) is None
+    more = made(plan(tmp_path, Source(4)), keep_clips=keep_clips)
+    assert more is not None and [row["episode"] for row in more.quarantined] == ["episode_001"]
     counts = made(work, retry=True)
     assert counts is not None and counts.done == 3 and not counts.quarantined
     assert made(work, retry=True) is None
@@ -124,6 +143,52 @@ def test_all_stages_leave_what_clips_read(tmp_path: Path) -> None:
     clip = decode_clip(work.job.records(unit, work.job.mark(unit) or {})[0])
     assert clip.visible[:, 0].all() and clip.tracks.shape == (6, 4, 2)
     assert clip.provenance["segment"] == "reach" and "motion" in clip.provenance
+
+
+@pytest.mark.parametrize(("deep", "unit"), [(1, "relative"), (5, "metres"), (6, "metres"), (0, "relative")])
+def test_metres_and_relative_depth_are_not_mixed(tmp_path: Path, deep: int, unit: str) -> None:
+    network = Annotators(None, None, Relative(), None, None)
+    counts = made(plan(tmp_path, Source(6, deep=deep), network))
+    store = open_store(tmp_path / "store")
+    records = [store.source(split)[i] for split in store.splits for i in range(len(store.source(split)))]
+    assert counts is not None and counts.done == 6 and len(records) == 30
+    by_episode = {record["provenance"]["episode"] for record in records if record["depth"] is not None}
+    assert by_episode == {f"episode_{n:03d}" for n in range(6) if (n < deep) == (unit == "metres")}
+    for record in records:
+        assert record["provenance"]["depth_unit"] == (unit if record["depth"] is not None else "")
+        assert record["provenance"]["depth_range"] == store.manifest["depth_range"]
+    assert store.manifest["depth_unit"] == unit
+    assert store.manifest["depth_range"] == ([3.0, 3.0] if unit == "relative" else pytest.approx([1.0, 4.5]))
+    assert counts.depth_left_out == store.manifest["counts"]["depth_left_out"] == 5 * (6 - len(by_episode))
+    told = f"depth     left out of {counts.depth_left_out} clips"
+    assert any(line.startswith(told) for line in lines(counts)) == (deep in (1, 5))
+
+
+def test_where_only_the_test_split_has_depth_none_is_kept(tmp_path: Path) -> None:
+    source = Source(4)
+    held = split_episodes(list(source.episodes()), 0.25)["test"][0]
+    counts = made(plan(tmp_path, Source(4, only=held.location["number"])))
+    store = open_store(tmp_path / "store")
+    assert store.manifest["depth_range"] is None and store.manifest["depth_unit"] is None
+    assert counts is not None and counts.depth_left_out == 5 and store.source("test")[0]["depth"] is None
+
+
+def test_a_network_that_cannot_be_loaded_ends_the_job_and_quarantines_nothing(tmp_path: Path) -> None:
+    work = plan(tmp_path, Source(2), Annotators(None, None, Relative(there=False), None, None))
+    with pytest.raises(AnnotationError, match=r"relative.pt: no such file"):
+        made(work)
+    assert not list(tmp_path.rglob("units/**/*.json"))
+
+
+def test_a_network_that_tracks_sees_recorded_depth_or_else_that_of_the_stage(tmp_path: Path) -> None:
+    methods = Annotators(None, None, Relative(), ByDepth(), None)  # type: ignore[arg-type]
+    made(plan(tmp_path, Source(2, deep=1), methods, share=0.0))
+    source = open_store(tmp_path / "store").source("train")
+    for number in range(len(source)):
+        record = source[number]
+        frames = np.array(record["provenance"]["frames"])
+        deep = record["provenance"]["episode"] == "episode_000"
+        np.testing.assert_allclose(record["tracks"][0, :, 0], 0.1 + frames / 100 if deep else 0.3, atol=1e-3)
 
 
 @dataclass
@@ -144,8 +209,28 @@ def test_episodes_that_do_not_fit_the_others_are_rows(tmp_path: Path) -> None:
     counts = made(plan(tmp_path, Odd(4)))
     assert counts is not None and (counts.found, counts.done) == (5, 3)
     errors = {row["episode"]: row["error"] for row in counts.quarantined}
-    assert errors["episode_003"] == "actions: 5 dimensions, those of the others have 2; ingest it alone"
+    assert errors["episode_003"] == "actions: 5 dimensions, those of most others have 2; ingest it alone"
     assert "another episode is called episode_000" in errors["episode_000"]
+
+
+def test_a_manifest_tells_of_all_that_is_quarantined_under_one_name(tmp_path: Path) -> None:
+    made(plan(tmp_path, Odd(5, broken=(0,))))
+    manifest = open_store(tmp_path / "store").manifest
+    assert "video_0.mp4: truncated" in manifest["quarantine"]["episode_000"]
+    assert "another episode is called episode_000" in manifest["quarantine"]["episode_000"]
+    counts = manifest["counts"]
+    assert counts["found"] == counts["done"] + counts["without"] + counts["quarantined"] == 6
+    assert counts["quarantined"] == 3
+
+
+def test_the_first_episode_does_not_say_how_long_actions_are(tmp_path: Path) -> None:
+    class First(Source):
+        def read(self, ref: EpisodeRef) -> Episode:
+            width = 5 if ref.location["number"] == 0 else 2
+            return episode(ref.id, actions=np.zeros((40, width), np.float32), fingerprint=ref.fingerprint)
+
+    counts = made(plan(tmp_path, First(4)))
+    assert counts is not None and [row["episode"] for row in counts.quarantined] == ["episode_000"]
 
 
 @dataclass
@@ -163,6 +248,37 @@ def test_an_id_leads_nowhere_but_into_the_folder(tmp_path: Path) -> None:
     assert counts is not None and counts.done == 5
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
     assert sorted(path.name for path in (tmp_path / "inner").iterdir()) == ["store", "work"]
+
+
+def test_what_is_no_store_of_this_data_set_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "thesis.txt").write_text("years of work")
+    with pytest.raises(StoreError, match=r"exists and is not a store"):
+        made(plan(tmp_path, Source(2)))
+    made(plan(tmp_path / "inner", Source(2)))
+    with pytest.raises(StoreError, match=r"holds clips of toy, not what this makes of other"):
+        made(plan(tmp_path / "inner", Source(2, name="other")))
+    manifest = tmp_path / "inner" / "store" / "manifest.json"
+    merged = {name: value for name, value in json.loads(manifest.read_text()).items() if name != "counts"}
+    manifest.write_text(json.dumps(merged))
+    with pytest.raises(StoreError, match=r"holds clips of toy, not what this makes of toy"):
+        made(plan(tmp_path / "inner", Source(3)))
+    assert not (tmp_path / "work").exists()
+
+
+def test_two_that_make_one_store_do_not_meet(tmp_path: Path) -> None:
+    work = plan(tmp_path, Source(2))
+    with lock(work.job.folder / LOCK), pytest.raises(StoreError, match=r"another process is making it"):
+        made(work)
+    assert made(work) is not None
+
+
+def test_what_a_killed_worker_left_is_swept_up(tmp_path: Path) -> None:
+    left = tmp_path / "work" / "units" / "tracks" / "ab" / "x.array_record.host-1.tmp"
+    left.parent.mkdir(parents=True)
+    left.touch()
+    made(plan(tmp_path, Source(2)))
+    assert not left.exists()
 
 
 @pytest.mark.parametrize(
@@ -193,8 +309,30 @@ def test_memory_does_not_grow_with_the_episodes(tmp_path: Path, monkeypatch: pyt
     config = ClipConfig(CONFIG.windows, image_size=96, tracks=6)  # 440 kB of pixels a clip, 5 clips an episode
     monkeypatch.setattr("tests.annotate.test_ingest.CONFIG", config)
     peak(1)
-    few, many = peak(2), peak(12)
-    assert many < few + 1_000_000
+    few, many = peak(3), peak(12)
+    assert many < few + 1_000_000  # the pixels of nine more episodes are 20 MB
+
+
+def test_what_workers_are_told_and_tell_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ids and places, never pictures: all that an executor is given and gives, pickled."""
+    sent: list[int] = []
+
+    class Recording(Inline):
+        def submit(self, unit: Unit) -> None:
+            sent.append(len(pickle.dumps(unit)))
+            super().submit(unit)
+
+        def wait(self) -> list[Outcome]:
+            outcomes = super().wait()
+            sent.append(len(pickle.dumps(outcomes)))
+            return outcomes
+
+    config = ClipConfig(CONFIG.windows, image_size=96, tracks=6)
+    monkeypatch.setattr("tests.annotate.test_ingest.CONFIG", config)
+    work = plan(tmp_path, Source(2, depth=True), Annotators())
+    ingest(work, lambda: Recording(work.job), lambda done, total: None, keep_clips=True)
+    assert len(sent) == 20 and max(sent) < 2000
+    assert all(len(record["rgb"].tobytes()) > 100_000 for record in [open_store(work.out).source("train")[0]])
 
 
 def test_a_failed_packing_leaves_the_old_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,7 +343,7 @@ def test_a_failed_packing_leaves_the_old_store(tmp_path: Path, monkeypatch: pyte
         raise OSError(errno.ENOSPC, "No space left on device")
         yield {}
 
-    monkeypatch.setattr(ingest_module, "_records", failing)
+    monkeypatch.setattr(packing, "_records", failing)
     with pytest.raises(StoreError, match=r"disk is full"):
         made(plan(tmp_path, Source(3)))
     assert hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest() == before

@@ -20,6 +20,7 @@ from rsjax.annotate.protocols import ArrayFrames, in_chunks, parameters
 from rsjax.annotate.semantics import OwnSemantics
 from rsjax.annotate.shots import HistogramShots
 from rsjax.annotate.tracks import LucasKanade
+from rsjax.config import ConfigError
 
 HERE = Path(__file__)
 ALL = [
@@ -87,3 +88,26 @@ def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap
     assert all(part == list(range(start, start + len(part))) and len(part) <= size for start, part in chunks)
     held = [t for i, (_, part) in enumerate(chunks) for t in part[overlap if i else 0 :]]
     assert held == list(range(count))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: LucasKanade(grid=0), "lucas-kanade: grid is 0"),
+        (lambda: LucasKanade(window=2), "at least 3"),
+        (lambda: LucasKanade(levels=-1), "levels is -1"),
+        (lambda: HistogramShots(shortest=0), "hsv-histogram: shortest is 0"),
+        (lambda: DISFlow(preset=3), "choose 0, 1 or 2"),
+        (lambda: OwnSemantics(smooth=0), "own: smooth is 0"),
+        (lambda: SpatialTracker(HERE, HERE, span=0), "spatial-tracker: span is 0"),
+        (lambda: BootsTapir(HERE, HERE, side=100), "multiple of 8"),
+        (lambda: TransNetShots(shortest=-1), "transnetv2: shortest is -1"),
+        (lambda: RaftFlow(HERE, batch=0), "raft: batch is 0"),
+        (lambda: VideoDepthAnything(HERE, HERE, input_size=0), "input_size is 0"),
+        (lambda: DepthAnything(HERE, batch=0), "depth-anything: batch is 0"),
+        (lambda: InternVL(HERE, tries=0), "internvl: tries is 0"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_named_at_once(wrong, message):
+    with pytest.raises(ConfigError, match=message):
+        wrong()

@@ -7,10 +7,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 
 from rsjax.annotate.pool import ProcessPool
-from rsjax.annotate.runner import Counts, Executor, Inline, count, run, write_tables
+from rsjax.annotate.report import Counts, count, write_tables
+from rsjax.annotate.runner import Executor, Inline, limit_threads, run
 from rsjax.annotate.units import Job, Unit, mark_path
 from rsjax.data.episode import EpisodeRef
 from rsjax.data.store import StoreError
@@ -22,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 def finish(work: Job, executor: Executor | None = None) -> Counts:
     """Runs it to its end, and counts; the numbers add up."""
-    refs, told = list(work.source.episodes()), []
+    refs, told = list(work.source.episodes()), list[tuple[int, int]]()
     run(work, refs, executor or Inline(work), lambda done, total: told.append((done, total)))
     assert told[-1] == (len(refs) * len(work.stages), len(refs) * len(work.stages))
     counts = count(work, refs)
@@ -42,6 +44,35 @@ def test_every_stage_runs_once_and_sees_the_one_before(tmp_path: Path) -> None:
     )
     finish(work)
     assert len(runs(tmp_path)) == 6
+
+
+def test_a_run_says_what_it_did_itself(tmp_path: Path) -> None:
+    work = job(tmp_path, Source(3), seconds=0.02)
+    refs = list(work.source.episodes())
+    first = run(work, refs[:2], Inline(work), lambda done, total: None)
+    assert (first.units, first.clips) == (4, 4) and first.seconds >= 4 * 0.02
+    assert first.clips_per_second == pytest.approx(4 / first.seconds)
+    rest = run(work, refs, Inline(work), lambda done, total: None)
+    assert (rest.units, rest.clips) == (2, 2)
+    stages = count(work, refs).stages
+    assert stages["first"]["seconds"] >= 0.06
+    assert stages["first"]["clips_per_second"] == pytest.approx(6 / stages["first"]["seconds"])
+
+
+def test_a_worker_leaves_cores_to_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    before = cv2.getNumThreads()
+    limit_threads(1)
+    assert cv2.getNumThreads() == 1 and os.environ["OMP_NUM_THREADS"] == "1"
+    cv2.setNumThreads(before)
+
+
+def test_keys_are_the_same_when_they_are_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsjax.annotate.units.RECENT", 2)
+    work, refs = job(tmp_path, Source(5)), list(Source(5).episodes())
+    first = [work.keys(ref) for ref in refs]
+    assert [work.keys(ref) for ref in refs] == first == [job(tmp_path, Source(5)).keys(ref) for ref in refs]
+    assert len({key for keys in first for key in keys.values()}) == 10
 
 
 def test_only_what_depends_on_a_change_runs_again(tmp_path: Path) -> None:

@@ -1,3 +1,6 @@
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +14,7 @@ from rsjax.annotate.windows import (
     index_windows,
     judge,
     segment_at,
+    starts_by_reason,
     tally,
 )
 from rsjax.config import ConfigError
@@ -77,6 +81,29 @@ def test_a_rate_above_the_recorded_one_is_refused() -> None:
         frame_offsets(5, WindowConfig(rate=10))
 
 
+@pytest.mark.parametrize("fps", [1e30, float("inf"), float("nan")])
+def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
+    with pytest.raises(EpisodeError, match=r"fps: recorded at .* which no camera does"):
+        index_windows(fps, [(0, 100)], WindowConfig())
+
+
+@given(FPS, st.lists(st.integers(1, 299), max_size=6), st.lists(st.integers(0, 300), max_size=8), CONFIGS)
+def test_no_window_reaches_across_a_cut_or_out_of_a_segment(
+    fps: float, cuts: list[int], edges: list[int], config: WindowConfig
+) -> None:
+    bounds = [0, *sorted(set(cuts)), 300]
+    edges = sorted(set(edges))
+    segments = [Segment(a, b, f"{a}") for a, b in itertools.pairwise(edges)][::2]
+    for within in (False, True):
+        asked = dataclasses.replace(config, within_segments=within)
+        index = index_windows(fps, cut_spans(300, list(itertools.pairwise(bounds)), segments, asked), asked)
+        for number in range(len(index)):
+            first, last = index.frames(number)[[0, -1]]
+            assert first >= 0 and last < 300
+            assert not any(first < cut <= last for cut in bounds)
+            assert not (within and segments) or any(s.start <= first and last < s.end for s in segments)
+
+
 def test_spans_are_shots_and_where_asked_segments_within_them() -> None:
     segments = [Segment(0, 30, "a"), Segment(30, 80, "b")]
     assert cut_spans(100, [], segments, WindowConfig()) == [(0, 100)]
@@ -105,6 +132,7 @@ def test_each_filter_leaves_out_what_it_names() -> None:
     reasons = judge(index, times, motion, [3, 20, 35], config)
     assert reasons == ["gap", "still", "", "shaking", "no key frame"]
     assert tally(reasons) == {"kept": 1, "gap": 1, "no key frame": 1, "shaking": 1, "still": 1}
+    assert starts_by_reason(index, reasons) == {"gap": [0], "still": [10], "shaking": [30], "no key frame": [40]}
     assert judge(index, np.arange(60) / 10, None, [], WindowConfig(frames=3, rate=2)) == [""] * 5
 
 
@@ -117,7 +145,9 @@ def test_reasons_are_one_for_each_window(fps: float, parts: list[Span], config: 
     assert len(reasons) == len(index) == sum(tally(reasons).values())
 
 
-@pytest.mark.parametrize("fields", [{"frames": 1}, {"rate": -1}, {"hop": 0}, {"most_gap": 0.5}, {"most_motion": -1}])
+@pytest.mark.parametrize(
+    "fields", [{"frames": 1}, {"frames": 10**9}, {"rate": -1}, {"hop": 0}, {"most_gap": 0.5}, {"most_motion": -1}]
+)
 def test_impossible_windows_are_refused_by_name(fields: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=f"windows.{next(iter(fields))}"):
         WindowConfig(**fields)  # type: ignore[arg-type]

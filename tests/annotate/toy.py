@@ -6,13 +6,14 @@ import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from rsjax.annotate.protocols import AnnotationError, ArrayDepths, DepthMaps, Tracked
 from rsjax.annotate.units import Inputs, Job, Summary, Work
 from rsjax.data.codec import Record
-from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, Segment
+from rsjax.data.episode import Depths, Episode, EpisodeError, EpisodeRef, Frames, Segment
 
 FPS = 10.0
 
@@ -64,12 +65,19 @@ def episode(name: str, count: int = 40, depth: bool = False, **fields: Any) -> E
 
 @dataclass
 class Source:
-    """``count`` episodes of 40 frames; those in ``broken`` cannot be read, those in ``short`` have 5 frames."""
+    """``count`` episodes of 40 frames; those in ``broken`` cannot be read, those in ``short`` have 5 frames.
+
+    Attributes:
+        deep: how many of them, from the first on, have depth even if ``depth`` is False.
+        only: one more that has.
+    """
 
     count: int
     broken: tuple[int, ...] = ()
     short: tuple[int, ...] = ()
     depth: bool = False
+    deep: int = 0
+    only: int = -1
     version: str = "0"
     name: str = "toy"
 
@@ -81,7 +89,8 @@ class Source:
         number = ref.location["number"]
         if number in self.broken:
             raise EpisodeError(f"video_{number}.mp4: truncated; copy it again")
-        return episode(ref.id, 5 if number in self.short else 40, self.depth, fingerprint=ref.fingerprint)
+        frames, deep = 5 if number in self.short else 40, self.depth or number < self.deep or number == self.only
+        return episode(ref.id, frames, deep, fingerprint=ref.fingerprint)
 
 
 @dataclass(frozen=True)
@@ -138,3 +147,36 @@ def job(folder: Path, source: Source, **fields: Any) -> Job:
 def runs(folder: Path) -> list[str]:
     """The lines of the log."""
     return (folder / "log").read_text().splitlines() if (folder / "log").exists() else []
+
+
+@dataclass(frozen=True)
+class Relative:
+    """A depth network that says 3 of everything, without a unit; where ``there`` is False it cannot be loaded."""
+
+    name: ClassVar[str] = "relative"
+    version: ClassVar[int] = 1
+    there: bool = True
+    device: str = "cpu"
+
+    def __call__(self, episode: Episode, camera: str) -> DepthMaps:
+        frames = len(episode.timestamps)
+        return DepthMaps(ArrayDepths(np.full((frames, 12, 16), 3, np.float32)), "relative", (0.0, 1.0))
+
+    def load(self) -> None:
+        if not self.there:
+            raise AnnotationError("relative.pt: no such file")
+
+
+@dataclass(frozen=True)
+class ByDepth:
+    """A tracking network of one point, whose x is the depth of each frame / 10."""
+
+    name: ClassVar[str] = "by-depth"
+    version: ClassVar[int] = 1
+    device: str = "cpu"
+
+    def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
+        if depth is None:
+            raise AnnotationError("no depth to track by")
+        x = depth.read(range(len(frames)))[:, 0, 0] / 10
+        return Tracked(np.stack([x, x], 1)[None].astype(np.float32), np.ones((1, len(frames)), bool))

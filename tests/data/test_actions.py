@@ -104,6 +104,16 @@ def test_flipped_signs_of_a_turning_hand_are_undone(flips: list[bool]) -> None:
     np.testing.assert_array_equal(mended, smooth * signs[0])
 
 
+@given(st.lists(st.booleans(), min_size=6, max_size=6), st.sampled_from(["join", "last", "stack"]))
+def test_signs_of_quaternions_do_not_change_what_leads_from_one_to_the_other(flips: list[bool], compose: str) -> None:
+    smooth = np.stack([turn(1, 0.3 * step) for step in range(6)]).astype(np.float32)
+    signs = np.where(flips, -1.0, 1.0)[:, None].astype(np.float32)
+    config = ActionConfig(compose=compose, kind="delta")  # type: ignore[arg-type]
+    frames, layout = np.arange(1, 6, 2), Layout("absolute", (0,))
+    made = sampled_actions(smooth * signs, frames, config, layout)
+    np.testing.assert_allclose(made, sampled_actions(smooth, frames, config, layout), atol=1e-6)
+
+
 @given(ROWS, ROWS)
 def test_statistics_of_parts_are_those_of_the_whole(left: np.ndarray, right: np.ndarray) -> None:
     right = np.resize(right, (len(right), left.shape[1]))
@@ -125,8 +135,10 @@ def test_what_does_not_fit_is_told() -> None:
         ActionConfig(compose="sum")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="the source records deltas"):
         sampled_actions(rows, np.arange(3), ActionConfig(kind="absolute"), Layout("delta"))
-    with pytest.raises(EpisodeError, match="names dimension 5, but actions have 2"):
+    with pytest.raises(EpisodeError, match="names dimension 2, but actions have 2"):
         sampled_actions(rows, np.arange(3), EVERY, Layout("absolute", quaternions=(2,)))
+    with pytest.raises(EpisodeError, match="names dimension -1, but actions have 2"):
+        sampled_actions(rows, np.arange(3), EVERY, Layout("delta", held=(-1,)))
     with pytest.raises(EpisodeError, match="actions of 3 dimensions among such of 2"):
         Statistics.of(rows).merged(Statistics.of(np.zeros((1, 3))))
 

@@ -15,8 +15,10 @@ from experiments import doctor as command
 from rsjax.config import ConfigError
 from rsjax.data.doctor import examine, open_any
 from rsjax.data.episode import Episode, EpisodeError, Segment, SourceError
+from rsjax.data.formats import open_source
 from rsjax.data.selection import select, write_selection
 from rsjax.data.symptoms import KINDS, Thresholds, quaternions
+from tests.data.formats.test_folder import write_episode
 from tests.data.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.data.toy_source import COUNT, Pictures, ToySource, episode, pictures, source
 
@@ -155,6 +157,74 @@ def test_quaternions_are_recognised_among_other_numbers(seed: int, before: int, 
     assert quaternions(rows) == [before]
 
 
+def test_a_gripper_after_zeros_is_no_quaternion() -> None:
+    rows = np.zeros((6, 7))
+    rows[:, 6] = [-1, -1, 1, 1, -1, 1]
+    assert quaternions(rows) == []
+    odd = episode(ODD)
+    held = replace(odd, actions=changed(odd.actions, (slice(None), slice(4, 8)), 0.5), meta={"actions": {"held": [7]}})
+    held.actions[6:, 4:] *= -1
+    assert "quaternion-flip" not in examine(source(held), Thresholds()).counts()
+    assert "quaternion-flip" in examine(source(replace(held, meta={})), Thresholds()).counts()
+
+
+@pytest.mark.parametrize("kind", ["length", "time", "not-finite", "undecodable", "camera"])
+def test_what_a_reader_refuses_is_told_by_its_kind(kind: str) -> None:
+    report = examine(source(EpisodeError("a.h5:\n\nwrong", kind)), Thresholds())
+    assert [(finding.kind, finding.detail) for finding in report.findings] == [(kind, "a.h5: wrong")]
+
+
+def test_what_a_reader_mended_is_told_and_no_finding() -> None:
+    notes = {"empty": ["state/waist"], "scattered": {"end": 3}, "depth_left_out": "7 maps for 8 frames"}
+    report = examine(source(replace(episode(ODD), meta={"notes": notes})), Thresholds())
+    assert not report.findings
+    assert report.mended == (
+        ("episode-6", "empty: state/waist; scattered: end 3; depth left out: 7 maps for 8 frames"),
+    )
+
+
+def test_episodes_of_one_name_are_all_counted_and_left_out(tmp_path: Path) -> None:
+    report = examine(source(replace(episode(7), id="episode-2")), Thresholds())
+    assert report.counts() == {"duplicate": 2} and report.bad() == 2
+    assert write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons()) == (5, 2)
+
+
+def test_damaged_files_are_told_by_kind_and_left_out(tmp_path: Path) -> None:
+    data_set = tmp_path / "set"
+    for name in ("one", "cut", "nan", "other", "short", "still", "twin"):
+        write_episode(data_set, name)
+        (data_set / name / "actions.csv").write_text(
+            "timestamp,x\n" + "".join(f"{row / 10},{row + (name == 'other')}\n" for row in range(8))
+        )
+    payload = (data_set / "cut" / "front.mp4").read_bytes()
+    (data_set / "cut" / "front.mp4").write_bytes(payload[: len(payload) // 2])
+    (data_set / "nan" / "actions.csv").write_text("x\n" + "1\n" * 3 + "nan\n" + "1\n" * 4)
+    (data_set / "short" / "actions.csv").write_text("x\n" + "1\n" * 5)
+    (data_set / "still" / "actions.csv").write_text("timestamp,x\n" + "0,1\n" * 8)
+    (data_set / "dataset.json").write_text('{"task": "go"}')
+    read = open_source("folder", data_set)
+    report = examine(read, Thresholds())
+    assert {finding.episode: finding.kind for finding in report.findings} == {
+        "cut": "undecodable",
+        "nan": "not-finite",
+        "short": "length",
+        "still": "time",
+        "twin": "duplicate",
+    }
+    assert write_selection(tmp_path / "m.json", "set", report.refs, report.reasons()) == (2, 5)
+    chosen = select(read, tmp_path / "m.json")
+    good = [ref.id for ref in chosen.episodes() if "left_out" not in ref.location]
+    assert good == ["one", "other"] and len(list(chosen.episodes())) == len(report.refs) == 7
+
+
+def test_a_manifest_made_with_other_options_is_told(tmp_path: Path) -> None:
+    report = examine(source(), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons())
+    others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
+    with pytest.raises(SourceError, match=r"m.json: the data set was read with other options then"):
+        select(others, tmp_path / "m.json")
+
+
 def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: Path) -> None:
     data_set = source(replace(episode(6), task=""), episode(7))
     report = examine(data_set, Thresholds())
@@ -179,9 +249,10 @@ def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"format": 2}', '{"format": 1, "kept": 3, "left_out": []}'])
 def test_another_file_is_no_manifest(tmp_path: Path, content: str) -> None:
-    (tmp_path / "m.json").write_text(content)
-    with pytest.raises(SourceError, match="m.json: not a manifest"):
-        select(source(), tmp_path / "m.json")
+    for text in (content, "[" * 100_000 + content):
+        (tmp_path / "m.json").write_text(text)
+        with pytest.raises(SourceError, match="m.json: not a manifest"):
+            select(source(), tmp_path / "m.json")
 
 
 def test_the_manifest_of_another_data_set_is_told(tmp_path: Path) -> None:
@@ -227,5 +298,8 @@ def test_the_command_tells_by_its_status(
     ]
     write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task="")])
     assert run(monkeypatch, "rlds", tmp_path / "data", "--ignore", "no-task") == 0
+    write_bridge(tmp_path / "data", [bridge_episode(4, task="")])
+    assert run(monkeypatch, "rlds", tmp_path / "data") == 1
+    assert "all are 'no-task': if that is as it should be, --ignore no-task" in capsys.readouterr().out
     assert run(monkeypatch, "rlds", tmp_path / "nowhere") == 2
     assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split") == 2

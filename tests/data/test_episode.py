@@ -1,4 +1,5 @@
 import os
+import pickle
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -60,6 +61,11 @@ def test_a_good_episode_passes() -> None:
 def test_what_is_wrong_is_named(changes: dict, message: str) -> None:
     with pytest.raises(EpisodeError, match=f"^{re.escape(message)}"):
         checked(replace(GOOD, **changes), "f")
+
+
+def test_an_error_that_comes_from_another_process_keeps_its_kind() -> None:
+    error = pickle.loads(pickle.dumps(EpisodeError("f: late", "time")))
+    assert (str(error), error.kind, EpisodeError("f").kind) == ("f: late", "time", "unreadable")
 
 
 @given(st.lists(st.text(), unique=True, max_size=20))

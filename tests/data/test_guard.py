@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.data.guard import open_foreign
-from rsjax.data.store import MANIFEST, StoreError
+from rsjax.data.store import MANIFEST, StoreError, open_store
 from tests.data.clips import clip_store, numbers
 
 
@@ -33,7 +32,7 @@ def test_a_name_that_leads_elsewhere_is_refused(path: Path, name: Any) -> None:
     for keys in (("files", 0), ("labels",)):
         change(path, name, "splits", "train", *keys, "name")
         with pytest.raises(StoreError, match=r"splits.train.*name is .*not a file beside it"):
-            open_foreign(path)
+            open_store(path)
 
 
 @pytest.mark.parametrize("value", [-1, 2**60, "7", 1.5, None])
@@ -41,7 +40,7 @@ def test_impossible_sizes_are_refused(path: Path, value: Any) -> None:
     for field in ("bytes", "count"):
         change(path, value, "splits", "train", "files", 0, field)
         with pytest.raises(StoreError, match=r"splits.train.files.0"):
-            open_foreign(path)
+            open_store(path)
 
 
 @settings(max_examples=30, deadline=None)
@@ -52,13 +51,13 @@ def test_any_manifest_is_one_clear_line(tmp_path_factory: pytest.TempPathFactory
         (path / MANIFEST).write_text(json.dumps(content))
         if not _opened(path):
             with pytest.raises(StoreError, match=MANIFEST):
-                open_foreign(path)
+                open_store(path)
 
 
 def _opened(path: Path) -> bool:
     """Whether it is a store after all: one without splits, or with empty ones."""
     try:
-        open_foreign(path)
+        open_store(path)
     except StoreError:
         return False
     return True
@@ -68,13 +67,13 @@ def test_a_loop_of_links_is_told(path: Path) -> None:
     (path / MANIFEST).rename(path / "real")
     (path / MANIFEST).symlink_to(MANIFEST)
     with pytest.raises(StoreError, match=r"manifest.json: cannot be read \(Too many levels of symbolic links\)"):
-        open_foreign(path)
+        open_store(path)
 
 
 def test_bytes_that_are_no_text_are_told(path: Path) -> None:
     (path / MANIFEST).write_bytes(b"\xff\xfe\x00")
     with pytest.raises(StoreError, match=r"not JSON"):
-        open_foreign(path)
+        open_store(path)
 
 
 def test_a_missing_permission_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,8 +82,29 @@ def test_a_missing_permission_is_told(path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(Path, "read_text", refuse)  # root, who may run the tests, may read everything
     with pytest.raises(StoreError, match=r"manifest.json: cannot be read \(Permission denied\)"):
-        open_foreign(path)
+        open_store(path)
 
 
 def test_a_good_store_is_opened(path: Path) -> None:
-    assert numbers(open_foreign(path)) == [0, 1]
+    assert numbers(open_store(path)) == [0, 1]
+
+
+@pytest.mark.parametrize("split", ["../elsewhere", "/tmp/x", "..", ""])
+def test_a_split_that_leads_elsewhere_is_refused(path: Path, split: str) -> None:
+    change(path, {"files": []}, "splits", split)
+    with pytest.raises(StoreError, match=r"manifest.json: splits has .* cannot be the name of a file"):
+        open_store(path)
+
+
+def test_a_shard_that_is_a_loop_of_links_is_told(path: Path) -> None:
+    shard = path / "train-00000.array_record"
+    shard.unlink()
+    shard.symlink_to(shard)
+    with pytest.raises(StoreError, match=r"train-00000.array_record: cannot be read \(Too many levels of symbolic"):
+        open_store(path)
+
+
+def test_a_manifest_of_nothing_but_brackets_is_told(path: Path) -> None:
+    (path / MANIFEST).write_text("[" * 100_000)
+    with pytest.raises(StoreError, match=r"manifest.json: not JSON"):
+        open_store(path)

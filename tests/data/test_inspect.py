@@ -1,15 +1,12 @@
-import builtins
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.data.inspect import contact_sheet, histogram, look, motion_of, render, rerun_view
+from rsjax.data.inspect import contact_sheet, histogram, look, motion_of, render
 from rsjax.data.store import StoreError
-from rsjax.errors import UserError
 from tests.data.clips import clip, clip_store
 
 
@@ -72,16 +69,3 @@ def test_a_histogram_is_one_line(values: list[float]) -> None:
 def test_a_store_without_a_readable_clip_has_no_sheet(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"no clip can be read"):
         contact_sheet(clip_store(tmp_path / "a"), clips=0)
-
-
-def test_without_the_viewer_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def refuse(name: str, *arguments: Any, **options: Any) -> Any:
-        if name == "rerun":
-            raise ImportError(name)
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(UserError, match=r"pip install 'rsjax\[rerun\]'"):
-        rerun_view(clip_store(tmp_path / "a"))

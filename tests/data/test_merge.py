@@ -1,3 +1,4 @@
+import json
 import shutil
 from itertools import chain
 from pathlib import Path
@@ -84,7 +85,6 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
         ([a, a], r"neither be merged with itself"),
         ([a, tmp_path / "large"], r"large: rgb is uint8 \(4, 16, 16, 3\), in .*a uint8 \(4, 8, 8, 3\)"),
         ([a, tmp_path / "tokens"], r"its kind is tokens, that of .*a is clips"),
-        ([a, tmp_path / "deep"], r"deep: depth is float32 \(4, 8, 8\), in .*a none"),
     ):
         with pytest.raises(StoreError, match=match):
             merge(paths, tmp_path / "out")
@@ -97,8 +97,34 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
         split(a, {tmp_path / "none": lambda name, number, words: False})
 
 
-def test_tokens_in_other_units_are_refused(tmp_path: Path) -> None:
-    clip_store(tmp_path / "a", 0, kind="tokens")
-    clip_store(tmp_path / "b", 10, kind="tokens")
-    with pytest.raises(StoreError, match=r"its action_mean is .*mixed in training"):
+def test_clips_with_and_without_depth_go_together_but_not_metres_and_relative_depth(tmp_path: Path) -> None:
+    blind, deep = clip_store(tmp_path / "blind", 0, 2), clip_store(tmp_path / "deep", 10, 2, [1.0, 2.0])
+    merged = merge([blind.path, deep.path], tmp_path / "merged")
+    source = merged.source("train")
+    assert [source[i]["depth"] is None for i in range(4)] == [True, True, False, False]
+    assert merged.manifest["depth_range"] == [1.0, 2.0]
+    units = dict(zip(("blind", "deep", "far"), (None, "metres", "relative"), strict=True))
+    clip_store(tmp_path / "far", 20, 2, [1.0, 9.0])
+    for name, unit in units.items():
+        place = tmp_path / name / "manifest.json"
+        place.write_text(json.dumps(json.loads(place.read_text()) | {"depth_unit": unit}))
+    assert merge([blind.path, deep.path], tmp_path / "told").manifest["depth_unit"] == "metres"
+    with pytest.raises(StoreError, match=r"depth_unit: metres in .*deep; relative in .*far"):
+        merge([deep.path, tmp_path / "far"], tmp_path / "out")
+
+
+def test_what_was_left_out_of_each_is_told_of_all(tmp_path: Path) -> None:
+    for number, name in enumerate("ab"):
+        place = clip_store(tmp_path / name, 10 * number).path / "manifest.json"
+        more = {"quarantine": {"episode": f"bad in {name}"}, "filtered": {f"still {name}": "still"}}
+        place.write_text(json.dumps(json.loads(place.read_text()) | more))
+    told = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c").manifest
+    assert told["quarantine"] == {"episode": "bad in a", f"episode ({tmp_path / 'b'})": "bad in b"}
+    assert told["filtered"] == {"still a": "still", "still b": "still"}
+
+
+def test_tokens_of_another_depth_range_are_refused(tmp_path: Path) -> None:
+    clip_store(tmp_path / "a", 0, depth_range=[1.0, 2.0], kind="tokens")
+    clip_store(tmp_path / "b", 10, depth_range=[1.0, 3.0], kind="tokens")
+    with pytest.raises(StoreError, match=r"its depth_range is .*mixed in training"):
         merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out")

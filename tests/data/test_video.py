@@ -1,5 +1,6 @@
 import pickle
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -65,6 +66,8 @@ def test_frames_by_time(clip: Path) -> None:
         at_times(clip, np.array([0.201]), tolerance=1e-4)
     with pytest.raises(EpisodeError, match="no frame at 1.0000 s, row 1"):
         at_times(clip, np.array([0.0, 1.0]), tolerance=1e-4)
+    with pytest.raises(EpisodeError, match="no frame at nan s, row 0"):
+        at_times(clip, np.array([np.nan]), tolerance=1e-4)
     with pytest.raises(EpisodeError, match="rows 0 and 1 of the table show the same frame"):
         at_times(clip, np.array([0.2, 0.205]), tolerance=0.01)
 
@@ -125,6 +128,58 @@ def test_damage_in_the_middle_is_told(tmp_path: Path) -> None:
     path.write_bytes(payload)
     with pytest.raises(EpisodeError, match=r"v.mp4: frame \d+ \(at .* s\) cannot be decoded"):
         VideoFrames(path).read(range(30))
+
+
+def remuxed(source: Path, path: Path, first: int, begins: int) -> Path:
+    """The packets from frame ``first`` on, of a file that is shown from frame ``begins`` on: so trimming tools cut."""
+    options = {"avoid_negative_ts": "disabled", "use_editlist": "1"}
+    with av.open(str(source)) as recorded, av.open(str(path), "w", options=options) as out:
+        stream, tick = out.add_stream_from_template(recorded.streams.video[0]), scan(source).stamps[1]
+        for packet in recorded.demux(video=0):
+            if packet.pts is not None and packet.dts is not None and packet.pts >= first * tick:
+                packet.pts, packet.dts, packet.stream = packet.pts - begins * tick, packet.dts - begins * tick, stream
+                out.mux(packet)
+    return path
+
+
+def test_frames_that_an_edit_list_hides_are_not_missing(tmp_path: Path, clip: Path) -> None:
+    path = remuxed(clip, tmp_path / "cut.mp4", first=5, begins=8)
+    frames = VideoFrames(path)
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].frames == 25 > len(frames) == 22
+    assert numbers_of(frames.read(range(22))) == list(range(8, 30))
+    assert numbers_of(frames.read([5])) == [13]
+
+
+def test_a_playlist_opens_no_other_file(tmp_path: Path, clip: Path) -> None:
+    (tmp_path / "beside.mp4").write_bytes(clip.read_bytes())
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile beside.mp4\n")
+    with pytest.raises(EpisodeError, match=r"list.mp4: not a readable video"):
+        scan(tmp_path / "list.mp4")
+
+
+def test_pictures_of_several_sizes_are_told(tmp_path: Path) -> None:
+    streams = []
+    for side in (32, 64):
+        with av.open(str(tmp_path / f"{side}.h264"), "w", format="h264") as out:
+            stream = out.add_stream("libx264", rate=30, options={"bf": "0"})
+            stream.height, stream.width, stream.pix_fmt = side, side, "yuv420p"
+            for _ in range(3):
+                out.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((side, side, 3), np.uint8))))
+            out.mux(stream.encode())
+        streams.append((tmp_path / f"{side}.h264").read_bytes())
+    (tmp_path / "both.h264").write_bytes(b"".join(streams))
+    with av.open(str(tmp_path / "both.h264")) as source, av.open(str(tmp_path / "both.mkv"), "w") as out:
+        stream = out.add_stream_from_template(source.streams.video[0])
+        packets = [packet for packet in source.demux(video=0) if packet.size]
+        for number, packet in enumerate(packets):
+            packet.pts = packet.dts = number * 33
+            packet.time_base, packet.stream = Fraction(1, 1000), stream
+            out.mux(packet)
+    frames = VideoFrames(tmp_path / "both.mkv")
+    assert frames.read([0, 1]).shape == (2, 32, 32, 3)
+    with pytest.raises(EpisodeError, match=r"both.mkv: frame 5: pictures of several sizes \(64 × 64"):
+        frames.read([0, 5])
 
 
 @pytest.mark.parametrize("payload", [b"", b"not a video", b"\x00" * 5000])

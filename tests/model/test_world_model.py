@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -8,133 +7,23 @@ import numpy as np
 import pytest
 
 from rsjax.config import ModelConfig
-from rsjax.model.world_model import WorldModel, branches, empty_cache
-
-DUAL = ModelConfig(frames=5, grid=2, code_bits=4, action_dim=3, width=8, blocks=2, heads=2)
-RGB = replace(DUAL, depth=False)
-NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
-QK_NORM = replace(DUAL, qk_norm=True, mup=True)
-GENIE = replace(RGB, action_dim=0)
-GUIDED = replace(DUAL, action_dropout=0.5)
-BATCH = 2
-
-
-def forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
-    logits, cache = _apply(config, params, *inputs)
-    assert cache is None
-    return jax.tree.map(np.asarray, logits)
-
-
-def _apply_plain(
-    config: ModelConfig,
-    params: Any,
-    tokens: Any,
-    mask: Any,
-    actions: Any,
-    start: Any = 0,
-    cache: Any = None,
-    drop_actions: Any = None,
-):
-    return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache, drop_actions)
-
-
-_apply = jax.jit(_apply_plain, static_argnums=0)
-
-
-def random_params(config: ModelConfig) -> Any:
-    """Parameters without a zero among them, so that nothing hides behind an initial value."""
-    rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
-    return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
-
-
-def random_inputs(config: ModelConfig, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    shape = (BATCH, config.frames, config.grid, config.grid)
-    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in branches(config)}
-    return (
-        tokens,
-        rng.random(shape) < 0.4,
-        rng.normal(size=(BATCH, config.frames, config.action_dim)).astype(np.float32),
-    )
-
-
-# The model once more, cell by cell, from the paper's §2.3 and the public Genie's layout.
-
-
-def softmax(x: np.ndarray) -> np.ndarray:
-    e = np.exp(x - x.max(-1, keepdims=True))
-    return e / e.sum(-1, keepdims=True)
-
-
-def gelu(x: np.ndarray) -> np.ndarray:
-    return x * 0.5 * (1 + np.vectorize(math.erf)(x / math.sqrt(2)))
-
-
-def layer_norm(x: np.ndarray, p: dict) -> np.ndarray:
-    centred = x - x.mean(-1, keepdims=True)
-    return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * p["scale"] + p["bias"]
-
-
-def sequence_attention(x: np.ndarray, p: dict, config: ModelConfig, causal: bool) -> np.ndarray:
-    """Attention over one sequence (L, C)."""
-    length, width = x.shape
-    heads = config.heads
-    qkv = (x @ p["qkv"]["kernel"]).reshape(length, 3, heads, width // heads)
-    if config.qk_norm:
-        qkv[:, :2] = layer_norm(qkv[:, :2], p["norm"])
-    scale = 8 / (width // heads) if config.mup else 1 / math.sqrt(width // heads)
-    out = np.zeros((length, heads, width // heads))
-    for head in range(heads):
-        for i in range(length):
-            last = i + 1 if causal else length
-            scores = qkv[:last, 1, head] @ qkv[i, 0, head] * scale
-            out[i, head] = softmax(scores) @ qkv[:last, 2, head]
-    return out.reshape(length, width) @ p["proj"]["kernel"] + p["proj"]["bias"]
-
-
-def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
-    x = x.copy()
-    b, t, s, _ = x.shape
-    normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
-    x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
-    before = layer_norm(x, p["norm_temporal"]) if config.temporal_norm else x.copy()
-    for i in range(b):
-        for cell in range(s):
-            x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
-    normed = x if config.qk_norm else layer_norm(x, p["norm2"])
-    hidden = gelu(normed @ p["fc1"]["kernel"] + p["fc1"]["bias"])
-    return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
-
-
-def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
-    tokens, mask, actions = inputs
-    p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
-    b, t = mask.shape[:2]
-    h = {}
-    for name, grid in tokens.items():
-        embed = p[f"{name}_embed"]
-        flat = grid.reshape(b, t, -1)
-        x = sum(
-            embed[f"factored_embed_{k}"]["embedding"][(flat // config.vocabulary_size**k) % config.vocabulary_size]
-            for k in range(config.vocabularies)
-        )
-        x[mask.reshape(b, t, -1)] = embed["mask_token_embed"]
-        h[name] = x + p["pos_embed"][:t]
-        if config.action_dim:
-            h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
-    for block in range(config.blocks):
-        own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
-        h = {name: st_block(x, own[name], config) for name, x in h.items()}
-        if config.depth:
-            h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
-    if config.final_norm:
-        h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
-    if config.mup:
-        h = {name: x * 256 / config.width for name, x in h.items()}
-    logits = {name: x @ p[f"{name}_head"]["kernel"] + p[f"{name}_head"]["bias"] for name, x in h.items()}
-    return {name: x.reshape(*x.shape[:3], config.vocabularies, config.vocabulary_size) for name, x in logits.items()}
-
+from rsjax.model.world_model import WorldModel, empty_cache
+from tests.model.toy import (
+    BATCH,
+    DUAL,
+    GENIE,
+    GUIDED,
+    NORMED,
+    QK_NORM,
+    RGB,
+    apply,
+    apply_plain,
+    blind,
+    forward,
+    plain_forward,
+    random_inputs,
+    random_params,
+)
 
 CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "genie": GENIE}
 
@@ -180,7 +69,7 @@ def test_without_an_action_encoder_actions_are_not_read() -> None:
 def test_a_dropped_clip_sees_the_null_action_in_every_frame_and_the_others_their_own() -> None:
     params, (tokens, mask, actions) = random_params(GUIDED), random_inputs(GUIDED)
     drop = np.array([True, False])
-    dropped, _ = _apply(GUIDED, params, tokens, mask, actions, 0, None, drop)
+    dropped, _ = apply(GUIDED, params, tokens, mask, actions, 0, None, drop)
     own = forward(GUIDED, params, (tokens, mask, actions))
     null = dict(params, action_encoder={"kernel": np.zeros((3, 8), np.float32), "bias": params["null_action"]})
     without = forward(GUIDED, null, (tokens, mask, actions))
@@ -190,9 +79,33 @@ def test_a_dropped_clip_sees_the_null_action_in_every_frame_and_the_others_their
         assert not np.allclose(own[name][0], without[name][0], atol=0.1)
 
 
+def test_a_clip_without_depth_has_it_hidden_in_every_frame_and_the_others_as_the_mask_says() -> None:
+    params, (tokens, mask, actions) = random_params(DUAL), random_inputs(DUAL)
+    hidden, _ = apply(DUAL, params, tokens, mask, actions, no_depth=np.array([True, False]))
+    own = forward(DUAL, params, (tokens, mask, actions))
+    without = forward(DUAL, blind(params), (tokens, mask, actions))
+    for name in own:
+        np.testing.assert_allclose(hidden[name][0], without[name][0], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(hidden[name][1], own[name][1], rtol=1e-4, atol=1e-4)
+        assert not np.allclose(own[name][0], without[name][0], atol=0.1)
+    other = tokens | {"depth": tokens["depth"] ^ np.array([5, 0])[:, None, None, None]}
+    again, _ = apply(DUAL, params, other, mask, actions, no_depth=np.array([True, False]))
+    jax.tree.map(np.testing.assert_array_equal, hidden, again)
+
+
+def test_hiding_depth_leaves_the_callers_mask_and_a_model_without_depth_as_they_are() -> None:
+    inputs = random_inputs(DUAL)
+    before = inputs[1].copy()
+    apply_plain(DUAL, random_params(DUAL), *inputs, no_depth=np.ones(BATCH, bool))
+    np.testing.assert_array_equal(inputs[1], before)
+    params, inputs = random_params(RGB), random_inputs(RGB)
+    alone, _ = apply(RGB, params, *inputs, no_depth=np.ones(BATCH, bool))
+    np.testing.assert_array_equal(alone["rgb"], forward(RGB, params, inputs)["rgb"])
+
+
 def test_actions_cannot_be_dropped_without_a_null_action() -> None:
     with pytest.raises(ValueError, match="model.action_dropout"):
-        _apply_plain(DUAL, random_params(DUAL), *random_inputs(DUAL), drop_actions=np.array([True, False]))
+        apply_plain(DUAL, random_params(DUAL), *random_inputs(DUAL), drop_actions=np.array([True, False]))
 
 
 @pytest.mark.parametrize("remat", ["products", "blocks"])
@@ -200,7 +113,7 @@ def test_remat_changes_neither_parameters_nor_gradients(remat: Literal["products
     params, inputs = random_params(DUAL), random_inputs(DUAL)
 
     def gradients(config: ModelConfig) -> Any:
-        loss = lambda params: sum(jnp.mean(jnp.square(x)) for x in _apply_plain(config, params, *inputs)[0].values())  # noqa: E731
+        loss = lambda params: sum(jnp.mean(jnp.square(x)) for x in apply_plain(config, params, *inputs)[0].values())  # noqa: E731
         return jax.jit(jax.grad(loss))(params)
 
     plain, again = gradients(DUAL), gradients(replace(DUAL, remat=remat))
@@ -211,7 +124,7 @@ def test_of_the_remat_policies_each_keeps_less_than_the_one_before() -> None:
     params, inputs = random_params(DUAL), random_inputs(DUAL)
 
     def kept(remat: Literal["none", "products", "blocks"]) -> int:
-        forward = lambda params: _apply_plain(replace(DUAL, remat=remat), params, *inputs)[0]  # noqa: E731
+        forward = lambda params: apply_plain(replace(DUAL, remat=remat), params, *inputs)[0]  # noqa: E731
         return sum(x.size for x in jax.tree.leaves(jax.eval_shape(lambda p: jax.vjp(forward, p)[1], params)))
 
     assert kept("none") > kept("products") > kept("blocks")
@@ -311,7 +224,7 @@ def test_pieces_through_the_cache_are_the_whole(config: ModelConfig, pieces: tup
     for length in pieces:
         here = slice(start, start + length)
         piece = ({name: x[:, here] for name, x in tokens.items()}, mask[:, here], actions[:, here])
-        logits, cache = _apply(config, params, *piece, start, cache)
+        logits, cache = apply(config, params, *piece, start, cache)
         for name in whole:
             np.testing.assert_allclose(logits[name], whole[name][:, here], rtol=1e-4, atol=1e-4)
         start += length
@@ -324,9 +237,9 @@ def test_what_a_cache_held_of_a_frame_is_replaced() -> None:
     cache, first = empty_cache(DUAL, BATCH, DUAL.frames), slice(0, 3)
     for given in (draft, tokens):
         piece = {name: x[:, first] for name, x in given.items()}
-        _, cache = _apply(DUAL, params, piece, mask[:, first], actions[:, first], 0, cache)
+        _, cache = apply(DUAL, params, piece, mask[:, first], actions[:, first], 0, cache)
     rest = slice(3, None)
-    logits, _ = _apply(
+    logits, _ = apply(
         DUAL, params, {n: x[:, rest] for n, x in tokens.items()}, mask[:, rest], actions[:, rest], 3, cache
     )
     for name in whole:

@@ -54,33 +54,80 @@ def test_what_is_off_has_no_term(depth: bool, keypoints: bool) -> None:
     assert terms.keys() == loss.terms(depth).keys()
 
 
-def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked() -> None:
+@pytest.mark.parametrize("has_depth", [None, (1, 0, 1), (0, 0, 0)])
+def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: tuple[int, ...] | None) -> None:
+    """Of clips without depth RGB alone, by a model to which all their depth is hidden."""
     params, batch = random_params(MODEL), random_batch()
+    has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
+    batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
     clean = {name: jnp.asarray(getattr(batch, name)) for name in branches(MODEL)}
     corrupt = jax.jit(partial(masking.corrupt, MASK, MODEL.code_bits, MODEL.vocabularies))
     given = corrupt(KEY, clean, batch.index)
-    logits, _ = jax.jit(WorldModel(MODEL).apply)({"params": params}, given.tokens, given.mask, batch.actions)
+    inputs = (given.tokens, given.mask, batch.actions)
+    logits, _ = jax.jit(WorldModel(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
     points = kp.select(batch.tracks, batch.visible, LOSS.num_keypoints, MODEL.grid)
     emphasis = np.asarray(kp.attention_map(points, MODEL.grid, LOSS.gamma))
 
     expected = dict.fromkeys(("rgb", "depth", "attention"), 0.0)
-    cells = 0
+    cells = dict.fromkeys(expected, 0)
     for clip, t, row, column in np.argwhere(np.asarray(given.mask)):
         if not batch.weight[clip]:
             continue
-        cells += 1
         for name in clean:
+            if name == "depth" and not has[clip]:
+                continue
             score, token = 0.0, int(clean[name][clip, t, row, column])
             for k in range(2):
                 x = np.asarray(logits[name][clip, t, 2 * row + column, k])
                 score += float(np.log(np.exp(x).sum()) - x[(token // 4**k) % 4])
             expected[name] += score
+            cells[name] += 1
             if name == "rgb":
                 expected["attention"] += score * emphasis[clip, t, row, column]
+                cells["attention"] += 1
 
     terms = terms_of(MODEL, LOSS, params, batch)
     for name, value in expected.items():
-        np.testing.assert_allclose(terms[name], (value, cells), rtol=1e-4, err_msg=name)
+        np.testing.assert_allclose(terms[name], (value, cells[name]), rtol=1e-4, err_msg=name)
+
+
+def objective(params: Any, batch: Batch) -> tuple[Any, Any]:
+    return losses.combine(terms_of(MODEL, LOSS, params, batch), LOSS.terms(True))
+
+
+GRADIENT = jax.jit(jax.value_and_grad(objective, has_aux=True))
+
+
+def test_where_every_clip_has_depth_it_is_as_if_nothing_was_said() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    told = batch.replace(has_depth=np.ones(3, np.float32))  # type: ignore[attr-defined]
+    jax.tree.map(np.testing.assert_array_equal, GRADIENT(params, told), GRADIENT(params, batch))
+
+
+def test_of_a_batch_without_depth_the_branch_learns_by_what_it_tells_rgb_alone() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    (loss, shares), gradient = GRADIENT(params, batch.replace(has_depth=np.zeros(3, np.float32)))  # type: ignore[attr-defined]
+    assert shares["depth"] == 0
+    assert np.isfinite(loss)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(gradient))
+    learns = lambda tree: any(np.any(x) for x in jax.tree.leaves(tree))  # noqa: E731
+    embed = gradient["depth_embed"]
+    assert not learns([gradient["depth_head"], embed["factored_embed_0"], embed["factored_embed_1"]])
+    assert learns(embed["mask_token_embed"])
+    assert learns(gradient["blocks"]["depth"])
+
+
+def test_depth_tokens_of_a_clip_without_depth_change_nothing() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    has = np.array([1, 0, 1], np.float32)
+    other = np.r_[batch.depth[:1], batch.depth[1:2] ^ 15, batch.depth[2:]]
+    before, after = (
+        GRADIENT(params, batch.replace(has_depth=has, depth=depth))  # type: ignore[attr-defined]
+        for depth in (batch.depth, other)
+    )
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+    all_told = GRADIENT(params, batch.replace(has_depth=np.ones(3, np.float32)))  # type: ignore[attr-defined]
+    assert all_told[0][1]["rgb"] != before[0][1]["rgb"]
 
 
 def test_a_padding_clip_changes_nothing() -> None:

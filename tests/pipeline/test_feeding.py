@@ -1,6 +1,7 @@
 """From damaged clips to a curriculum of tokens, with the tokenizer left untrained."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,9 @@ import pytest
 from rsjax.config import LoopConfig
 from rsjax.config.stages import parse_stage
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
-from rsjax.pipeline import jobs, stages, transforms
+from rsjax.pipeline import jobs, stages
 from rsjax.pipeline.feeding import fingerprint, planned, readable, token_transform
 from rsjax.pipeline.run import Run
-from rsjax.sample.generator import Units
 from rsjax.tokenizer.magvit2 import Tokenizer
 from rsjax.train.checkpoint import save_weights
 from tests.pipeline import toy
@@ -50,7 +50,8 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
     (run.directory / "tokenizer").mkdir(parents=True)
     save_weights(run.directory / "tokenizer" / "weights", params)
     stages.tokenize(run)
-    tokens = open_store(run.output("tokens"))
+    tokens = run.open_tokens()
+    assert tokens.path.parent == clips.path.resolve() / "tokens"
     assert tokens.manifest["tokenizer"] == fingerprint(params)
     source = tokens.source("train")
     assert [source[i]["provenance"]["episode"] for i in range(len(source))] == [0, 2]
@@ -58,8 +59,8 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
     (line,) = (run.directory / "tokens" / "quarantine.jsonl").read_text().splitlines()
     assert '"record": 1' in line
     with pytest.raises(StoreError, match="task 'drift' 2×; difficulty 'unknown' 2×"):
-        planned(loop("simple:2"), tokens, lambda store: transforms.token_clip, tmp_path)
-    planned(loop("unknown/dri*:3"), tokens, lambda store: transforms.token_clip, tmp_path)
+        planned(loop("simple:2"), tokens, partial(token_transform, tokens, False), tmp_path)
+    planned(loop("unknown/dri*:3"), tokens, partial(token_transform, tokens, False), tmp_path)
     assert "note: stage unknown/dri*:3: 2 clips, steps 1 to 3" in capsys.readouterr().out
 
 
@@ -84,21 +85,20 @@ def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "moved", "told"),
-    [({}, False, 0), ({"action_mean": [1.0]}, True, 0), ({"depth_range": [0, 9]}, False, 1)],
+    ("changes", "told"),
+    [({}, 0), ({"action_mean": [1.0]}, 0), ({"depth_range": [0, 9]}, 1), ({"depth_range": None}, 0)],
 )
 def test_another_stores_tokens_come_in_this_stores_units(
-    changes: dict[str, Any], moved: bool, told: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    changes: dict[str, Any], told: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    meta = {"action_mean": [0.0], "action_std": [1.0], "depth_range": [0.5, 2.0]}
+    meta = {"action_mean": [0.5], "action_std": [2.0], "depth_range": [0.5, 2.0]}
+    grid, actions = np.zeros((3, 2, 2), np.int32), np.array([[0], [1], [3]], np.float32)
+    record = {"rgb": grid, "depth": grid, "actions": actions, "tracks": grid, "visible": grid}
     for name, more in (("own", {}), ("other", changes)):
-        write_store(tmp_path / name, "tokens", {"train": [{"x": np.zeros(1)}]}, meta | more)
+        write_store(tmp_path / name, "tokens", {"train": [record]}, meta | more)
     own, other = (open_store(tmp_path / name) for name in ("own", "other"))
-    assert token_transform(own, False, own) is transforms.token_clip
-    made = token_transform(own, False, other)
-    assert (made is not transforms.token_clip) == moved
-    if moved:
-        assert made.args == (Units.create(own), Units.create(other), False)  # type: ignore[attr-defined]
+    made = token_transform(own, False, other)(other.source("train")[0], np.random.default_rng(0))
+    np.testing.assert_allclose(made["actions"], np.array([[0], [0.25], [1.25]]))
     assert capsys.readouterr().out.count("its depth tokens stand for") == told
 
 

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,14 +12,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsjax.clip import Batch
 from rsjax.config import Config, EvalConfig
+from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Record, StoreError, open_store, write_store
+from rsjax.data.units import Units
 from rsjax.metrics.pixels import psnr
 from rsjax.objective.losses import combine
 from rsjax.pipeline import evaluation
 from rsjax.pipeline import held_out as module
-from rsjax.pipeline.held_out import TokenizerHeldOut, WorldModelHeldOut, readable, token_batches
+from rsjax.pipeline.clips import readable
+from rsjax.pipeline.held_out import TokenizerHeldOut, WorldModelHeldOut, token_batches
 from rsjax.pipeline.run import Run
+from rsjax.pipeline.tokens import token_record
+from rsjax.pipeline.transforms import TOKEN_ARRAYS, token_clip
 from rsjax.sample.generator import Generator
 from rsjax.tokenizer.depth_color import depth_to_color
 from rsjax.train.checkpoint import save_weights
@@ -42,13 +49,17 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     codec = generator(run).codec
     (run.directory / "tokenizer").mkdir(parents=True)
     save_weights(run.output("tokenizer"), codec.params)
-    records = []
-    for _, clip in readable(clips.source("test")):
-        actions = codec.units.action_inputs(clip["actions"], run.config.model.integrate_actions)
-        tokens = {"rgb": codec.encode_rgb(clip["rgb"]), "depth": codec.encode_depth(clip["depth"])}
-        records.append(tokens | {"actions": actions, "tracks": clip["tracks"], "visible": clip["visible"]})
-    write_store(run.output("tokens"), "tokens", {"test": iter(records)}, {})
+    records = (token_record(codec, clip) for _, clip in readable(clips.source("test")))
+    write_store(run.output("tokens"), "tokens", {"test": records}, {})
     return run
+
+
+def batches(run: Run, size: int) -> list[Batch]:
+    return list(token_batches(run.open_tokens().source("test"), transform(run), size))
+
+
+def transform(run: Run) -> Transform:
+    return partial(token_clip, Units.create(run.open_clips()), run.config.model.integrate_actions)
 
 
 def generator(run: Run) -> Generator:
@@ -66,7 +77,7 @@ def found(run: Run) -> HeldOut:
 
 def test_the_loss_is_that_of_the_whole_split_in_one_batch(run: Run, found: HeldOut) -> None:
     objective, params = WorldModelObjective.create(run.config), generator(run).params
-    (batch,) = token_batches(open_store(run.output("tokens")).source("test"), CLIPS)
+    (batch,) = batches(run, CLIPS)
     draws = [_terms(objective, params, batch, np.int32(draw)) for draw in range(DRAWS)]
     loss, terms = combine(jax.tree.map(lambda *x: sum(x), *draws), objective.weights)
     assert found.metric == found.scalars["held_out/loss"] == pytest.approx(float(loss), rel=1e-5)
@@ -75,8 +86,7 @@ def test_the_loss_is_that_of_the_whole_split_in_one_batch(run: Run, found: HeldO
 
 
 def test_batches_with_a_filled_up_last_one_change_the_loss_by_rounding_alone(run: Run, found: HeldOut) -> None:
-    batches = token_batches(open_store(run.output("tokens")).source("test"), 2)
-    loss = held_out_loss(WorldModelObjective.create(run.config), generator(run).params, batches)
+    loss = held_out_loss(WorldModelObjective.create(run.config), generator(run).params, batches(run, 2))
     assert {f"held_out/{k}": pytest.approx(v, rel=1e-5) for k, v in loss.items()}.items() <= found.scalars.items()
 
 
@@ -138,23 +148,27 @@ class Damaged:
     def __getitem__(self, index: int) -> Record:
         if index in self.bad:
             raise StoreError(f"record {index} is damaged")
-        return {name: np.full(2, index) for name in ("rgb", "depth", "actions", "tracks", "visible")}
+        return {name: np.full(2, index) for name in TOKEN_ARRAYS}
+
+
+def plain(record: Record, rng: np.random.Generator) -> Arrays:
+    return record
 
 
 @given(st.integers(1, 9).flatmap(lambda n: st.tuples(st.just(n), st.sets(st.integers(0, n - 1)))), st.integers(1, 4))
 @settings(max_examples=40, deadline=None)
 def test_every_readable_clip_counts_once_and_under_its_own_number(split: tuple[int, set[int]], size: int) -> None:
     count, bad = split
-    batches = list(token_batches(Damaged(count, bad), size))
-    assert {batch.index.shape for batch in batches} <= {(size,)}
-    counted = [(int(i), int(x[0])) for b in batches for i, x, w in zip(b.index, b.rgb, b.weight, strict=True) if w]
+    made = list(token_batches(Damaged(count, bad), plain, size))
+    assert {batch.index.shape for batch in made} <= {(size,)}
+    counted = [(int(i), int(x[0])) for b in made for i, x, w in zip(b.index, b.rgb, b.weight, strict=True) if w]
     assert counted == [(i, i) for i in range(count) if i not in bad]
 
 
 def test_a_damaged_record_is_told_and_a_split_without_any_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     told: list[str] = []
-    assert [number for number, _ in readable(Damaged(3, {1}), told.append)] == [0, 2]
+    assert [number for number, _ in readable(Damaged(3, {1}), tell=told.append)] == [0, 2]
     assert told == ["record 1 is damaged; it is left out of the held-out scores"]
     none: Any = WorldModelObjective.create(config())
     with pytest.raises(ValueError, match="no held-out clips"):
-        held_out_loss(none, {}, token_batches(Damaged(2, {0, 1}), 2))
+        held_out_loss(none, {}, token_batches(Damaged(2, {0, 1}), plain, 2))

@@ -70,7 +70,8 @@ def test_weights_from_elsewhere_bring_the_reminder_of_their_tokens(
         tokenizer_train=replace(cfg.tokenizer_train, start_from=tokenizer_start),
     )
     run = Run(cfg, tmp_path / "run", tmp_path / "data")
-    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, {"key": "toy"})
+    meta = {"key": "toy", "action_mean": [0.0], "action_std": [1.0], "depth_range": None}
+    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, meta)
     monkeypatch.setattr(jobs, "fit", lambda *_, **__: SimpleNamespace(weights={}))
     monkeypatch.setattr(stages, "save_weights", lambda *_: None)
     stages.train_world_model(run, resume=True)

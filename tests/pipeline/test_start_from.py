@@ -38,7 +38,8 @@ def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path)
     run.prepare(overwrite=False)
     toy.store(run.clips)
     train_tokenizer(run, resume=True)
-    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, {"key": "toy"})
+    meta = {"key": "toy", "action_mean": [0.0], "action_std": [1.0], "depth_range": None}
+    write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, meta)
     train_world_model(run, resume=True)
     # A run directory is laid out as the converted one.
     jax.tree.map(np.testing.assert_array_equal, load_part(run.directory, TokenizerConfig)[1], tokenizer)

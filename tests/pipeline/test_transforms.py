@@ -2,12 +2,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
+from rsjax.clip import Batch
 from rsjax.data.store import Record, encode_clip
+from rsjax.data.units import Units
 from rsjax.pipeline import transforms
-from rsjax.sample.generator import Units
 from rsjax.tokenizer.depth_color import depth_to_color
 from tests.pipeline import toy
 
@@ -82,36 +81,45 @@ def test_images_of_several_clips_are_one_batch() -> None:
     np.testing.assert_array_equal(batch, np.concatenate([images[0], images[1]]))
 
 
+UNITS = Units((0.1, -0.2, 0.3), (0.5, 1.0, 2.0), (0.1, 1.0))
+
+
+def token_record(record: Record) -> Record:
+    grid = np.arange(6 * 8 * 8, dtype=np.int32).reshape(6, 8, 8)
+    actions = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    return record | {"rgb": grid, "depth": grid + 1, "actions": actions}
+
+
+def batch_of(records: list[Record], **more: np.ndarray) -> Batch:
+    rows = [transforms.token_clip(UNITS, True, record, np.random.default_rng(0)) for record in records]
+    return transforms.token_batch({name: np.stack([row[name] for row in rows]) for name in rows[0]} | more)
+
+
 def test_a_token_batch_counts_every_clip_and_numbers_them(record: Record) -> None:
-    grid = np.zeros((6, 8, 8), np.int32)
-    arrays = transforms.token_clip(record | {"rgb": grid, "depth": grid + 1}, np.random.default_rng(0))
-    batch = transforms.token_batch({name: np.stack([array] * 3) for name, array in arrays.items()})
+    tokens = token_record(record)
+    batch = batch_of([tokens] * 3)
     assert batch.weight.tolist() == [1, 1, 1]
     assert batch.index.tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(batch.depth, np.ones((3, 6, 8, 8)))
+    np.testing.assert_array_equal(batch.depth, np.stack([tokens["depth"]] * 3))
     np.testing.assert_array_equal(batch.tracks[1], record["tracks"])
+    np.testing.assert_array_equal(batch.actions[2], UNITS.action_inputs(tokens["actions"], True))
 
 
 def test_a_token_batch_takes_weights_and_places_where_it_is_given_them(record: Record) -> None:
-    grid = np.zeros((6, 8, 8), np.int32)
-    arrays = transforms.token_clip(record | {"rgb": grid, "depth": grid}, np.random.default_rng(0))
-    stacked = {name: np.stack([array] * 2) for name, array in arrays.items()}
-    stacked |= {"weight": np.array([1.0, 0.0], np.float32), "index": np.array([1, 3], np.int32), "part": np.zeros(2)}
-    batch = transforms.token_batch(stacked)
+    weight, index = np.array([1.0, 0.0], np.float32), np.array([1, 3], np.int32)
+    batch = batch_of([token_record(record)] * 2, weight=weight, index=index, part=np.zeros(2))
     assert (batch.weight.tolist(), batch.index.tolist()) == ([1, 0], [1, 3])
 
 
-@given(st.integers(0, 2**32 - 1), st.booleans())
-def test_another_stores_actions_become_what_this_store_would_have_made_of_them(seed: int, integrate: bool) -> None:
-    rng = np.random.default_rng(seed)
-    own, other = (Units(tuple(rng.normal(size=3)), tuple(rng.uniform(0.1, 2, 3)), (0.1, 1.0)) for _ in range(2))
-    actions = rng.normal(size=(5, 3))
-    there, here = (
-        dict.fromkeys(transforms.TOKEN_ARRAYS, actions) | {"actions": units.action_inputs(actions, integrate)}
-        for units in (other, own)
-    )
-    moved = transforms.token_clip_in(own, other, integrate, there, rng)
-    assert moved.keys() == transforms.token_clip(here, rng).keys()
-    assert moved["actions"].dtype == here["actions"].dtype
-    near = 1e-4 * np.abs(here["actions"]).max()
-    np.testing.assert_allclose(moved["actions"], here["actions"], rtol=0, atol=near)
+def test_clips_without_depth_say_so_and_bring_zeros(record: Record) -> None:
+    tokens = token_record(record)
+    batch = batch_of([tokens, tokens | {"depth": None}])
+    assert np.asarray(batch.has_depth).tolist() == [1, 0]
+    assert not batch.depth[1].any()
+    np.testing.assert_array_equal(batch.depth[0], tokens["depth"])
+
+
+def test_images_of_a_clip_without_depth_are_its_frames(record: Record) -> None:
+    blind = record | {"depth": None}
+    for images in draws(blind, 0.5, seeds=5):
+        assert None not in [which(image, record["rgb"]) for image in images]

@@ -10,8 +10,9 @@ from rsjax import presets
 from rsjax.clip import Clip
 from rsjax.config import Config, EvalConfig, SampleConfig
 from rsjax.data.store import Store, encode_clip, open_store, write_store
+from rsjax.data.units import Units
 from rsjax.model.world_model import WorldModel
-from rsjax.sample.generator import Codec, Generator, Units
+from rsjax.sample.generator import Codec, Generator
 from rsjax.tokenizer.magvit2 import Tokenizer
 
 TRAIN, TEST = 3, 5

@@ -10,17 +10,19 @@ from hypothesis import strategies as st
 
 from rsjax import presets
 from rsjax.config import to_dict
+from rsjax.data.units import Units
 from rsjax.errors import UserError
 from rsjax.model.world_model import WorldModel
 from rsjax.sample import generator as module
-from rsjax.sample.generator import Codec, Generator, Units, load_config
+from rsjax.sample.generator import Codec, Generator, load_config
 from rsjax.sample.rollout import rollout
 from rsjax.tokenizer.depth_color import depth_to_color
 from rsjax.tokenizer.magvit2 import Tokenizer
 
 CONFIG = presets.debug()
 WIDTH = CONFIG.sim.action_dim
-UNITS = Units(tuple(np.linspace(-1, 1, WIDTH)), (0.0, *np.linspace(0.1, 2, WIDTH - 1)), (0.4, 3.0))
+NEAR_FAR = (0.4, 3.0)
+UNITS = Units(tuple(np.linspace(-1, 1, WIDTH)), (0.0, *np.linspace(0.1, 2, WIDTH - 1)), NEAR_FAR)
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +71,26 @@ def test_chunks_of_any_size_give_the_same(codec: Codec, monkeypatch: pytest.Monk
 
 
 def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, monkeypatch: pytest.MonkeyPatch) -> None:
-    depth = np.random.default_rng(0).uniform(*UNITS.depth_range, (2, 3, 64, 64)).astype(np.float32)
-    colors = depth_to_color(depth, *UNITS.depth_range, "inverse").astype(np.uint8)
+    depth = np.random.default_rng(0).uniform(*NEAR_FAR, (2, 3, 64, 64)).astype(np.float32)
+    colors = depth_to_color(depth, *NEAR_FAR, "inverse").astype(np.uint8)
     tokens = codec.encode_depth(depth)
     np.testing.assert_array_equal(tokens, codec.encode_rgb(colors))
     # With a tokenizer that keeps everything, metres are right to half of one of the map's 766 levels.
     monkeypatch.setattr(module, "_decode", lambda config, params, tokens: np.resize(colors, (len(tokens), 64, 64, 3)))
     metres = codec.decode_depth(tokens)
     assert metres.shape == depth.shape
-    level = (1 / UNITS.depth_range[0] - 1 / UNITS.depth_range[1]) / 765
+    level = (1 / NEAR_FAR[0] - 1 / NEAR_FAR[1]) / 765
     assert np.abs(1 / metres - 1 / depth).max() <= 0.51 * level
+
+
+def test_where_no_clip_has_depth_its_maps_have_no_tokens(codec: Codec) -> None:
+    blind = replace(codec, units=replace(UNITS, depth_range=None))
+    for make in (
+        lambda: blind.encode_depth(np.ones((1, 64, 64), np.float32)),
+        lambda: blind.decode_depth(np.zeros((1, 8, 8), np.int32)),
+    ):
+        with pytest.raises(UserError, match="depth_range is null: none of the clips .* has depth"):
+            make()
 
 
 @pytest.mark.parametrize("depth_branch", [True, False])
@@ -106,11 +118,38 @@ def test_generate_is_a_rollout_decoded(codec: Codec, depth_branch: bool) -> None
     np.testing.assert_array_equal(generator.generate(prompt, unread, CONFIG.sample).rgb, made.rgb)
 
 
-def test_a_plan_is_what_generate_makes_of_each_candidate(codec: Codec) -> None:
+def random_generator(codec: Codec) -> Generator:
     rng, shapes = np.random.default_rng(0), jax.eval_shape(WorldModel(CONFIG.model).init_params, jax.random.key(1))
     params = jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
-    generator = Generator(CONFIG, codec, params)
-    prompt = {name: rng.integers(0, 256, (1, 3, 8, 8), np.int32) for name in ("rgb", "depth")}
+    return Generator(CONFIG, codec, params)
+
+
+def test_generated_depth_is_that_of_the_clips_that_have_it(codec: Codec) -> None:
+    generator, rng, has = random_generator(codec), np.random.default_rng(0), np.array([True, False])
+    prompt = {name: rng.integers(0, 256, (2, 1, 8, 8), np.int32) for name in ("rgb", "depth")}
+    actions = rng.normal(size=(2, 4, WIDTH)).astype(np.float32)
+    make = lambda prompt, has: generator.generate(prompt, actions, CONFIG.sample, has_depth=has)  # noqa: E731
+    whole, mixed, none = make(prompt, None), make(prompt, has), make({"rgb": prompt["rgb"]}, None)
+    assert whole.depth is not None
+    assert mixed.depth is not None
+    assert mixed.depth.dtype == np.float32
+    # As many images as are decoded at once move a colour by float32's last bit, and that a pixel by a level of the map.
+    np.testing.assert_allclose(mixed.depth[0], whole.depth[0], rtol=0.01)
+    assert np.isnan(mixed.depth[1]).all()
+    np.testing.assert_array_equal(mixed.rgb, np.stack([whole.rgb[0], none.rgb[1]]))
+    assert none.depth is None
+    assert make(prompt, np.zeros(2, bool)).depth is None
+    np.testing.assert_array_equal(make(prompt, np.ones(2, bool)).depth, whole.depth)
+    with pytest.raises(ValueError, match='no tokens "depth"'):
+        make({"rgb": prompt["rgb"]}, has)
+    with pytest.raises(ValueError, match="the prompt has 2 clips"):
+        make(prompt, np.ones(3, bool))
+
+
+@pytest.mark.parametrize("names", [("rgb", "depth"), ("rgb",)], ids=["depth", "no-depth"])
+def test_a_plan_is_what_generate_makes_of_each_candidate(codec: Codec, names: tuple[str, ...]) -> None:
+    generator, rng = random_generator(codec), np.random.default_rng(0)
+    prompt = {name: rng.integers(0, 256, (1, 3, 8, 8), np.int32) for name in names}
     actions = rng.normal(size=(2, 7, WIDTH)).astype(np.float32)
     with pytest.raises(ValueError, match="differ in rows before 3"):
         generator.plan(prompt, actions, CONFIG.sample)

@@ -83,6 +83,20 @@ def test_random_order_does_not_look_at_the_logits() -> None:
     assert not np.array_equal(one.mask, unmask_step(config, BITS, clip_keys(8), 0, start, LOGITS).mask)
 
 
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_greedy_is_sure_of_a_clip_without_depth_by_its_rgb_alone_and_draws_alike(temperature: float) -> None:
+    config = SampleConfig(steps=2, unmask="greedy", temperature=temperature)
+    start, keys = decode(config)[0], clip_keys(0)
+    plain, one = (unmask_step(config, BITS, keys, 0, start, LOGITS, x) for x in (None, jnp.array([True, False])))
+    np.testing.assert_array_equal(one.tokens["rgb"], plain.tokens["rgb"])
+    log_p = np.asarray(jax.nn.log_softmax(LOGITS["rgb"][0]))
+    codes = np.stack([one.tokens["rgb"][0] & 7, one.tokens["rgb"][0] >> 3], -1)
+    sure = np.take_along_axis(log_p, codes[..., None], -1)[..., 0].sum(-1)
+    assert set(np.flatnonzero(one.mask[0])) == set(np.argsort(sure)[: int(masked_after(0, 2, CELLS))])
+    assert not np.array_equal(one.mask[0], plain.mask[0])
+    np.testing.assert_array_equal(one.mask[1], plain.mask[1])
+
+
 def test_at_temperature_zero_the_most_probable_codes_are_taken_whatever_the_key() -> None:
     for seed in range(2):
         tokens, log_p = sample_tokens(jax.random.key(seed), LOGITS["rgb"], 0.0, BITS)
@@ -117,6 +131,7 @@ def test_a_clips_draws_do_not_depend_on_the_clips_beside_it(unmask: Order) -> No
         jax.tree.map(np.testing.assert_array_equal, alone, jax.tree.map(only, together))
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 99), top_k=st.integers(1, 8))
 def test_top_k_keeps_the_k_largest_logits_as_they_are(seed: int, top_k: int) -> None:
     logits = np.random.default_rng(seed).normal(size=(5, 2, 8)).astype(np.float32)

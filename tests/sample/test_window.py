@@ -10,8 +10,8 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from rsjax.config import ModelConfig, SampleConfig
+from rsjax.data.units import Units
 from rsjax.sample import rollout as module
-from rsjax.sample.generator import Units
 from rsjax.sample.rollout import rollout
 from rsjax.sample.window import room, window_actions, window_start
 from tests.sample.toy import BATCH, DUAL, KEY, RGB, count_model, given, random_params

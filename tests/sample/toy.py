@@ -38,10 +38,10 @@ def count_model(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Takes model and decoding out; counts the calls, and the frames of all clips, that would go to the model."""
     seen: Counter[str] = Counter()
 
-    def apply(_: Any, __: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any, drop: Any) -> Any:
+    def apply(_: Any, __: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any, *___: Any) -> Any:
         seen.update(calls=1, frames=mask.shape[0] * mask.shape[1])
         return {name: jnp.zeros((*mask.shape, 2, 8)) for name in tokens}, cache
 
     monkeypatch.setattr(guidance, "_apply", apply)
-    monkeypatch.setattr(decode, "unmask_step", lambda config, code_bits, keys, step, frame, logits: frame)
+    monkeypatch.setattr(decode, "unmask_step", lambda config, code_bits, keys, step, frame, *_: frame)
     return seen

@@ -2,9 +2,11 @@
 
 Prints, as JSON, how far the parameters end from the jitted ones (the largest difference, and the distance as a share
 of the way that training moved them), for "pmap", "mesh" (data alone), "fsdp" (2 × 2), and "muon": a smaller network by
-Muon under fsdp. "mean of ratios": how far the loss is, as a share, where every device divides by its own weight. For
-the tokenizer, how far gradients and averages are from the jitted ones ("tokenizer pmap", with its discriminator, and
-"tokenizer fsdp", without), and how far its entropy is where each device knows its own images alone ("tokenizer apart").
+Muon under fsdp. "mean of ratios": how far the loss is, as a share, where every device divides by its own weight. Of a
+model with depth and clips of which some have none: "depth pmap" and "depth mesh", how far the gradient is from the
+jitted one, and "depth mean of ratios". For the tokenizer, how far gradients and averages are from the jitted ones
+("tokenizer pmap", with its discriminator, and "tokenizer fsdp", without), and how far its entropy is where each device
+knows its own images alone ("tokenizer apart").
 "checkpoint": how far two steps of one placement, saved, and a third one of another are from three steps; "start":
 whether fresh parameters are the same to the bit where they are made in parts; "cut": the share of the fsdp state that
 one device holds.
@@ -48,6 +50,7 @@ from rsjax.train.state import TrainState, create_state
 MODEL = ModelConfig(frames=4, grid=2, code_bits=4, action_dim=3, width=64, blocks=2, heads=2)
 WITH_DEPTH = WorldModelObjective(MODEL, MaskConfig(), LossConfig(num_keypoints=3))
 OBJECTIVE = replace(WITH_DEPTH, model=replace(MODEL, depth=False))
+SOME_DEPTH = replace(WITH_DEPTH, model=replace(MODEL, width=8, blocks=1), loss=LossConfig(keypoints=False))
 LOOP = LoopConfig(batch_size=8, steps=3, ema=0.9, optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=1))
 MUON = replace(LOOP, optimizer=replace(LOOP.optimizer, kind="muon"))
 WAYS: dict[str, dict[str, Any]] = {
@@ -81,7 +84,7 @@ class Small(Objective):
 
 
 def batch(seed: int) -> Batch:
-    """Eight clips for four devices: two, one, none and two of them count; hidden keypoints are as uneven."""
+    """Eight clips for four devices: two, one, none and two of them count; hidden keypoints and depth are as uneven."""
     rng = np.random.default_rng(seed)
     tokens = [rng.integers(0, 2**MODEL.code_bits, (8, 4, 2, 2), np.int32) for _ in range(2)]
     seen = np.array([0.9, 0.9, 0.1, 0.9, 0.5, 0.5, 0.1, 0.1])[:, None, None]
@@ -93,6 +96,7 @@ def batch(seed: int) -> Batch:
         "visible": rng.random((8, 7, 4)) < seen,
         "weight": np.array([1, 1, 1, 0, 0, 0, 1, 1], np.float32),
         "index": np.arange(8, dtype=np.int32),
+        "has_depth": np.array([1, 0, 0, 1, 1, 0, 1, 1], np.float32),
     }
     return Batch(**fields)
 
@@ -117,17 +121,17 @@ class Training:
         return self.placement.gather(self.state)
 
 
-def mean_of_ratios(params: Any) -> float:
+def mean_of_ratios(objective: Objective, params: Any) -> float:
     """What must not be done: every device's own ratio, averaged over devices."""
     around = Surroundings(jnp.int32(0), None, None)
 
     @jax.jit
     def terms(params: Any, part: Any) -> dict[str, Term]:
-        return OBJECTIVE.terms(params, part, jax.random.key(0), around)
+        return objective.terms(params, part, jax.random.key(0), around)
 
     def loss(found: list[dict[str, Term]]) -> float:
         sums = jax.tree.map(lambda *x: jnp.sum(jnp.stack(x)), *found)
-        return float(losses.combine(sums, OBJECTIVE.weights)[0])
+        return float(losses.combine(sums, objective.weights)[0])
 
     cut = jax.tree.map(lambda x: x.reshape(4, 2, *x.shape[1:]), batch(0))
     found = [terms(params, jax.tree.map(itemgetter(i), cut)) for i in range(4)]
@@ -166,20 +170,23 @@ def apart(state: TrainState) -> float:
     return float(abs(np.mean(parts) - whole) / abs(whole))
 
 
+def share(one: Any, other: Any) -> float:
+    """The distance of two trees, as a share of the first one's length."""
+    flat = [np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)]) for tree in (one, other)]
+    return float(np.linalg.norm(flat[0] - flat[1]) / np.linalg.norm(flat[0]))
+
+
+def moments(state: TrainState) -> Any:
+    """After one step these stand for the gradient. Adam would blow the rounding of its smallest entries up."""
+    return optax.tree_utils.tree_get(state.opt_state, "mu")
+
+
 def moments_apart(one: TrainState, other: TrainState) -> dict[str, float]:
-    """After one step: relative distances of each network's gradient and of the averages.
-
-    Moments stand for the gradient, rather than parameters: Adam would blow the rounding of its smallest entries up.
-    """
-
-    def share(x: Any, y: Any) -> float:
-        flat = [np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)]) for tree in (x, y)]
-        return float(np.linalg.norm(flat[0] - flat[1]) / np.linalg.norm(flat[0]))
-
-    moments = [optax.tree_utils.tree_get(state.opt_state, "mu") for state in (one, other)]
+    """After one step: relative distances of each network's gradient and of the averages."""
+    found = moments(one), moments(other)
     if one.extra is None:
-        return {"tokenizer": share(*moments)}
-    shares = {name: share(moments[0][name], moments[1][name]) for name in moments[0]}
+        return {"tokenizer": share(*found)}
+    shares = {name: share(found[0][name], found[1][name]) for name in found[0]}
     return shares | {"averages": share(one.extra, other.extra)}
 
 
@@ -220,25 +227,34 @@ def through_checkpoints(trainings: list[Training], start: Any) -> list[TrainStat
 
 def main() -> dict[str, Any]:
     clips = [batch(seed) for seed in range(STEPS)]
-    start, fresh, plain = (
+    start, deep, fresh, plain = (
         jax.device_get(jax.jit(partial(create_state, objective, loop))())
-        for objective, loop in ((OBJECTIVE, LOOP), (TOKENIZER, TOKENIZER.train), (PLAIN, PLAIN.train))
+        for objective, loop in (
+            (OBJECTIVE, LOOP),
+            (SOME_DEPTH, LOOP),
+            (TOKENIZER, TOKENIZER.train),
+            (PLAIN, PLAIN.train),
+        )
     )
     trainings = {way: Training(way, OBJECTIVE, LOOP, clips, start) for way in WAYS}
+    depths = {way: Training(way, SOME_DEPTH, LOOP, clips, deep) for way in ("jit", "pmap", "mesh")}
     small = {way: Training(way, Small(), MUON, clips, None) for way in ("jit", "fsdp")}
     tokenizers = [Training(way, TOKENIZER, TOKENIZER.train, [IMAGES], fresh) for way in ("jit", "pmap")]
     plainer = [Training(way, PLAIN, PLAIN.train, [IMAGES], plain) for way in ("jit", "fsdp")]
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(Training.compiled, [*trainings.values(), *tokenizers, *plainer]))
+        list(pool.map(Training.compiled, [*trainings.values(), *depths.values(), *tokenizers, *plainer]))
 
-    share = held(trainings["fsdp"].state)
+    cut = held(trainings["fsdp"].state)
     begun = {way: training.placement.gather(training.state) for way, training in small.items()}
     ends = {way: training.run(0, STEPS) for way, training in trainings.items()}
     muon = {way: training.run(0, STEPS) for way, training in small.items()}
+    gradients = {way: moments(training.run(0, 1)) for way, training in depths.items()}
     return {
         **{way: distance(ends["jit"], ends[way], start) for way in ("pmap", "mesh", "fsdp")},
         "muon": distance(muon["jit"], muon["fsdp"], begun["jit"]),
-        "mean of ratios": mean_of_ratios(start.params),
+        "mean of ratios": mean_of_ratios(OBJECTIVE, start.params),
+        "depth mean of ratios": mean_of_ratios(SOME_DEPTH, deep.params),
+        **{f"depth {way}": share(gradients["jit"], gradients[way]) for way in ("pmap", "mesh")},
         "tokenizer pmap": moments_apart(*(training.run(0, 1) for training in tokenizers)),
         "tokenizer fsdp": moments_apart(*(training.run(0, 1) for training in plainer)),
         "tokenizer apart": apart(fresh),
@@ -246,7 +262,7 @@ def main() -> dict[str, Any]:
             distance(ends["jit"], end, start) for end in through_checkpoints(list(trainings.values()), start)
         ],
         "start": same(begun["jit"], begun["fsdp"]),
-        "cut": share,
+        "cut": cut,
     }
 
 

@@ -39,6 +39,12 @@ def test_every_placement_gives_the_same_parameters_on_uneven_batches(placement: 
     assert apart["mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
 
 
+@pytest.mark.parametrize("placement", ["pmap", "mesh"])
+def test_clips_without_depth_count_alike_wherever_they_lie(placement: str, apart: dict[str, Any]) -> None:
+    assert apart[f"depth {placement}"] < 1e-5, apart
+    assert apart["depth mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
+
+
 def test_the_tokenizers_gradients_and_averages_are_those_of_the_whole_batch(apart: dict[str, Any]) -> None:
     assert apart["tokenizer pmap"].keys() == {"generator", "discriminator", "averages"}
     for distance in (*apart["tokenizer pmap"].values(), *apart["tokenizer fsdp"].values()):

@@ -1,5 +1,8 @@
 """Stage "depth" by networks: Video Depth Anything (a checkout), and DepthAnything per frame (transformers)."""
 
+import math
+import os
+import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -10,7 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from rsjax.annotate.depth import metric_depth, relative_depth
 from rsjax.annotate.networks.local import checkout_module, library, load_weights, on_device, pretrained
-from rsjax.annotate.protocols import AnnotationError, DepthMaps, in_chunks
+from rsjax.annotate.protocols import AnnotationError, DepthMaps, in_chunks, require_counts
 from rsjax.data.episode import Episode, EpisodeError, Frames
 
 Encoder = Literal["vits", "vitb", "vitl"]
@@ -31,7 +34,7 @@ class VideoDepthAnything:
         encoder: of these weights.
         metric: whether they are the metric ones: metres instead of relative depth.
         input_size: pixels of the shorter side that the network sees.
-        most_frames: of an episode; frames and maps are all in memory, 7 bytes a pixel.
+        most_frames: of an episode; its frames and maps are all in memory, several times: about 20 bytes a pixel.
         device: torch's name of it.
     """
 
@@ -45,6 +48,9 @@ class VideoDepthAnything:
     most_frames: int = 2000
     device: str = "cuda"
 
+    def __post_init__(self) -> None:
+        require_counts(self, "input_size", "most_frames")
+
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
         frames = _pictures_of(episode, camera)
         if len(frames) > self.most_frames:
@@ -53,7 +59,8 @@ class VideoDepthAnything:
                 f"Depth Anything holds in memory at once; raise that, or cut the episode"
             )
         model = self.load()
-        options = {"input_size": self.input_size, "device": self.device, "fp32": self.device == "cpu"}
+        precise = {"fp32": True} if self.device == "cpu" else {}  # older checkouts do not know the option
+        options = {"input_size": self.input_size, "device": self.device} | precise
         found, _ = model.infer_video_depth(frames.read(range(len(frames))), episode.fps, **options)
         return _as_maps(np.asarray(found), "metres" if self.metric else "relative", episode, camera, self.name)
 
@@ -66,8 +73,11 @@ class VideoDepthAnything:
 class DepthAnything:
     """DepthAnything (Yang et al. 2024) through transformers, frame by frame: relative depth may flicker.
 
+    An episode's maps are kept in the folder for temporary files until they are stored, 4 bytes a pixel.
+
     Attributes:
-        model: local folder of a ``DepthAnythingForDepthEstimation`` with its image processor.
+        model: local folder of a ``DepthAnythingForDepthEstimation`` with its image processor. What its configuration
+            calls "metric" gives metres, the others relative depth.
         batch: frames at a time.
         device: torch's name of it.
     """
@@ -78,14 +88,17 @@ class DepthAnything:
     batch: int = 8
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        require_counts(self, "batch")
+
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
         frames = _pictures_of(episode, camera)
         model, processor = self.load()
-        found = [
-            _estimate(model, processor, pictures, self.device) for _, pictures in in_chunks(frames, size=self.batch)
-        ]
+        found = _on_disk((len(frames), *frames.read([0]).shape[1:3]))
+        for start, pictures in in_chunks(frames, size=self.batch):
+            found[start : start + len(pictures)] = _estimate(model, processor, pictures, self.device)
         unit: Any = "metres" if model.config.depth_estimation_type == "metric" else "relative"
-        return _as_maps(np.concatenate(found), unit, episode, camera, self.name)
+        return _as_maps(found, unit, episode, camera, self.name)
 
     def load(self) -> tuple[Any, Any]:
         """The network and its image processor, loaded once per process. Errors likewise."""
@@ -104,9 +117,22 @@ def _as_maps(
     shape = (len(episode.timestamps), *episode.cameras[camera].read([0]).shape[1:3])
     if found.shape != shape:
         raise AnnotationError(f"{by} gave depth of shape {found.shape} for frames of {shape}; check its version")
-    if not np.isfinite(found).all():
-        raise AnnotationError(f"episode {episode.id}: {by} gave depth that is not finite; check weights and precision")
-    return metric_depth(found) if unit == "metres" else relative_depth(found)
+    try:
+        return metric_depth(found) if unit == "metres" else relative_depth(found)
+    except ValueError as error:
+        raise AnnotationError(f"episode {episode.id}: {by}: {error}; check weights and precision") from error
+
+
+def _on_disk(shape: tuple[int, ...]) -> Float32[np.ndarray, "N H W"]:
+    """An array in a temporary file that has no name, so that an episode may be longer than memory.
+
+    Raises:
+        OSError: no space for it.
+    """
+    with tempfile.TemporaryFile() as file:
+        # A file with holes would be found too large by the write that fills the disk, which kills the process.
+        os.posix_fallocate(file.fileno(), 0, 4 * math.prod(shape))
+        return np.memmap(file, np.float32, "r+", shape=shape)  # type: ignore[call-overload,no-any-return]
 
 
 def _estimate(

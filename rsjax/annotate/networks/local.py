@@ -1,6 +1,7 @@
 """What the adapters share: torch and its kin, weights from local files, and modules of a checkout."""
 
 import importlib
+import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,12 +20,21 @@ def library(name: str, what: str) -> Any:
         what: what needs it, for the message.
 
     Raises:
-        AnnotationError: it is not installed.
+        AnnotationError: it is not installed, or does not go with the torch that is.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise AnnotationError(f"{what} needs {name} ({error}); install it ({EXTRA}), or take the default") from error
+    except (RuntimeError, OSError, AttributeError) as error:  # what a torchvision of another torch raises, by version
+        raise AnnotationError(
+            f"{what} needs {name}, which does not import ({_first_line(error)}); torchvision has to be of the same "
+            f"release and build as torch: install both again together"
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0][:200]
 
 
 def checkout_module(checkout: Path, name: str, what: str) -> Any:
@@ -70,7 +80,7 @@ def load_weights(model: Any, path: Path, what: str) -> Any:
         state = content.get("state_dict", content.get("model", content))
         model.load_state_dict(state)
     except Exception as error:  # torch reports damage as many types
-        told = str(error).strip().partition("\n")[0][:200]
+        told = _first_line(error)
         raise AnnotationError(
             f"{path}: not the weights of {what} ({told}); give the file that belongs to it"
         ) from error
@@ -86,10 +96,13 @@ def pretrained(kind: str, path: Path, what: str, **options: Any) -> Any:
     transformers = library("transformers", what)
     if not (path / "config.json").is_file() and not (path / "preprocessor_config.json").is_file():
         raise AnnotationError(f"{path}: holds no model (config.json); {what} needs it there (nothing is downloaded)")
+    if importlib.util.find_spec("torchvision"):  # processors use it where it is, and tell nothing useful of one amiss
+        library("torchvision", what)
+    local: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
     try:
-        return getattr(transformers, kind).from_pretrained(path, local_files_only=True, **options)
+        return getattr(transformers, kind).from_pretrained(path, **local, **options)
     except Exception as error:  # transformers reports what is missing or damaged as many types
-        told = str(error).strip().partition("\n")[0][:200]
+        told = _first_line(error)
         raise AnnotationError(f"{path}: {kind} cannot be made from it ({told}); fetch the whole model again") from error
 
 
@@ -102,7 +115,7 @@ def on_device(model: Any, device: str, what: str) -> Any:
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built with CUDA
-        told = str(error).strip().partition("\n")[0][:200]
+        told = _first_line(error)
         raise AnnotationError(
             f"device {device!r} cannot be used for {what} ({told}); choose another, or cpu"
         ) from error

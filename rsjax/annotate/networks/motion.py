@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.annotate.networks.local import library, load_weights, on_device
+from rsjax.annotate.protocols import require_counts
 
 _MULTIPLE, _LEAST = 8, 128  # what RAFT asks of both sides, in pixels
 
@@ -32,6 +33,9 @@ class RaftFlow:
     updates: int = 12
     batch: int = 8
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        require_counts(self, "updates", "batch")
 
     def __call__(
         self, before: UInt8[np.ndarray, "T H W 3"], after: UInt8[np.ndarray, "T H W 3"]

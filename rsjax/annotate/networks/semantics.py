@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from rsjax.annotate.networks.local import library, on_device, pretrained
-from rsjax.annotate.protocols import AnnotationError, Semantic, Semantics
+from rsjax.annotate.protocols import AnnotationError, Semantic, Semantics, require_counts
 from rsjax.annotate.semantics import OwnSemantics
 from rsjax.data.episode import Episode, EpisodeError
 
@@ -55,6 +55,8 @@ class Answer:
 class InternVL:
     """InternVL; text of the data set, where there is any, stays as it is, and with it its key frames.
 
+    In the parts that it is asked about, its key frame counts before the peak of motion, and the gripper's before both.
+
     Attributes:
         model: local folder, such as a copy of ``OpenGVLab/InternVL3-1B-hf``.
         pictures: of each part of an episode, evenly spaced.
@@ -65,13 +67,16 @@ class InternVL:
     """
 
     name: ClassVar[str] = "internvl"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     model: Path
     pictures: int = 8
     tries: int = 3
     new_tokens: int = 200
     own: OwnSemantics = field(default_factory=OwnSemantics)
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        require_counts(self, "pictures", "tries", "new_tokens")
 
     def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
         known = self.own(episode, camera, motion)
@@ -108,8 +113,8 @@ def complete(known: Semantics, episode: Episode, camera: str, ask: Ask, settings
 
 def _told(part: Semantic, answer: Answer, frames: list[int], by: str) -> Semantic:
     part = replace(part, text=answer.action, skill=part.skill or answer.skill, text_by=by)
-    # what a gripper or the pixels say is exact to the frame, a picture's number only to the spacing of the pictures
-    return part if part.key_frames else replace(part, key_frames=(frames[answer.key_picture],), key_by=by)
+    # what a gripper says is exact to the frame, a picture's number only to the spacing of the pictures
+    return part if part.key_by == "gripper" else replace(part, key_frames=(frames[answer.key_picture],), key_by=by)
 
 
 def asked(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], ask: Ask, tries: int, where: str) -> Answer:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.annotate.networks.local import library, on_device
-from rsjax.annotate.protocols import in_chunks
+from rsjax.annotate.protocols import in_chunks, require_counts
 from rsjax.annotate.shots import spans_between
 from rsjax.data.episode import Frames
 
@@ -34,6 +34,9 @@ class TransNetShots:
     threshold: float = 0.5
     shortest: int = 8
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        require_counts(self, "shortest")
 
     def __call__(self, frames: Frames) -> list[tuple[int, int]]:
         small = [_small(picture) for _, pictures in in_chunks(frames) for picture in pictures]

@@ -10,9 +10,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.annotate.networks.local import checkout_module, library, load_weights, on_device
-from rsjax.annotate.protocols import AnnotationError, Tracked
+from rsjax.annotate.protocols import AnnotationError, Tracked, require_counts
 from rsjax.annotate.tracks import Followed, track_in_spans
+from rsjax.config import require
 from rsjax.data.episode import Depths, Frames
+
+_LEAST_DEPTH = 0.01  # below which SpatialTracker takes a depth for not measured
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,9 @@ class SpatialTracker:
     window: int = 12
     device: str = "cuda"
 
+    def __post_init__(self) -> None:
+        require_counts(self, "grid", "span", "window")
+
     def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
         if depth is None:
             raise AnnotationError("SpatialTracker needs the frames' depth; give a depth stage, or take another tracker")
@@ -51,10 +57,12 @@ class SpatialTracker:
         """As :class:`rsjax.annotate.tracks.Follower`; the depth is needed."""
         torch = library("torch", "SpatialTracker")
         model = self.load()
-        size = np.array(pictures.shape[2:0:-1], np.float32)
+        size, count = np.array(pictures.shape[2:0:-1], np.float32), len(pictures)
         queries = np.concatenate([np.zeros((len(points), 1)), points * size - 0.5], 1).astype(np.float32)
-        video = torch.from_numpy(pictures).to(self.device).permute(0, 3, 1, 2)[None].float()
-        maps = torch.from_numpy(np.asarray(depth, np.float32)).to(self.device)[:, None]
+        # of fewer frames than half its window it says nothing at all: zeros, and no point visible
+        kept = np.arange(max(count, self.window)).clip(max=count - 1)
+        video = torch.from_numpy(pictures[kept]).to(self.device).permute(0, 3, 1, 2)[None].float()
+        maps = torch.from_numpy(_usable(np.asarray(depth, np.float32))[kept]).to(self.device)[:, None]
         with torch.no_grad():
             places, seen, _ = model(
                 video,
@@ -62,7 +70,7 @@ class SpatialTracker:
                 queries=torch.from_numpy(queries)[None].to(self.device),
                 wind_length=self.window,
             )
-        places, seen = places[0].permute(1, 0, 2).cpu().numpy(), seen[0].permute(1, 0).cpu().numpy()
+        places, seen = places[0, :count].permute(1, 0, 2).cpu().numpy(), seen[0, :count].permute(1, 0).cpu().numpy()
         return _cleaned((places[..., :2] + 0.5) / size, seen.astype(bool), points)
 
     def load(self) -> Any:
@@ -92,6 +100,10 @@ class BootsTapir:
     side: int = 256
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        require_counts(self, "grid", "span", "side")
+        require(self.side % 8 == 0, f"bootstapir: side is {self.side}; it must be a multiple of 8")
+
     def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
         return track_in_spans(frames, self.follow, self.grid, self.span)
 
@@ -117,6 +129,16 @@ class BootsTapir:
     def load(self) -> Any:
         """The network, loaded once per process; errors as of :func:`rsjax.annotate.protocols.prepare`."""
         return _load_tapir(self.checkout, self.weights, self.device)
+
+
+def _usable(depth: Float32[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W"]:
+    """SpatialTracker divides by the spread of the depth beyond a centimetre, and starts a debugger at the first NaN."""
+    measured = depth[depth > _LEAST_DEPTH]
+    if not np.isfinite(depth).all() or not measured.size or not np.ptp(measured):
+        raise AnnotationError(
+            "SpatialTracker needs depth that is finite and not the same everywhere; take another depth or tracker"
+        )
+    return depth
 
 
 def _cleaned(places: np.ndarray, seen: np.ndarray, points: np.ndarray) -> Followed:

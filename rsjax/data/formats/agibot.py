@@ -13,14 +13,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from jaxtyping import Float32
 
 from rsjax.data.actions import Layout, led_into
-from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, Segment, SourceError, checked, fingerprint, safe_id
-from rsjax.data.formats.agibot_proprio import Proprio, unflipped_pair
+from rsjax.data.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, safe_id
+from rsjax.data.formats.agibot_proprio import Proprio
 from rsjax.data.formats.files import broken, inside, is_there, location_of, read_json, subfolders
+from rsjax.data.formats.hdf5 import open_file
 from rsjax.data.pictures import DepthFiles
 from rsjax.data.video import VideoFrames
 
@@ -39,7 +39,7 @@ class AgiBot:
         self._root, self._cameras, self._only = root, tuple(cameras), tuple(tasks)
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Every episode that is on disk or in ``task_info``, task by task; what is not in both cannot be read."""
+        """Every episode that is on disk or in ``task_info``, task by task; what is not on disk cannot be read."""
         for task in self._tasks():
             path = self._root / "task_info" / f"task_{task}.json"
             told: dict[str, dict[str, Any]] = {}
@@ -68,17 +68,14 @@ class AgiBot:
         location = location_of(ref)
         place = f"{location['task']}/{location['episode']}"
         path = inside(self._root, f"proprio_stats/{place}/proprio_stats.h5")
-        try:
-            with h5py.File(path, "r") as file:
-                proprio = Proprio(file, path)
-                times, states, actions = proprio.seconds(), proprio.states(), self._actions(proprio)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:  # h5py reports damage as all of these
-            reason = "missing" if isinstance(error, FileNotFoundError) else f"not readable HDF5 ({_line(error)})"
-            raise EpisodeError(f"{path}: {reason}; fetch the file again or leave the episode out") from error
+        with open_file(path) as file:
+            proprio = Proprio(file, path)
+            times, states, actions = proprio.seconds(), proprio.states(), self._actions(proprio)
         folder = inside(self._root, f"observations/{place}")
         segments, bad = _segments(location["segments"], len(times))
         depth, why_not = _depth(folder / "depth", len(times))
-        notes = {"bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
+        untold = "" if location["told"] else "names no such episode, so it has no task"
+        notes = {"task_info": untold, "bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -102,13 +99,10 @@ class AgiBot:
 
     @staticmethod
     def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
-        position, orientation = proprio.command("end/position"), proprio.command("end/orientation")
-        hands = np.concatenate([position, unflipped_pair(orientation)], 1)
-        if proprio.copied():
-            arms = hands.astype(np.float32)
-            arms[0] = 0
-        else:
-            arms = led_into(hands)
+        hands = np.concatenate([proprio.command("end/position"), proprio.turns("action/end/orientation")], 1)
+        with np.errstate(over="ignore"):
+            hands = hands.astype(np.float32)
+        arms = np.concatenate([np.zeros_like(hands[:1]), hands[1:]]) if proprio.copied() else led_into(hands)
         return np.concatenate([arms, led_into(proprio.grippers())], 1)
 
     def _tasks(self) -> list[str]:
@@ -129,6 +123,7 @@ class AgiBot:
         location = {
             "task": task,
             "episode": identity,
+            "told": bool(entry),
             "name": str(entry.get("task_name") or ""),
             "scene": str(entry.get("init_scene_text") or ""),
             "segments": segments if isinstance(segments, list) else [],
@@ -183,7 +178,3 @@ def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
     if len(paths) != count:
         return None, f"{len(paths)} depth maps for {count} frames" if paths else ""
     return DepthFiles(paths, unit=0.001), ""
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int64
 from rsjax.data.actions import unflipped
 from rsjax.data.episode import EpisodeError
 from rsjax.data.formats.files import MAX_CELLS
+from rsjax.data.formats.hdf5 import own
 
 _CURE = "leave the episode out"
 _STATES = (
@@ -29,7 +30,8 @@ class Proprio:
     """The arrays of an open file, each flattened to (rows, D).
 
     Attributes:
-        notes: what had to be mended, JSON-ready: fields that are empty, commands that were scattered.
+        notes: what had to be mended, JSON-ready: fields that are empty, commands that were scattered, quaternions that
+            changed sign.
     """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
@@ -38,7 +40,7 @@ class Proprio:
         if not len(stamps):
             raise EpisodeError(f"{path}: timestamp is missing or empty; {_CURE}")
         self._count = len(stamps)
-        self.notes: dict[str, Any] = {"empty": [], "scattered": {}}
+        self.notes: dict[str, Any] = {"empty": [], "scattered": {}, "flipped": {}}
 
     def seconds(self) -> Float64[np.ndarray, " N"]:
         """From the first frame; the file has nanoseconds."""
@@ -49,8 +51,18 @@ class Proprio:
     def states(self) -> Float32[np.ndarray, "N 34"]:
         """Positions (6, m), orientations (8), grippers (2, mm), joints (14, rad), head (2, rad), waist (2, rad, m)."""
         parts = {name: self._state(name, width) for name, width in _STATES}
-        parts["end/orientation"] = unflipped_pair(parts["end/orientation"])
-        return np.concatenate(list(parts.values()), 1).astype(np.float32)
+        parts["end/orientation"] = self.turns("state/end/orientation")
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, which is told
+            return np.concatenate(list(parts.values()), 1).astype(np.float32)
+
+    def turns(self, name: str) -> Float64[np.ndarray, "N 8"]:
+        """Both hands' quaternions, at every frame, each with continuous signs. Raises as :meth:`command`."""
+        kind, _, field = name.partition("/")
+        pair = self._state(field, 8) if kind == "state" else self.command(field)
+        mended = np.concatenate([unflipped(pair[:, :4]), unflipped(pair[:, 4:])], 1)
+        if rows := int((mended != pair).any(1).sum()):
+            self.notes["flipped"][name] = rows
+        return mended
 
     def command(self, name: str) -> Float64[np.ndarray, "N D"]:
         """``action/name`` at every frame; where none was sent, the state. Zeros where the field is empty.
@@ -127,7 +139,7 @@ class Proprio:
 
     def _rows(self, name: str, width: int) -> np.ndarray:
         """A dataset as (rows, width), with no rows where it is missing or empty; float64, times as they are."""
-        data = self._file.get(name)
+        data = own(self._file, name, self._path)
         if not isinstance(data, h5py.Dataset) or not data.size:
             return np.zeros((0, width))
         if data.size > MAX_CELLS or data.dtype.kind not in "fiu" or not data.ndim:
@@ -141,8 +153,3 @@ class Proprio:
     def _note_empty(self, name: str) -> None:
         if name not in self.notes["empty"]:
             self.notes["empty"].append(name)
-
-
-def unflipped_pair(pair: Float64[np.ndarray, "N 8"]) -> Float64[np.ndarray, "N 8"]:
-    """Both hands' quaternions, each with continuous signs."""
-    return np.concatenate([unflipped(pair[:, :4]), unflipped(pair[:, 4:])], 1)

@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt8
 
 from rsjax.data.actions import Layout, led_into
 from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint, safe_id
-from rsjax.data.formats.tfrecord import Example, read_payload, spans
+from rsjax.data.formats.tfrecord import Example, Span, read_payload, spans
 
 SIDE = 64
 CAMERAS = {"main": "image_main", "aux1": "image_aux1"}
@@ -63,7 +63,7 @@ class BairSource:
         """From the heads of the records alone. What a damaged file lacks is one entry, which ``read`` refuses."""
         for file in self.files:
             stem = safe_id(file.removesuffix(".tfrecords").replace("/", "-"))
-            for number, span in enumerate(spans(self.folder / file)):
+            for number, span in enumerate(_records(self.folder / file)):
                 where = {"file": file, "offset": span.offset, "length": span.length, "damage": span.damage}
                 marks = fingerprint((), file, span.length, span.crc, span.damage, self.fps)
                 yield EpisodeRef(f"{stem}-{number:03d}", marks, where)
@@ -109,6 +109,21 @@ class RawFrames:
         """These pictures."""
         chosen = b"".join(self._payloads[index] for index in indices)
         return np.frombuffer(chosen, np.uint8).reshape(-1, SIDE, SIDE, 3)
+
+
+def _records(path: Path) -> list[Span]:
+    """The records of a file and, where a file without other damage lacks some, one entry that says so."""
+    found, promised = list(spans(path)), _promised(path.name)
+    if len(found) < promised and not (found and found[-1].damage):
+        damage = f"holds {len(found)} of the {promised} records that its name promises"
+        found.append(Span(0, 0, damage=damage))
+    return found
+
+
+def _promised(name: str) -> int:
+    """How many records a file has by its name, ``traj_0_to_255``; one at least."""
+    match = re.match(r"traj_(\d+)_to_(\d+)", name)
+    return max(1, int(match[2]) - int(match[1]) + 1) if match else 1
 
 
 def _steps(example: Example) -> int:

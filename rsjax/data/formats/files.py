@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from rsjax.data.episode import EpisodeError, EpisodeRef, SourceError
 
 _CURE = "fetch the file again or leave the episode out"
-MAX_CELLS = 2**28  # numbers in one episode's table: more is a damaged header
+MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
+_MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share
 
 
 def inside(root: Path, relative: str) -> Path:
@@ -101,30 +102,64 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
     """A Parquet file's columns (of these, those it has), or its rows that pass ``filters``.
 
     Raises:
-        EpisodeError: it is missing or damaged.
+        EpisodeError: it is missing or damaged, or too large.
     """
     try:
-        there = pq.read_schema(path).names
-        chosen = None if columns is None else [name for name in columns if name in there]
+        with pq.ParquetFile(path) as file:
+            there = file.schema_arrow.names
+            chosen = there if columns is None else [name for name in columns if name in there]
+            _check_size(file.metadata, MAX_CELLS if filters is None else _MOST_ROWS, path)
         return pq.read_table(path, columns=chosen, filters=filters, partitioning=None)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise EpisodeError(f"{path}: {_reason(error)}; {_CURE}") from error
 
 
+def _check_size(metadata: pq.FileMetaData, most: int, path: Path) -> None:
+    """Raises :class:`EpisodeError` where a table is too large: one number a thousand million times takes few bytes.
+
+    What the file says of each column chunk is not asked: where that is damaged, pyarrow ends the process.
+    """
+    size = sum(metadata.row_group(number).total_byte_size for number in range(metadata.num_row_groups))
+    if metadata.num_rows > most or size > _MOST_BYTES:
+        raise EpisodeError(f"{path}: {metadata.num_rows} rows of {size} bytes, more than a table can have; {_CURE}")
+
+
 def matrix(table: pa.Table, column: str, where: Path | str) -> Float32[np.ndarray, "N A"]:
-    """A column of numbers or of lists of numbers, all of one length.
+    """A column of numbers or of lists of numbers, all of one length; what float32 cannot hold is infinite.
 
     Raises:
         EpisodeError: there is no such column, or it holds something else.
     """
+    with np.errstate(over="ignore"):
+        return _numbers(table, column, where).astype(np.float32)
+
+
+def seconds(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndarray, " N"]:
+    """A column of times; those that count from 1970 do not fit into float32. Raises as :func:`matrix`."""
+    values = _numbers(table, column, where)
+    if values.shape[1] != 1:
+        raise EpisodeError(f"{where}: column {column!r} has {values.shape[1]} numbers a row, should have one; {_CURE}")
+    return values[:, 0]
+
+
+def _numbers(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndarray, "N A"]:
     if column not in table.column_names:
         raise EpisodeError(f"{where}: has no column {column!r}; it has {', '.join(table.column_names)}")
+    kind = inner = table[column].type
+    while pa.types.is_list(inner) or pa.types.is_large_list(inner) or pa.types.is_fixed_size_list(inner):
+        inner = inner.value_type
+    wrong = f"{where}: column {column!r} ({kind}) is not rows of as many numbers; {_CURE}"
+    if not any(test(inner) for test in (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)):
+        raise EpisodeError(wrong)
+    if table[column].nbytes > 8 * MAX_CELLS:
+        raise EpisodeError(
+            f"{where}: column {column!r} has {table[column].nbytes} bytes, more than it can have; {_CURE}"
+        )
     try:
-        values = np.array(table[column].to_pylist(), np.float32)
+        values = np.array(table[column].to_pylist(), np.float64)
     except (ValueError, TypeError) as error:
-        kind = table[column].type
-        raise EpisodeError(f"{where}: column {column!r} ({kind}) is not rows of as many numbers; {_CURE}") from error
-    return values.reshape(len(values), -1) if values.size else np.zeros((len(values), 0), np.float32)
+        raise EpisodeError(wrong) from error
+    return values.reshape(len(values), -1) if values.size else np.zeros((len(values), 0))
 
 
 def integers(table: pa.Table, column: str, where: Path | str) -> Int64[np.ndarray, " N"]:

@@ -36,7 +36,7 @@ from rsjax.data.episode import (
     safe_id,
 )
 from rsjax.data.formats import folder_parts as parts
-from rsjax.data.formats.files import inside, is_there, location_of, matrix, read_json, subfolders
+from rsjax.data.formats.files import inside, is_there, location_of, read_json, seconds, subfolders
 from rsjax.data.formats.folder_config import FolderConfig, Rows
 from rsjax.data.video import VideoFrames, scan
 
@@ -53,9 +53,13 @@ class Folder:
         """Folders first, then the files that make up flat episodes, each by name."""
         for folder in subfolders(self._root):
             yield self._ref(folder.name, flat=False)
-        names = {path.stem for path in self._root.iterdir() if path.suffix.lower() in parts.VIDEOS + parts.TABLES}
-        for name in sorted(names):
-            yield self._ref(name, flat=True)
+        beside: dict[str, list[Path]] = {}
+        for path in self._root.iterdir():
+            if path.suffix.lower() in (*parts.VIDEOS, *parts.TABLES, ".json"):
+                beside.setdefault(path.stem, []).append(path)
+        for name, files in sorted(beside.items()):
+            if any(path.suffix.lower() != ".json" for path in files):
+                yield self._ref(name, flat=True, files=sorted(files))
 
     def read(self, ref: EpisodeRef) -> Episode:
         """One episode."""
@@ -80,12 +84,13 @@ class Folder:
         commands = parts.columns(table, actions, table_path)
         times = self._times(table, cameras, fps, count, place)
         if len(times) != count:
-            raise EpisodeError(f"{table_path}: {len(times)} timestamps for {count} pictures; one row per frame")
+            rows = f"{len(times)} timestamps for {count} pictures"
+            raise EpisodeError(f"{table_path}: {rows}; one row per frame", "length")
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
             task=self._config.task if told.task is None else told.task,
-            fps=fps or (1 / float(np.median(np.diff(times))) if count > 1 else 1.0),
+            fps=fps or _rate(times),
             timestamps=times - times[0],
             actions=self._actions(commands, count, table_path),
             states=parts.columns(table, states, table_path) if states else None,
@@ -110,10 +115,10 @@ class Folder:
             raise EpisodeError(f"{self._root / name}: cannot be listed ({error.strerror}); leave it out") from error
         return sorted(found)
 
-    def _ref(self, name: str, flat: bool) -> EpisodeRef:
+    def _ref(self, name: str, flat: bool, files: Sequence[Path] | None = None) -> EpisodeRef:
         sizes = []
         try:
-            files = self._files(name, flat)
+            files = self._files(name, flat) if files is None else files
             for folder in filter(Path.is_dir, files):  # pictures are too many to look into
                 sizes += sorted((folder.name, path.name, path.stat().st_size) for path in folder.iterdir())
         except (EpisodeError, OSError):
@@ -127,7 +132,7 @@ class Folder:
     ) -> Float[np.ndarray, " N"]:
         """Seconds: the table's, or those of the given rate, or the first video's own."""
         if "timestamp" in table.column_names:
-            return matrix(table, "timestamp", place)[:, 0].astype(np.float64)
+            return seconds(table, "timestamp", place)
         if fps:
             return np.arange(count) / fps
         for frames in cameras.values():
@@ -139,10 +144,17 @@ class Folder:
         if self._config.rows == "given" and len(rows) == count - 1:
             rows = np.concatenate([rows, rows[-1:]])  # what is given at the last frame leads nowhere
         if len(rows) != count:
-            raise EpisodeError(f"{path}: {len(rows)} rows of actions for {count} pictures; one row per frame")
+            told = f"{path}: {len(rows)} rows of actions for {count} pictures; one row per frame"
+            raise EpisodeError(told, "length")
         if self._config.rows == "given":
             return led_into(rows)
         return np.concatenate([np.zeros_like(rows[:1]), rows[1:]])
+
+
+def _rate(times: Float[np.ndarray, " N"]) -> float:
+    """Frames per second by the median interval; 1 where there is none that time could be counted by."""
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    return 1 / interval if interval > 0 else 1.0
 
 
 def open_source(

@@ -19,6 +19,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 PICTURES = (".png", ".jpg", ".jpeg")
 TABLES = (".csv", ".parquet", ".npy")
 _DEPTH = ".depth"
+_MOST_BYTES = 2**28  # of a table that is text
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,9 @@ class Told:
         made = []
         for place, entry in enumerate(self.entries):
             try:
-                segment = Segment(int(entry["start"]), int(entry["end"]), str(entry["text"]), entry.get("skill", ""))
+                segment = Segment(
+                    int(entry["start"]), int(entry["end"]), str(entry["text"]), str(entry.get("skill") or "")
+                )
             except (AttributeError, KeyError, TypeError, ValueError) as error:
                 raise EpisodeError(
                     f"{self.path}: segment {place}: field missing or wrong ({error}); mend it"
@@ -116,6 +119,8 @@ def read_table(path: Path) -> pa.Table:
     if path.suffix.lower() == ".parquet":
         return parquet_columns(path)
     try:
+        if (size := path.stat().st_size) > _MOST_BYTES:
+            raise ValueError(f"{size} bytes are more than an episode's table can have")
         table = pa_csv.read_csv(path)
         names = table.column_names  # decoded here, not before
     except (pa.ArrowException, OSError, ValueError) as error:

@@ -1,5 +1,6 @@
 """Arrays of an HDF5 file as pictures, depth maps and rows of numbers, with errors that name file and data set."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +11,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.data.episode import MAX_PIXELS, EpisodeError
+from rsjax.data.formats.files import MAX_CELLS
 
-MAX_NUMBERS = 2**24  # numbers of one array that are read at once
+_MOST_CHUNK = 2**30  # bytes that HDF5 unpacks at once, whatever of them is asked for
 _CURE = "fetch the file again or leave the episode out"
 
 
@@ -25,9 +27,30 @@ def open_file(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r", locking=False) as file:
             yield file
+    except FileNotFoundError as error:
+        raise EpisodeError(f"{path}: missing; {_CURE}") from error
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # how h5py reports damage
         reason = " ".join(str(error).split())[:200]
         raise EpisodeError(f"{path}: not a readable HDF5 file ({reason}); {_CURE}") from error
+
+
+def own(group: Any, key: str, path: Path) -> Any:
+    """What is called ``key``, None where nothing is. HDF5 can point into any file of the machine: that is refused.
+
+    Raises:
+        EpisodeError: it lies in another file, or cannot be unpacked in parts.
+    """
+    found = group.get(key)
+    if found is None:
+        return None
+    name = f"{group.name.rstrip('/')}/{key}"
+    elsewhere = found.file.filename != group.file.filename
+    if elsewhere or (isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)):
+        raise EpisodeError(f"{path}: {name} lies in another file; copy it into this one or leave the episode out")
+    chunks = found.chunks if isinstance(found, h5py.Dataset) else None
+    if chunks and (size := math.prod(chunks) * found.dtype.itemsize) > _MOST_CHUNK:
+        raise EpisodeError(f"{path}: {name} has chunks of {size} bytes; {_CURE}")
+    return found
 
 
 class H5Frames:
@@ -44,8 +67,7 @@ class H5Frames:
 
     def __init__(self, path: Path, key: str, turned: bool = False) -> None:
         self._path, self._key, self._turned = path, key, turned
-        with open_file(path) as file:
-            shape, kind = file[key].shape, file[key].dtype
+        shape, kind = _outline(path, key)
         if kind != np.uint8 or len(shape) != 4 or shape[3] != 3 or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
             raise EpisodeError(f"{path}: {key} is {kind} {shape}, should be uint8 (N, H, W, 3); render it again")
         self._count = int(shape[0])
@@ -73,9 +95,9 @@ class H5Depths:
 
     def __init__(self, path: Path, key: str, turned: bool = False) -> None:
         self._path, self._key, self._turned = path, key, turned
-        with open_file(path) as file:
-            shape, kind = file[key].shape, file[key].dtype
-        if kind.kind != "f" or shape[3:] not in ((), (1,)) or not 0 < np.prod(shape[1:3]) <= MAX_PIXELS:
+        shape, kind = _outline(path, key)
+        possible = len(shape) in (3, 4) and shape[3:] in ((), (1,)) and 0 < shape[1] * shape[2] <= MAX_PIXELS
+        if kind.kind != "f" or not possible:
             raise EpisodeError(f"{path}: {key} is {kind} {shape}, should be floats (N, H, W); render it again")
         self._count = int(shape[0])
 
@@ -95,13 +117,14 @@ def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
     Raises:
         EpisodeError: there is none, or it holds something else.
     """
-    found = group.get(key)
+    found = own(group, key, path)
     name = f"{group.name}/{key}"
     if not isinstance(found, h5py.Dataset):
         raise EpisodeError(f"{path}: has no {name}; leave the episode out")
-    if 0 in found.shape[1:] or found.dtype.kind not in "fiu" or found.ndim not in (1, 2) or found.size > MAX_NUMBERS:
+    if 0 in found.shape[1:] or found.dtype.kind not in "fiu" or found.ndim not in (1, 2) or found.size > MAX_CELLS:
         raise EpisodeError(f"{path}: {name} is {found.dtype} {found.shape}, should be numbers (N, n); {_CURE}")
-    values = found[()].astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, which is told
+        values = found[()].astype(np.float32)
     return values[:, None] if values.ndim == 1 else values
 
 
@@ -109,6 +132,15 @@ def attribute(group: Any, name: str, path: Path) -> Any:
     """An attribute, text decoded; None where there is none."""
     value = group.attrs.get(name)
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
+def _outline(path: Path, key: str) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of a data set."""
+    with open_file(path) as file:
+        found = own(file, key, path)
+        if not isinstance(found, h5py.Dataset) or found.shape is None:
+            raise EpisodeError(f"{path}: {key} is no array; render it again or leave the episode out")
+        return found.shape, found.dtype
 
 
 def _picked(path: Path, key: str, indices: Sequence[int]) -> np.ndarray:

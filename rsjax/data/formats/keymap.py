@@ -133,7 +133,7 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
 def _from_file(path: Path) -> KeyMap:
     try:
         values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SourceError(f"{path}: not a readable key map ({error}); write the fields of KeyMap as JSON") from error
     known = [entry.name for entry in fields(KeyMap)]
     if not isinstance(values, dict):
@@ -159,7 +159,7 @@ def _checked(path: Path, values: Mapping[str, Any]) -> KeyMap:
     cameras = values["cameras"]
     if not isinstance(cameras, dict) or not all(isinstance(key, str) for key in cameras.values()):
         raise SourceError(f"{path}: cameras is {cameras!r}, should be an object of feature names")
-    if not isinstance(values["fps"], int | float) or values["fps"] <= 0:
+    if not isinstance(values["fps"], int | float) or not 0 < values["fps"] < 1e6:
         raise SourceError(f"{path}: fps is {values['fps']!r}, should be a positive number")
     if values.get("kind", "delta") not in ("delta", "absolute"):
         raise SourceError(f"{path}: kind is {values['kind']!r}, should be delta or absolute")
@@ -174,7 +174,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SourceError(f"{path}: not readable JSON ({error}); fetch it again") from error
     if not isinstance(content, dict):
         raise SourceError(f"{path}: holds {type(content).__name__}, should be an object; fetch it again")

@@ -14,7 +14,17 @@ import pyarrow as pa
 from jaxtyping import Float, UInt8
 
 from rsjax.data.actions import Kind, Layout, led_into
-from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, Frames, Segment, SourceError, checked, fingerprint
+from rsjax.data.episode import (
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    Frames,
+    Segment,
+    SourceError,
+    checked,
+    fingerprint,
+    safe_id,
+)
 from rsjax.data.formats.files import (
     broken,
     filled,
@@ -25,6 +35,7 @@ from rsjax.data.formats.files import (
     matrix,
     parquet_columns,
     parquet_rows,
+    seconds,
 )
 from rsjax.data.formats.lerobot_info import Info
 from rsjax.data.pictures import decode_picture
@@ -47,9 +58,11 @@ class LeRobot:
     def episodes(self) -> Iterator[EpisodeRef]:
         """Every episode of ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
         seen: set[int] = set()
+        listed = 0
         for where, row in self._rows():
+            listed += 1
             try:
-                if isinstance(row, ValueError):
+                if isinstance(row, Exception):
                     raise row
                 number = int(row["episode_index"])
                 if number in seen:
@@ -58,9 +71,14 @@ class LeRobot:
                 yield self._ref(number, row)
             except EpisodeError as error:
                 yield broken(f"episode_{number:06d}", str(error))
-            except (KeyError, TypeError, ValueError) as error:
+            except SourceError as error:
+                yield broken(safe_id(where), str(error))
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 identity = where.rpartition("/")[2].replace(" ", "-").replace(":", "-")
                 yield broken(identity, f"{where}: field missing or wrong ({error}); {_CURE}")
+        if listed < (self._info.episodes or 0):
+            told = f"total_episodes is {self._info.episodes}, meta lists only {listed}"
+            yield broken("meta-info", f"{self._root}/meta/info.json: {told}; {_CURE}")
 
     def read(self, ref: EpisodeRef) -> Episode:
         """One episode; its pictures are not decoded, but their times are checked."""
@@ -69,8 +87,9 @@ class LeRobot:
         table = self._table(path, location)
         number, count = location["episode"], table.num_rows
         if count != location["length"]:
-            raise EpisodeError(f"{path}: {count} rows of episode {number}, metadata say {location['length']}; {_CURE}")
-        times = matrix(table, "timestamp", path)[:, 0].astype(np.float64)
+            told = f"{path}: {count} rows of episode {number}, metadata say {location['length']}; {_CURE}"
+            raise EpisodeError(told, "length")
+        times = seconds(table, "timestamp", path)
         self._check_rows(table, times, location, path)
         states = matrix(table, self._state, path) if self._state in table.column_names else None
         tasks = self._task_of_rows(table, path)
@@ -103,7 +122,10 @@ class LeRobot:
         if not files:
             raise SourceError(f"{meta / 'episodes'}: holds no Parquet files; fetch the data set again")
         for path in files:
-            yield from ((f"{path}: row {number}", row) for number, row in enumerate(parquet_rows(path, columns)))
+            try:
+                yield from ((f"{path}: row {number}", row) for number, row in enumerate(parquet_rows(path, columns)))
+            except SourceError as error:  # the other files' episodes can be read all the same
+                yield str(path.relative_to(meta)), error
 
     def _ref(self, number: int, row: dict[str, Any]) -> EpisodeRef:
         length, tasks = int(row["length"]), [str(task) for task in row.get("tasks") or ()]
@@ -135,7 +157,7 @@ class LeRobot:
         """Raises :class:`EpisodeError` where the rows are not this episode's frames, in order and evenly spaced."""
         count, number = len(times), location["episode"]
         if count == 0:
-            raise EpisodeError(f"{path}: episode {number} has no frames; leave it out")
+            raise EpisodeError(f"{path}: episode {number} has no frames; leave it out", "length")
         first, end = location.get("rows", (None, None))
         expected = {"episode_index": np.full(count, number), "frame_index": np.arange(count)}
         if first is not None:
@@ -148,10 +170,10 @@ class LeRobot:
                 row = wrong[0]
                 raise EpisodeError(f"{path}: {name} of row {row} is {found[row]}, should be {values[row]}; {_CURE}")
         away = np.abs(np.diff(times) - 1 / self._info.fps)
-        if (uneven := np.flatnonzero(~(away <= TOLERANCE))).size:
+        if (uneven := np.flatnonzero(~(away <= _tolerance(times)))).size:
             row = uneven[0]
             step = f"{times[row + 1] - times[row]:.4f} s after the one before, at {self._info.fps:g} fps"
-            raise EpisodeError(f"{path}: timestamp of row {row + 1} comes {step}; {_CURE}")
+            raise EpisodeError(f"{path}: timestamp of row {row + 1} comes {step}; {_CURE}", "time")
 
     def _task_of_rows(self, table: pa.Table, path: Path) -> list[str]:
         if "task_index" not in table.column_names or not self._tasks:
@@ -165,7 +187,7 @@ class LeRobot:
         cameras: dict[str, Frames] = {}
         for key, video in location["videos"].items():
             file = inside(self._root, video["path"])
-            cameras[_camera(key)] = at_times(file, times + video["from"], TOLERANCE)
+            cameras[_camera(key)] = at_times(file, times + video["from"], _tolerance(times))
         for key in self._info.of_type("image"):
             cameras[_camera(key)] = TablePictures(path, key, location, len(times))
         return cameras
@@ -193,10 +215,15 @@ class TablePictures:
         table = parquet_columns(self._path, [self._column], filters)
         if self._column not in table.column_names:
             raise EpisodeError(f"{self._path}: has no column {self._column!r}; {_CURE}")
+        if table.num_rows != self._count:
+            raise EpisodeError(f"{self._path}: {table.num_rows} rows of {self._column}, not {self._count}; {_CURE}")
         pictures = []
         for index, cell in zip(indices, table[self._column].take(list(indices)).to_pylist(), strict=True):
             where = f"{self._path}: {self._column} of row {index}"
-            pictures.append(decode_picture((cell or {}).get("bytes") or b"", where))
+            payload = cell.get("bytes") if isinstance(cell, dict) else cell
+            if not isinstance(payload, bytes):
+                raise EpisodeError(f"{where}: holds no encoded picture; {_CURE}", "undecodable")
+            pictures.append(decode_picture(payload, where))
         if len({picture.shape for picture in pictures}) > 1:
             raise EpisodeError(f"{self._path}: {self._column} has pictures of several sizes; {_CURE}")
         return np.stack(pictures)
@@ -239,6 +266,11 @@ def _tasks(meta: Path, shared: bool) -> dict[int, str]:
         return {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__", ""))) for row in rows}
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{meta}: its table of tasks is damaged ({error}); fetch the file again") from error
+
+
+def _tolerance(times: Float[np.ndarray, " N"]) -> float:
+    """Seconds that a time may be off: LeRobot's, and what float32, in which times are stored, rounds away."""
+    return TOLERANCE + float(np.spacing(np.float32(np.abs(times).max(initial=0))))
 
 
 def _only(location: dict[str, Any]) -> list[tuple[str, str, int]]:

@@ -19,6 +19,7 @@ class Info:
         data_path: template of a table's path.
         video_path: template of a video's path, "" without videos.
         features: column → ``dtype``, ``shape``, ``names``.
+        episodes: how many there should be; None where it is not said.
     """
 
     shared: bool
@@ -27,6 +28,7 @@ class Info:
     data_path: str
     video_path: str
     features: dict[str, dict[str, Any]]
+    episodes: int | None = None
 
     @classmethod
     def read(cls, path: Path) -> "Info":
@@ -38,11 +40,12 @@ class Info:
                 raise SourceError(f"{path}: codebase_version {version}; v2.0, v2.1 and v3.0 can be read: convert it")
             fps, features = float(values["fps"]), dict(values["features"])
             chunks = int(values.get("chunks_size", 1000))
-            if not (fps > 0 and chunks > 0 and all(isinstance(feature, dict) for feature in features.values())):
+            total = values.get("total_episodes")
+            if not (0 < fps < 1e6 and chunks > 0 and all(isinstance(feature, dict) for feature in features.values())):
                 raise ValueError(f"fps {fps}, chunks_size {chunks}")
             paths = str(values["data_path"]), str(values.get("video_path") or "")
-            return cls(version.startswith("v3."), fps, chunks, *paths, features)
-        except (KeyError, TypeError, ValueError) as error:
+            return cls(version.startswith("v3."), fps, chunks, *paths, features, None if total is None else int(total))
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise SourceError(f"{path}: field missing or wrong ({error}); fetch the file again") from error
 
     def of_type(self, dtype: str) -> list[str]:

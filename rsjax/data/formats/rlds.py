@@ -27,6 +27,7 @@ from rsjax.data.episode import (
     fingerprint,
     safe_id,
 )
+from rsjax.data.formats.files import broken, location_of
 from rsjax.data.formats.keymap import KeyMap, check_keys, key_map, read_json
 from rsjax.data.formats.tfrecord import Example, Span, read_payload, spans
 from rsjax.data.pictures import decode_picture
@@ -57,7 +58,7 @@ def open_source(path: Path, keys: str = "", split: str = "") -> "RldsSource":
     if not chosen:
         have = sorted({_split_name(shard)[1] for shard in shards})
         raise SourceError(f"{folder}: no split {split!r}{did_you_mean(split, have)}; it has {', '.join(have)}")
-    return RldsSource(folder, tuple(shard.name for shard in chosen), keymap)
+    return RldsSource(folder, tuple(shard.name for shard in chosen), keymap, path.is_file())
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,14 @@ class RldsSource:
         folder: where the shards are.
         shards: their file names, in order.
         keys: which feature is what.
+        single: whether it is one shard that was asked for, not all there are.
     """
 
     name = "rlds"
     folder: Path
     shards: tuple[str, ...]
     keys: KeyMap
+    single: bool = False
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """From the heads of the records alone. What a damaged shard lacks is one entry, which ``read`` refuses."""
@@ -87,10 +90,23 @@ class RldsSource:
                 where = {"file": shard, "offset": span.offset, "length": span.length, "damage": span.damage}
                 marks = fingerprint((), shard, span.length, span.crc, span.damage, asdict(self.keys))
                 yield EpisodeRef(f"{_stem(shard)}-{number:05d}", marks, where)
+        for split, told in self._lacking():
+            yield broken(safe_id(f"{split}-missing"), told)
+
+    def _lacking(self) -> Iterator[tuple[str, str]]:
+        """Splits of which shards are missing by the names of the others. A user who asks for one shard lacks none."""
+        there: dict[tuple[str, str, int], set[int]] = {}
+        for match in filter(None, map(_SHARD.fullmatch, self.shards)):
+            there.setdefault((match["name"], match["split"], int(match["shards"])), set()).add(int(match["number"]))
+        for (_, split, total), numbers in there.items() if not self.single else ():
+            if gone := total - len(numbers):
+                first = next(number for number in range(total) if number not in numbers)
+                told = f"{gone} of the {total} shards of {split} are missing, the first is {first:05d}"
+                yield split, f"{self.folder}: {told}; fetch them or give one shard alone"
 
     def read(self, ref: EpisodeRef) -> Episode:
         """One record. Cameras that hold a placeholder of one colour are left out, ``meta["blank"]`` names them."""
-        path = _inside(self.folder, ref.location["file"])
+        path = _inside(self.folder, location_of(ref)["file"])
         if ref.location["damage"]:
             raise EpisodeError(f"{path}: {ref.location['damage']}; {_CURE}")
         where = f"{path}: record {ref.id}"

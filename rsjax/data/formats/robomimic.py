@@ -17,7 +17,7 @@ from jaxtyping import Float32
 
 from rsjax.data.actions import Layout, led_into, unflipped
 from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint, safe_id
-from rsjax.data.formats.hdf5 import H5Depths, H5Frames, attribute, open_file, rows
+from rsjax.data.formats.hdf5 import H5Depths, H5Frames, attribute, open_file, own, rows
 from rsjax.errors import did_you_mean
 
 _RENDER = "render them with robomimic's dataset_states_to_obs.py --camera_names …"
@@ -128,8 +128,8 @@ class DemoSource:
             raise EpisodeError(ref.location["damage"])
         path = self.folder / file
         with open_file(path) as opened:
-            group = opened.get(f"data/{demo}")
-            if not isinstance(group, h5py.Group) or not isinstance(group.get("obs"), h5py.Group):
+            group = own(opened, f"data/{demo}", path)
+            if not isinstance(group, h5py.Group) or not isinstance(own(group, "obs", path), h5py.Group):
                 raise EpisodeError(f"{path}: has no data/{demo}/obs; leave the episode out")
             told = _told(opened["data"], path)
             return checked(self._episode(ref, path, group, told), f"{path}: data/{demo}")
@@ -148,6 +148,7 @@ class DemoSource:
             raise EpisodeError(f"{path}: {group.name}/obs has no pictures (*{how.endings[0]}); {_RENDER}")
         depths = {camera: f"{group.name}/obs/{camera}_depth" for camera in cameras if f"{camera}_depth" in group["obs"]}
         fps = _fps(told, path) or how.fps
+        states, flipped = _states(group["obs"], how, path)
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -155,7 +156,7 @@ class DemoSource:
             fps=fps,
             timestamps=np.arange(len(actions)) / fps,
             actions=actions,
-            states=_states(group["obs"], how, path),
+            states=states,
             cameras={camera: H5Frames(path, key, how.turned) for camera, key in cameras.items()},
             depth={camera: H5Depths(path, key, how.turned) for camera, key in depths.items() if self.depth},
             meta={
@@ -163,6 +164,7 @@ class DemoSource:
                 "file": ref.location["file"],
                 "demo": ref.location["demo"],
                 "environment": str(told.get("env_name", "")),
+                "notes": {"flipped": flipped} if flipped else {},
                 "actions": Layout("delta", held=_grippers(actions.shape[1])).to_json(),
             },
         )
@@ -189,8 +191,10 @@ class DemoSource:
             EpisodeError: it cannot be read.
         """
         with open_file(path) as opened:
-            if not isinstance(opened.get("data"), h5py.Group):
+            if not isinstance(own(opened, "data", path), h5py.Group):
                 raise EpisodeError(f"{path}: has no group data, so it is no {self.convention.name} file; take it away")
+            if not len(opened["data"]):
+                raise EpisodeError(f"{path}: its group data has no demos; take it away or fetch it again")
             if not self.filter:
                 return sorted(opened["data"], key=_number)
             masks = opened.get("mask", {})
@@ -211,15 +215,21 @@ def picture_keys(observed: Any, how: Convention) -> dict[str, str]:
     }
 
 
-def _states(observed: Any, how: Convention, path: Path) -> Float32[np.ndarray, "N S"] | None:
-    parts = []
+def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndarray, "N S"] | None, dict[str, int]]:
+    """What the robot measured, and in how many rows of which field a quaternion's sign was turned back."""
+    parts, flipped = [], {}
     for key in (key for key in how.states if key in observed):
         part = rows(observed, key, path)
-        parts.append(unflipped(part) if key in how.quaternions else part)
+        if key in how.quaternions and part.shape[1] == 4:
+            mended = unflipped(part)
+            flipped[key] = int((mended != part).any(1).sum())
+            part = mended
+        parts.append(part)
     for part in parts:
         if len(part) != len(parts[0]):
-            raise EpisodeError(f"{path}: states below {observed.name} have {len(parts[0])} and {len(part)} rows")
-    return np.concatenate(parts, axis=1) if parts else None
+            told = f"{path}: states below {observed.name} have {len(parts[0])} and {len(part)} rows; leave it out"
+            raise EpisodeError(told, "length")
+    return np.concatenate(parts, axis=1) if parts else None, {key: count for key, count in flipped.items() if count}
 
 
 def _told(group: Any, path: Path) -> dict[str, Any]:

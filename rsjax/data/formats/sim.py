@@ -72,8 +72,12 @@ class StoreSource:
         except (StoreError, IndexError) as error:
             raise EpisodeError(f"{self.store.path}: {split} record {number}: {error}") from error
         where = f"{self.store.path / place['file']}: {split} record {number}"
-        _check_arrays(record, where)
-        return checked(self._episode(ref, record, place), where)
+        try:
+            _check_arrays(record, where)
+            return checked(self._episode(ref, record, place), where)
+        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError) as error:
+            told = " ".join(str(error).split())[:200]
+            raise EpisodeError(f"{where}: provenance or settings are wrong ({told}); {_CURE}") from error
 
     def _episode(self, ref: EpisodeRef, record: Record, place: dict[str, Any]) -> Episode:
         provenance = record.get("provenance", {})
@@ -169,3 +173,5 @@ def _check_arrays(record: Record, where: str) -> None:
         if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, kind) or array.ndim != axes:
             found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
             raise EpisodeError(f"{where}: {name} is {found}, should have {axes} axes of {kind.__name__}; {_CURE}")
+    if record["rgb"].shape[3] != 3 or not record["rgb"].size:
+        raise EpisodeError(f"{where}: rgb has the shape {record['rgb'].shape}, should be (T, H, W, 3); {_CURE}")

@@ -24,7 +24,10 @@ class SpaTrackerPredictor(torch.nn.Module):
         times = torch.arange(T)[None, :, None, None]
         places = queries[:, None, :, 1:] + times * self.shift
         deep = torch.ones_like(places[..., :1])
-        return torch.cat([places, deep], -1), torch.ones(places.shape[:3], dtype=torch.bool), queries[..., 0].byte()
+        seen = torch.ones(places.shape[:3], dtype=torch.bool)
+        if T <= wind_length // 2:
+            places, seen = places * 0, ~seen
+        return torch.cat([places, deep], -1), seen, queries[..., 0].byte()
 """
 
 TAPIR = """

@@ -100,3 +100,27 @@ def test_depth_anything_gives_maps_of_the_pictures_size(depth_anything, kind, un
     else:
         assert maps.max() <= 20
     np.testing.assert_allclose(DepthAnything(folder, batch=5)(EPISODE, "top").maps.read(range(5)), maps, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_depth_anything_says_here_what_it_says_by_itself(depth_anything, kind):
+    transformers = pytest.importorskip("transformers")
+    folder, frames = depth_anything(kind), sliding(3, (1, 0), (28, 28))
+    given = DepthAnything(folder, batch=2)(episode(frames), "top")
+    model = transformers.DepthAnythingForDepthEstimation.from_pretrained(folder)
+    inputs = transformers.DPTImageProcessor.from_pretrained(folder)(list(frames.pictures), return_tensors="pt")
+    with torch.no_grad():
+        said = model(**inputs).predicted_depth.numpy()
+    assert np.ptp(said) > 0
+    if kind == "relative":
+        np.testing.assert_allclose(inverse_of(given, range(3)), said, atol=1e-4 * np.ptp(said))
+        nearest = np.unravel_index(said.argmax(), said.shape)  # what it gives is 1/depth
+        assert given.maps.read(range(3))[nearest] == pytest.approx(1)
+    else:
+        np.testing.assert_allclose(given.maps.read(range(3)), np.maximum(said, 1e-3), rtol=1e-4)
+
+
+def test_weights_that_give_nonsense_are_told(checkout, tmp_path):
+    torch.save({"scale": torch.full((64,), float("nan"))}, tmp_path / "w")
+    with pytest.raises(AnnotationError, match="e0: video-depth-anything: depth is not finite"):
+        VideoDepthAnything(checkout, tmp_path / "w", device="cpu")(EPISODE, "top")

@@ -1,3 +1,4 @@
+import socket
 import sys
 
 import pytest
@@ -36,6 +37,14 @@ def test_without_torch_the_extra_is_named(name, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(AnnotationError, match=r"pip install 'rsjax\[annotate\]'"):
         calls(tmp_path)[name]()
+
+
+def test_a_library_that_does_not_go_with_torch_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "amiss.py").write_text("raise RuntimeError('operator amiss::nms does not exist\\nand more')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(AnnotationError, match=r"Net needs amiss, .*nms does not exist\).*same release") as caught:
+        library("amiss", "Net")
+    assert "\n" not in str(caught.value)
 
 
 def test_spatial_tracker_says_that_it_needs_depth(tmp_path):
@@ -107,6 +116,25 @@ def test_missing_weights_of_a_checkout_are_named(name, module, tmp_path):
     check_out(tmp_path, module)
     with pytest.raises(AnnotationError, match="w: no such file"):
         calls(tmp_path)[name]()
+
+
+def test_missing_weights_of_raft_are_named(tmp_path):
+    pytest.importorskip("torchvision")
+    with pytest.raises(AnnotationError, match="w: no such file"):
+        calls(tmp_path)["raft"]()
+
+
+def test_nothing_is_asked_of_a_hub(tmp_path, monkeypatch):
+    pytest.importorskip("transformers")
+    asked = []
+    monkeypatch.setattr(socket.socket, "connect", lambda self, address: asked.append(address))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *address, **options: asked.append(address))
+    for name in ("config.json", "preprocessor_config.json"):
+        (tmp_path / name).write_text('{"model_type": "depth_anything", "auto_map": {"AutoConfig": "someone/net--x.Y"}}')
+    for name in ("depth", "internvl"):
+        with pytest.raises(AnnotationError, match="cannot be made from it"):
+            calls(tmp_path)[name]()
+    assert not asked
 
 
 def test_what_has_no_network_is_always_prepared():

@@ -105,6 +105,14 @@ def test_only_parts_without_text_are_asked_about_and_key_pictures_become_frames(
     assert found.scene == "a table"
 
 
+def test_a_key_picture_counts_before_the_peak_of_motion(tmp_path):
+    given, motion = episode(FRAMES, "", PARTS), np.eye(20)[18]
+    own = OwnSemantics()(given, "top", motion)
+    assert own.parts[1].key_by == "motion" and own.parts[1].key_frames != (12,)
+    found = complete(own, given, "top", saying(json.dumps(GOOD)), InternVL(tmp_path, pictures=4))
+    assert (found.parts[1].key_frames, found.parts[1].key_by) == ((12,), "internvl")
+
+
 def test_a_key_frame_of_the_gripper_stays(tmp_path):
     grip = np.where(np.arange(20) < 14, -1, 1).astype(np.float32)
     given = episode(FRAMES, "", PARTS, grip)

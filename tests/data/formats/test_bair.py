@@ -25,7 +25,8 @@ def episode_bytes(value: int = 0, **changes: Values | None) -> bytes:
 
 
 def write(folder: Path, *payloads: bytes) -> Path:
-    return write_records(folder / "softmotion30_44k" / "train" / "traj_0_to_255.tfrecords", payloads)
+    name = f"traj_0_to_{len(payloads) - 1}.tfrecords"
+    return write_records(folder / "softmotion30_44k" / "train" / name, payloads)
 
 
 def test_pictures_actions_and_states_stand_where_they_belong(tmp_path: Path) -> None:
@@ -77,7 +78,18 @@ def test_a_truncated_file_is_one_more_entry_that_is_refused(tmp_path: Path) -> N
     source = open_source("bair", path)
     good, bad = source.episodes()
     assert len(source.read(good).timestamps) == STEPS
-    with pytest.raises(EpisodeError, match="traj_0_to_255.tfrecords: truncated"):
+    with pytest.raises(EpisodeError, match="traj_0_to_1.tfrecords: truncated"):
+        source.read(bad)
+
+
+@pytest.mark.parametrize("kept", [1, 0])
+def test_a_file_that_ends_between_two_records_is_told_by_its_name(tmp_path: Path, kept: int) -> None:
+    path = write(tmp_path, episode_bytes(), episode_bytes())
+    write_records(path, [episode_bytes()] * kept)
+    source = open_source("bair", tmp_path)
+    *good, bad = source.episodes()
+    assert len(good) == kept
+    with pytest.raises(EpisodeError, match=f"holds {kept} of the 2 records that its name promises"):
         source.read(bad)
 
 

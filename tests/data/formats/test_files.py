@@ -1,13 +1,16 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.data.episode import EpisodeError, SourceError
 from rsjax.data.formats import FORMATS, open_source
-from rsjax.data.formats.files import filled, inside, json_lines
+from rsjax.data.formats.files import MAX_CELLS, filled, inside, json_lines, matrix, parquet_columns, seconds
 
 ROOT = Path("/data/set")
 
@@ -76,3 +79,24 @@ def test_every_format_can_be_opened(tmp_path: Path, name: str) -> None:
         open_source(name, tmp_path, nonsense=1)
     with pytest.raises(SourceError, match="gone: not there"):
         open_source(name, tmp_path / "gone")
+
+
+def test_times_that_count_from_1970_keep_their_intervals() -> None:
+    table = pa.table({"t": 1.7e9 + np.arange(4) / 30, "pair": [[1.0, 2.0]] * 4, "text": ["1"] * 4})
+    np.testing.assert_allclose(np.diff(seconds(table, "t", "f")), 1 / 30, atol=1e-6)
+    with pytest.raises(EpisodeError, match="f: column 'pair' has 2 numbers a row"):
+        seconds(table, "pair", "f")
+    with pytest.raises(EpisodeError, match=r"f: column 'text' \(string\) is not rows of as many numbers"):
+        matrix(table, "text", "f")
+
+
+def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.parquet"
+    pq.write_table(pa.table({"action": np.zeros(MAX_CELLS + 1, np.float32)}), path)
+    assert path.stat().st_size < 2**20
+    with pytest.raises(EpisodeError, match=r"bomb.parquet: 16777217 rows of \d+ bytes, more than a table"):
+        parquet_columns(path)
+    values = pa.array(np.zeros(8 * MAX_CELLS // 4 + 2, np.float32))
+    wide = pa.table({"action": pa.ListArray.from_arrays(pa.array([0, len(values)], pa.int32()), values)})
+    with pytest.raises(EpisodeError, match=r"f: column 'action' has \d+ bytes, more than it can have"):
+        matrix(wide, "action", "f")

@@ -205,3 +205,18 @@ def test_settings_that_cannot_be(tmp_path: Path) -> None:
         open_source("folder", tmp_path / "file")
     with pytest.raises(SourceError, match="not there"):
         open_source("folder", tmp_path / "gone")
+
+
+def test_times_that_count_from_1970(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    lines = ["timestamp,x", *(f"{1.7e9 + row / 10:.3f},{row}" for row in range(COUNT))]
+    (place / "actions.csv").write_text("\n".join(lines))
+    (episode,) = read_all(tmp_path)
+    assert episode.fps == pytest.approx(10, rel=1e-3)
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10, atol=1e-4)
+
+
+def test_times_that_stand_still_are_told(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    (place / "actions.csv").write_text("timestamp,x\n" + "5,1\n" * COUNT)
+    assert "timestamps do not increase at frame 1" in error_of(tmp_path)

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from rsjax.data.episode import EpisodeError, SourceError
 from rsjax.data.formats import open_source
 from rsjax.data.formats.keymap import MAPS
+from tests.bridge import BRIDGE, needs_bridge
 from tests.data.formats.toy_tfrecord import bridge_episode, encoded, picture, step, write_bridge, write_records
-
-BRIDGE = Path("/work/shared/data/bridge")
 
 
 def test_an_action_stands_with_the_frame_that_it_led_into(tmp_path: Path) -> None:
@@ -159,6 +158,17 @@ def test_a_shard_that_lacks_records_is_told(tmp_path: Path) -> None:
         source.read(bad)
 
 
+def test_shards_that_are_missing_are_one_entry_that_is_refused(tmp_path: Path) -> None:
+    for number in (0, 2):
+        shard = write_records(tmp_path / f"kitchen-train.tfrecord-{number:05d}-of-00004", [bridge_episode()])
+    source = open_source("rlds", tmp_path, keys="bridge")
+    *good, bad = source.episodes()
+    assert [len(source.read(ref).timestamps) for ref in good] == [5, 5]
+    with pytest.raises(EpisodeError, match="2 of the 4 shards of train are missing, the first is 00001"):
+        source.read(bad)
+    assert len(list(open_source("rlds", shard, keys="bridge").episodes())) == 1
+
+
 def test_a_shard_that_cannot_be_opened_leaves_the_others(tmp_path: Path) -> None:
     write_bridge(tmp_path, [bridge_episode()])
     gone = write_records(tmp_path / "bridge_dataset-test.tfrecord-00000-of-00001", [bridge_episode()])
@@ -223,7 +233,7 @@ def test_nothing_to_read_is_told(tmp_path: Path) -> None:
         open_source("rlds", tmp_path)
 
 
-@pytest.mark.skipif(not BRIDGE.exists(), reason="the bundled Bridge episodes are not here")
+@needs_bridge
 def test_the_bundled_bridge_episodes() -> None:
     source = open_source("rlds", BRIDGE)
     episodes = [source.read(ref) for ref in source.episodes()]

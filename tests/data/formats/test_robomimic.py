@@ -69,9 +69,9 @@ def test_quaternions_of_the_state_keep_their_sign(tmp_path: Path) -> None:
     turns = np.tile([0.0, 0.6, 0.0, 0.8], (4, 1)) * np.array([[1], [-1], [-1], [1]])
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo() | {"obs/robot0_eef_quat": turns}})
     source = open_source("robomimic", path)
-    np.testing.assert_allclose(
-        np.asarray(source.read(next(source.episodes())).states)[:, 3:7], [[0, 0.6, 0, 0.8]] * 4, atol=1e-6
-    )
+    episode = source.read(next(source.episodes()))
+    np.testing.assert_allclose(np.asarray(episode.states)[:, 3:7], [[0, 0.6, 0, 0.8]] * 4, atol=1e-6)
+    assert episode.meta["notes"] == {"flipped": {"robot0_eef_quat": 2}}
 
 
 @pytest.mark.parametrize(
@@ -156,3 +156,11 @@ def test_nothing_to_read_is_told(tmp_path: Path) -> None:
     source = open_source("robomimic", tmp_path)
     with pytest.raises(EpisodeError, match="has no group data"):
         source.read(next(source.episodes()))
+
+
+def test_a_file_without_demos_is_one_entry(tmp_path: Path) -> None:
+    write_demos(tmp_path / "a.hdf5", {})
+    source = open_source("robomimic", tmp_path)
+    (ref,) = source.episodes()
+    with pytest.raises(EpisodeError, match=r"a.hdf5: its group data has no demos"):
+        source.read(ref)

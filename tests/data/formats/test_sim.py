@@ -62,6 +62,9 @@ def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
         ({"actions": np.full((4, 14), np.nan, np.float32)}, "actions of frame 0 is not finite"),
         ({"depth": np.zeros((4, 5), np.float32)}, "depth is float32"),
         ({"tracks": np.full((3, 4, 2), np.nan, np.float32)}, "tracks are not all finite"),
+        ({"rgb": np.zeros((4, 5, 5, 1), np.uint8)}, "rgb has the shape"),
+        ({"provenance": {"control_hz": "often"}}, "provenance or settings are wrong"),
+        ({"provenance": [1]}, "provenance or settings are wrong"),
     ],
 )
 def test_a_clip_with_other_arrays_is_refused(tmp_path: Path, change: dict, said: str) -> None:

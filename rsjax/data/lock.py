@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rsjax.ablation.fields import GridError
-from rsjax.data.store import disk_guard
+from rsjax.data.store import StoreError, disk_guard
 from rsjax.progress import note
 
 LOOKS, LOOK_SECONDS = 5, 0.05  # before a lock that is not waited for counts as another's
@@ -24,8 +23,7 @@ def lock(path: Path, wait: str = "") -> Iterator[bool]:
         wait: wait for the lock, and say this where there is need to. Empty: do not wait.
 
     Raises:
-        GridError: the file system has no locks.
-        StoreError: the file cannot be made.
+        StoreError: the file system has no locks, or the file cannot be made.
     """
     with disk_guard(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +60,7 @@ def _take(handle: int, path: Path, how: int) -> bool:
     except BlockingIOError:
         return False
     except OSError as error:
-        raise GridError(
+        raise StoreError(
             f"{path}: this file system has no locks ({error.strerror}); choose a place on another"
         ) from error
     return True

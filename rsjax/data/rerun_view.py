@@ -1,0 +1,94 @@
+"""Clips in the Rerun viewer: pictures, depth, tracks and actions over frames. Needs the extra ``rsjax[rerun]``."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.data.codec import Record
+from rsjax.data.inspect import sampled
+from rsjax.data.store import Store, StoreError
+from rsjax.errors import UserError
+
+TIMELINE = "frame"
+
+
+def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[str]:
+    """Opens some clips in the viewer, or writes them for it: ``rerun FILE.rrd`` opens those.
+
+    Clip n is the entity ``clip_00n``: below it ``camera``, ``camera/tracks`` (the visible points, in pixels),
+    ``depth`` (where there is any; in metres if its provenance says so), ``actions``, and once ``task``.
+
+    Args:
+        store: of clips.
+        clips: how many, spread evenly over the store.
+        file: written instead of opening the viewer.
+
+    Returns:
+        Messages of the clips that cannot be read.
+
+    Raises:
+        UserError: the extra is not installed, the viewer does not answer, or the file cannot be written.
+        StoreError: the store holds tokens, or no clip can be read.
+    """
+    try:
+        import rerun
+    except ImportError as error:
+        raise UserError("--rerun needs the viewer: pip install 'rsjax[rerun]'") from error
+    damaged, shown = list[str](), 0
+    recording = rerun.RecordingStream("rsjax")
+    with _reported(file):
+        for record in sampled(store, clips, damaged):
+            if record["rgb"].ndim != 4:
+                raise StoreError(f"{store.path}: holds tokens, not pictures; open the store of clips that they are of")
+            if not shown:
+                _spawn(recording) if file is None else recording.save(file)
+            _log_clip(rerun, recording, f"clip_{shown:03d}", record)
+            shown += 1
+        recording.flush()
+        recording.disconnect()
+    if not shown:
+        raise StoreError(f"{store.path}: no clip can be read{f' ({damaged[0]})' if damaged else ''}; make it again")
+    return damaged
+
+
+@contextmanager
+def _reported(file: Path | None) -> Iterator[None]:
+    """What Rerun raises where its viewer or its file fails it, as a :class:`UserError`."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        told = str(error).strip().partition("\n")[0]
+        if file is None:
+            cure = "it needs a screen; write a file for one elsewhere with --rerun-file"
+            raise UserError(f"the Rerun viewer does not answer ({told}); {cure}") from error
+        raise UserError(f"{file}: cannot be written ({told}); choose another place") from error
+
+
+def _spawn(recording: Any) -> None:
+    """Rerun looks for its viewer on the path; beside this Python it is also where no environment was activated."""
+    before = os.environ.get("PATH", "")
+    os.environ["PATH"] = os.pathsep.join(filter(None, (before, str(Path(sys.executable).parent))))
+    try:
+        recording.spawn()
+    finally:
+        os.environ["PATH"] = before
+
+
+def _log_clip(rerun: Any, recording: Any, name: str, record: Record) -> None:
+    recording.log(f"{name}/task", rerun.TextDocument(record["task"]), static=True)
+    metres = record["provenance"].get("depth_unit", "metres") == "metres"
+    for frame, rgb in enumerate(record["rgb"]):
+        recording.set_time(TIMELINE, sequence=frame)
+        recording.log(f"{name}/camera", rerun.Image(rgb))
+        if record.get("depth") is not None:
+            depth = rerun.DepthImage(record["depth"][frame], meter=1.0 if metres else None)
+            recording.log(f"{name}/depth", depth)
+        seen = np.flatnonzero(record["visible"][:, frame])
+        places = record["tracks"][seen, frame] * (rgb.shape[1], rgb.shape[0])
+        recording.log(f"{name}/camera/tracks", rerun.Points2D(places, keypoint_ids=seen.astype(np.uint16)))
+        recording.log(f"{name}/actions", rerun.Scalars(record["actions"][frame]))

@@ -1,0 +1,81 @@
+"""What turns a data set's units into a model's, and back.
+
+Axes: B clips, T frames, A action dimensions.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from rsjax.data.store import MANIFEST, Store, StoreError, write_atomically
+from rsjax.errors import UserError
+
+_FILE = "units.json"
+
+
+@dataclass(frozen=True)
+class Units:
+    """Those of a data set.
+
+    Attributes:
+        action_mean: of each action dimension over the training split, (A,).
+        action_std: likewise.
+        depth_range: near and far end of the depth colour map, metres; None where no clip has depth.
+    """
+
+    action_mean: tuple[float, ...]
+    action_std: tuple[float, ...]
+    depth_range: tuple[float, float] | None
+
+    @classmethod
+    def create(cls, store: Store) -> "Units":
+        """The units in a store's manifest.
+
+        Raises:
+            StoreError: it names none.
+        """
+        try:
+            return cls._of(store.manifest)
+        except (KeyError, TypeError) as error:
+            where = store.path / MANIFEST
+            raise StoreError(f"{where}: no statistics of actions and depth ({error}); make the store again") from error
+
+    @classmethod
+    def load(cls, run: Path) -> "Units":
+        """Those that a run was trained in.
+
+        Raises:
+            UserError: they are missing, because the run has not come so far, or damaged.
+        """
+        path = run / _FILE
+        try:
+            return cls._of(json.loads(path.read_text()))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{path}: missing or damaged ({error}); the train command of this run makes it") from error
+
+    def save(self, run: Path) -> None:
+        """Writes what :meth:`load` reads."""
+        write_atomically(run / _FILE, json.dumps(asdict(self)).encode())
+
+    @classmethod
+    def _of(cls, values: dict) -> "Units":
+        near_far = values["depth_range"]
+        return cls(tuple(values["action_mean"]), tuple(values["action_std"]), tuple(near_far) if near_far else None)
+
+    def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
+        """What the action encoder sees: actions at zero mean and unit variance; row 0, into the first frame, is zero.
+
+        A dimension that hardly varies is not blown up: its deviation counts as at least 0.001.
+
+        Args:
+            actions: in the data's units.
+            integrate: append their sum over the frames so far, at a quarter of its size.
+        """
+        scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
+        scaled[..., 0, :] = 0.0
+        if integrate:
+            scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
+        return scaled.astype(np.float32)

@@ -1,0 +1,89 @@
+"""Clips of a split, stacked, for what looks at whole clips: evaluation, pictures, videos.
+
+Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from rsjax.data.codec import Record
+from rsjax.data.records import RecordSource
+from rsjax.data.store import StoreError
+from rsjax.progress import note
+from rsjax.sample.generator import Codec, Tokens
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Fields of :class:`rsjax.clip.Clip` with a leading axis.
+
+    Attributes:
+        index: each one's number in the split.
+        depth: zeros for clips that have none.
+        has_depth: which have depth.
+        metric: which have depth in metres, and not relative (see :mod:`rsjax.annotate.depth`).
+    """
+
+    index: Int[np.ndarray, " B"]
+    rgb: UInt8[np.ndarray, "B T H W 3"]
+    depth: Float32[np.ndarray, "B T H W"]
+    has_depth: Bool[np.ndarray, " B"]
+    metric: Bool[np.ndarray, " B"]
+    actions: Float32[np.ndarray, "B T A"]
+    tracks: Float32[np.ndarray, "B N0 T 2"]
+    visible: Bool[np.ndarray, "B N0 T"]
+    success: Bool[np.ndarray, "B T"]
+    task: tuple[str, ...]
+
+    @classmethod
+    def stacked(cls, records: Sequence[Record], index: Sequence[int]) -> "Clips":
+        """Records of clips, all of one shape, with their numbers."""
+        fields = {
+            name: np.stack([record[name] for record in records])
+            for name in ("rgb", "actions", "tracks", "visible", "success")
+        }
+        none = np.zeros(records[0]["rgb"].shape[:3], np.float32)
+        has = np.array([record["depth"] is not None for record in records])
+        metres = [record["provenance"].get("depth_unit", "metres") == "metres" for record in records]
+        return cls(
+            index=np.array(index),
+            depth=np.stack([none if record["depth"] is None else record["depth"] for record in records]),
+            has_depth=has,
+            metric=has & np.array(metres),
+            task=tuple(record["task"] for record in records),
+            **fields,
+        )
+
+    def tokens(self, codec: Codec, frames: int | None = None) -> Tokens:
+        """Tokens of the first frames (None: all); no depth where no clip has it, zeros for those that lack it."""
+        tokens = {"rgb": codec.encode_rgb(self.rgb[:, :frames])}
+        if self.has_depth.any():
+            grid = codec.encode_depth(self.depth[self.has_depth, :frames])
+            tokens["depth"] = np.zeros((len(self.index), *grid.shape[1:]), grid.dtype)
+            tokens["depth"][self.has_depth] = grid
+        return tokens
+
+
+def spread(source: RecordSource, count: int) -> list[int]:
+    """The numbers of ``count`` records spread evenly over a split: neighbours may be windows of one episode."""
+    return np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int)).tolist()
+
+
+def readable(
+    source: RecordSource, numbers: Iterable[int] | None = None, tell: Callable[[str], None] = note
+) -> Iterator[tuple[int, Record]]:
+    """The records of a split that can be read, with their numbers; the others are told. Training need not end here.
+
+    Args:
+        numbers: those that are wanted; all if None.
+    """
+    for number in range(len(source)) if numbers is None else numbers:
+        try:
+            record = source[number]
+        except StoreError as error:
+            tell(f"{error}; it is left out of the held-out scores")
+            continue
+        yield number, record

@@ -1,0 +1,8 @@
+"""Real episodes (25 of BridgeData V2) that lie beside some checkouts."""
+
+from pathlib import Path
+
+import pytest
+
+BRIDGE = Path(__file__).parents[2] / "shared" / "data" / "bridge"
+needs_bridge = pytest.mark.skipif(not BRIDGE.exists(), reason=f"no real episodes at {BRIDGE}")

@@ -1,0 +1,177 @@
+"""Training on a store that was not simulated: clips without depth, of another length and width of actions."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rsjax import presets
+from rsjax.config import ConfigError
+from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
+from rsjax.data.units import Units
+from rsjax.metrics.depth import depth_scores
+from rsjax.pipeline import evaluation
+from rsjax.pipeline.held_out import token_batches
+from rsjax.pipeline.own_data import on_store, relocated
+from rsjax.pipeline.run import Run
+from rsjax.pipeline.tokens import tokenize_store
+from rsjax.pipeline.transforms import token_clip
+from tests.bridge import BRIDGE, needs_bridge
+from tests.pipeline import toy
+from tests.pipeline.conftest import ROOT
+
+
+@pytest.fixture
+def clips(tmp_path: Path) -> Path:
+    return toy.store(tmp_path / "clips").path
+
+
+def test_the_configuration_takes_what_the_clips_are_like(clips: Path) -> None:
+    debug = presets.debug()
+    made = on_store(dataclasses.replace(debug, model=dataclasses.replace(debug.model, frames=9)), clips)
+    sim = toy.config().sim
+    assert made.clips == dataclasses.replace(sim.clips, test_clips=toy.TEST)
+    assert made.model.action_dim == sim.action_dim
+    tiny = presets.get("tiny")
+    wide = dataclasses.replace(tiny, loss=dataclasses.replace(tiny.loss, num_keypoints=4))
+    assert on_store(wide, clips).model.action_dim == 2 * sim.action_dim, "their sums come with the actions"
+
+
+def test_what_does_not_fit_names_both_fields(clips: Path, tmp_path: Path) -> None:
+    debug = presets.debug()
+    short = dataclasses.replace(
+        debug, sim=dataclasses.replace(debug.sim, frames=4), model=dataclasses.replace(debug.model, frames=5)
+    )
+    with pytest.raises(ConfigError, match=r"data.frames is 6 but model.frames holds positions for 5"):
+        on_store(short, clips)
+    with pytest.raises(ConfigError, match=r"data.image_size is 64 but tokenizer.image_size is 256"):
+        on_store(presets.get("roboscape_s"), clips)
+    write_store(tmp_path / "few", "clips", {"train": [encode_clip(toy.clip(0))], "test": []}, {"key": "few"})
+    with pytest.raises(StoreError, match="1 train and 0 test clips.*--test-share"):
+        on_store(debug, tmp_path / "few")
+    write_store(tmp_path / "tokens", "tokens", {"train": [{"x": 1}]}, {"key": "t"})
+    with pytest.raises(StoreError, match="is of tokens"):
+        on_store(debug, tmp_path / "tokens")
+
+
+def test_a_moved_store_is_the_same_and_another_one_in_its_place_is_not(clips: Path, tmp_path: Path) -> None:
+    config = on_store(presets.debug(), clips)
+    keys = Run(config, tmp_path / "run", tmp_path).keys()
+    clips.rename(tmp_path / "moved")
+    there = relocated(config, tmp_path / "moved")
+    assert Run(there, tmp_path / "run", tmp_path).keys() == keys
+    assert Run(there, tmp_path / "run", tmp_path).open_clips().path == tmp_path / "moved"
+    records = {"train": [encode_clip(toy.clip(0))], "test": [encode_clip(toy.clip(1))]}
+    write_store(clips, "clips", records, {"key": "another"})
+    with pytest.raises(StoreError, match=r"is not the store that the run began with \(key another, not toy\)"):
+        Run(config, tmp_path / "run", tmp_path).open_clips()
+    with pytest.raises(StoreError, match="this run's clips were simulated"):
+        relocated(presets.debug(), clips)
+
+
+BLIND = {"train": (0,), "test": (1, 3)}  # clips without depth
+
+
+def partly_blind(path: Path) -> Store:
+    """The toy's clips, some without depth."""
+    whole = toy.store(path.with_name("whole"))
+    splits = {}
+    for split, blind in BLIND.items():
+        source = whole.source(split)
+        splits[split] = [source[i] | ({"depth": None} if i in blind else {}) for i in range(len(source))]
+    meta = {name: value for name, value in whole.manifest.items() if name not in ("splits", "format", "kind")}
+    write_store(path, "clips", splits, meta)
+    return open_store(path)
+
+
+def test_depth_is_scored_where_clips_have_it_and_nothing_else_changes(tmp_path: Path) -> None:
+    some, all_ = partly_blind(tmp_path / "some"), open_store(tmp_path / "whole")
+    generator = toy.generator(all_)
+    found, whole = evaluation.evaluate(generator, some), evaluation.evaluate(generator, all_)
+    seen = [i for i in range(toy.TEST) if i not in BLIND["test"]]
+    one_by_one = []
+    for i in seen:
+        clip = all_.source("test")[i]
+        prompt = {
+            "rgb": generator.codec.encode_rgb(clip["rgb"][None, :1]),
+            "depth": generator.codec.encode_depth(clip["depth"][None, :1]),
+        }
+        sample = generator.config.sample
+        made = generator.generate(prompt, clip["actions"][None], sample, index=np.array([i]))
+        assert made.depth is not None
+        one_by_one.append(
+            float(depth_scores(clip["depth"][None, 1:], made.depth[:, 1:], alignment="none").abs_rel.mean())
+        )
+    assert found.metrics["depth_absrel"] == pytest.approx(np.mean(one_by_one), rel=1e-4)
+    assert found.metrics["psnr_tokenizer"] == whole.metrics["psnr_tokenizer"]
+    shown = {int(clip): bool(has) for clip, has in zip(found.shown["clip"], found.shown["has_depth"], strict=True)}
+    assert shown == {clip: clip in seen for clip in shown}
+
+
+def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
+    whole = toy.store(tmp_path / "whole")
+    splits = {
+        name: [source[i] | {"depth": None} for i in range(len(source))]
+        for name in whole.splits
+        if (source := whole.source(name))
+    }
+    meta = {name: value for name, value in whole.manifest.items() if name not in ("splits", "format", "kind")}
+    write_store(tmp_path / "blind", "clips", splits, meta | {"depth_range": None})
+    blind = open_store(tmp_path / "blind")
+    found = evaluation.evaluate(toy.generator(blind), blind)
+    assert not [name for name in found.metrics if "depth" in name]
+    assert "predicted_depth" not in found.shown
+    assert np.isfinite(found.metrics["psnr"])
+
+
+def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Path) -> None:
+    clips = partly_blind(tmp_path / "some")
+    config = on_store(toy.config(), clips.path)
+    codec = toy.generator(clips).codec
+    tokens = open_store(tokenize_store(clips, config, codec.params, tmp_path / "run"))
+    assert tokens.path.parent == (clips.path / "tokens")
+    assert tokenize_store(clips, config, codec.params, tmp_path / "run") == tokens.path, "they are there already"
+    transform = partial(token_clip, Units.create(clips), config.model.integrate_actions)
+    for split, blind in BLIND.items():
+        source = tokens.source(split)
+        (batch,) = token_batches(source, transform, len(source))
+        assert np.flatnonzero(np.asarray(batch.has_depth) == 0).tolist() == list(blind)
+
+
+def commanded(folder: Path, module: str, *arguments: object) -> str:
+    line = [sys.executable, "-m", f"experiments.{module}", *map(str, arguments)]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@needs_bridge
+def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
+    """The README's commands, shortened: ingest, train ``tiny``, generate."""
+    store, run = tmp_path / "bridge", tmp_path / "run"
+    commanded(tmp_path, "ingest", "rlds", BRIDGE, "--out", store, "--windows.rate", 0, "--windows.frames", 8)
+    few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--sample.steps", 2]
+    few += ["--eval.clips", 2, "--eval.batch-size", 2, "--eval.action-draws", 1]
+    told = commanded(tmp_path, "train", "tiny", "--store", store, "--run-dir", run, *few)
+    assert "no clip has depth, so the depth branch trains with its loss masked" in told
+    log = [json.loads(line) for line in (run / "world_model" / "log.jsonl").read_text().splitlines()]
+    assert log[-1]["depth"] == 0 and np.isfinite(log[-1]["loss"])
+    scores = json.loads((run / "metrics.json").read_text())
+    assert np.isfinite(scores["psnr"]) and not [name for name in scores if name.startswith("depth")]
+    page = (run / "report.html").read_text()
+    assert open_store(store).source("test")[0]["task"] in page
+    tokens = run / "tokens" / "store"
+    assert tokens.resolve().parent == store / "tokens"
+    assert len(open_store(tokens).source("train")) == len(open_store(store).source("train"))
+
+    store.rename(tmp_path / "moved")
+    told = commanded(tmp_path, "generate", run, "--store", tmp_path / "moved", "--clips", 1, "--out", tmp_path / "out")
+    (video,) = (tmp_path / "out").glob("*.mp4")
+    assert str(video) in told
+    assert cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) == 8
