@@ -121,7 +121,8 @@ def read_table(path: Path) -> pa.Table:
     try:
         if (size := path.stat().st_size) > _MOST_BYTES:
             raise ValueError(f"{size} bytes are more than an episode's table can have")
-        table = pa_csv.read_csv(path)
+        with path.open("rb") as file:
+            table = pa_csv.read_csv(file)
         names = table.column_names  # decoded here, not before
     except (pa.ArrowException, OSError, ValueError) as error:
         raise EpisodeError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]}); save it again") from error

@@ -1,4 +1,5 @@
 import json
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from rsjax.data.actions import Layout
+from rsjax.data.codec import decode, encode
 from rsjax.data.episode import Episode, EpisodeError, SourceError
 from rsjax.data.formats import open_source
 from tests.data.formats.videos import numbers_of, picture, write_video
@@ -43,6 +45,16 @@ def error_of(root: Path, **options: Any) -> str:
         source.read(ref)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9")
+    write_episode(tmp_path, name)
+    (episode,) = read_all(tmp_path)
+    assert episode.id.isascii() or episode.id == name
+    assert decode(encode({"id": episode.id, "n": np.zeros(1)}))["id"] == episode.id
+    write_episode(tmp_path, os.fsdecode(b"caf\xea"))
+    assert len({episode.id for episode in read_all(tmp_path)}) == 2
 
 
 def test_an_episode_in_a_folder(tmp_path: Path) -> None:
