@@ -40,6 +40,7 @@ def records(count: int = 11) -> list[Arrays]:
             "tracks": rng.random((7, MODEL.frames, 2)).astype(np.float32),
             "visible": rng.random((7, MODEL.frames)) < rng.random(),
             "weight": np.asarray(number % 3 > 0, np.float32),
+            "has_depth": np.asarray(number % 4 > 0, np.float32),
         }
         for number in range(count)
     ]
