@@ -68,7 +68,8 @@ def choose(stage: str, text: str) -> Any:
     for part in filter(None, fields.split(",")):
         key, equals, value = part.partition("=")
         if key not in known or not equals:
-            raise ConfigError(f"{stage} {name}: no field {part!r}{did_you_mean(key, known)}; write {known}=VALUE")
+            takes = ", ".join(f"{field}=…" for field in known)
+            raise ConfigError(f"{stage} {name}: no field {part!r}{did_you_mean(key, known)}; it takes {takes}")
         values[key] = _value(f"{stage} {name}: {key}", hints[key], value)
     missing = [f.name for f in dataclasses.fields(made) if f.name not in values and _required(f)]
     if missing:

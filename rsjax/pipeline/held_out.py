@@ -121,10 +121,8 @@ class TokenizerHeldOut:
         params = TokenizerObjective(cfg.tokenizer, cfg.tokenizer_train).tokenizer_params(weights)
         codec = Codec(cfg, params, self._units)
         rgb = codec.decode_rgb(codec.encode_rgb(clips.rgb))
-        shown, of_rgb = (
-            {number: [(clips.rgb[row], rgb[row])] for row, number in enumerate(clips.index)},
-            _psnr(clips.rgb, rgb),
-        )
+        shown = {number: [(clips.rgb[row], rgb[row])] for row, number in enumerate(clips.index)}
+        of_rgb = _psnr(clips.rgb, rgb)
         metric, scalars = -of_rgb, {"held_out/psnr": of_rgb}
         if clips.has_depth.any() and self._units.depth_range:
             true = clips.depth[clips.has_depth]
