@@ -46,10 +46,6 @@ def main() -> None:
     """Runs the cells that are not finished, then prints the table; exits with 1 where a cell failed."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
-    if options.store:
-        from rsjax.pipeline.own_data import on_store
-
-        config = on_store(config, options.store)
     out, data = options.out or Path("runs") / f"ablation-{config.name}", options.data_dir
     cells = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
     number = options.cell if options.cell is not None or options.list else task_number(os.environ)

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -44,7 +45,8 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         argv: the arguments, without the program's name.
         prog: the command as the user types it, ``python -m experiments.train``.
         description: what the command does, for ``--help``.
-        options: a dataclass of the command's own options, with their defaults.
+        options: a dataclass of the command's own options, with their defaults. Where it has ``store`` and one is named,
+            the preset is fitted to the clips of that store before its fields are set.
 
     Returns:
         The preset with its overrides, checked, and the options.
@@ -59,6 +61,10 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         print(f"{usage}\n{description}\nEvery option and field: {prog} tiny --help")
         raise SystemExit(0)
     preset = presets.get(argv[0])
+    if hasattr(options, "store") and (store := _named(argv, "store")):
+        from rsjax.pipeline.own_data import on_store
+
+        preset = on_store(preset, Path(store))
     command: Any = dataclasses.make_dataclass(
         "Command",
         [
@@ -149,6 +155,17 @@ def _parse(kind: Any, default: Any, argv: Sequence[str], prog: str, description:
         word = unknown[0].partition("=")[0].lstrip("-").replace("_", "-")
         raise ConfigError(f"unknown argument {unknown[0]!r}{did_you_mean(word, known, '--')} (see {prog} --help)")
     return parsed
+
+
+def _named(argv: Sequence[str], name: str) -> str | None:
+    """The value of an option that is wanted before the others are read; the last one counts."""
+    found = None
+    for word, after in zip(argv, [*argv[1:], ""], strict=True):
+        if word == f"--{name}":
+            found = after
+        elif word.startswith(f"--{name}="):
+            found = word.partition("=")[2]
+    return found
 
 
 def _one_line(report: str) -> str:

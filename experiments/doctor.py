@@ -7,6 +7,10 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse_options
+from rsjax.config import ConfigError
+from rsjax.data.formats import FORMATS
+
+PROG = "python -m experiments.doctor"
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Options:
     lines: int = 50
     """Findings that are printed; 0: all."""
     workers: int = 1
-    """Processes that look at episodes."""
+    """Processes that look at episodes; -1: one per core."""
     fix: Path | None = None
     """Writes a manifest here that leaves out every episode with a finding, with the reasons."""
 
@@ -41,12 +45,18 @@ class Options:
 @main_errors()
 def main() -> None:
     """Prints a line per finding and a table of their kinds."""
-    options = parse_options(sys.argv[1:], "python -m experiments.doctor", Options.__doc__ or "", Options())
+    if len(sys.argv) < 2:
+        raise ConfigError(
+            f"name a store, or a source and its path, first; usage: {PROG} STORE, or {PROG} SOURCE PATH [--fix FILE]; "
+            f"sources: {', '.join(FORMATS)}"
+        )
+    options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
     from experiments.ingest import source_options
+    from rsjax.annotate.pool import count_workers
     from rsjax.data.doctor import examine, open_any
     from rsjax.data.selection import write_selection
     from rsjax.data.symptoms import KINDS, Thresholds
@@ -56,7 +66,7 @@ def main() -> None:
     with console.status("looking at episodes") as status:
         limits = Thresholds(options.frames, options.gap, options.unusual)
         tell = lambda done: status.update(f"looking at episodes: {done}")  # noqa: E731
-        report = examine(source, limits, options.ignore, tell, options.workers)
+        report = examine(source, limits, options.ignore, tell, count_workers(options.workers))
     shown = report.findings[: options.lines or None]
     for finding in shown:
         line = f"{finding.episode}: {finding.kind}: {finding.detail}"
@@ -71,18 +81,25 @@ def main() -> None:
     if report.findings:
         console.print(table)
     found, bad = len(report.refs), report.bad()
-    for kind, count in report.counts().items():
-        if count == found:
-            console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}", highlight=False)
+    common = [kind for kind, count in report.counts().items() if count == found]
+    for kind in common:
+        console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}", highlight=False)
     console.print(f"{found} episodes: {found - bad} without a finding, {bad} with", highlight=False)
     if report.mended:
         console.print(f"mended when they were read, which is no finding: {len(report.mended)}", highlight=False)
     if options.fix is not None:
         about = f"{source.name} {options.path or options.what}"
         kept, out = write_selection(options.fix, about, report.refs, report.reasons())
-        console.print(f"{options.fix}: keeps {kept}, leaves out {out}", markup=False, highlight=False, soft_wrap=True)
+        line = f"{options.fix}: keeps {kept}, leaves out {out}" + ("" if kept else _nothing_left(common))
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if report.findings:
         raise SystemExit(1)
+
+
+def _nothing_left(common: list[str]) -> str:
+    """What to do about a manifest by which nothing is ingested, of kinds that all episodes have."""
+    cure = f"--ignore {' '.join(common)}" if common else "--ignore the kinds that are as they should be"
+    return f"; nothing is left to ingest: {cure}, and write it again"
 
 
 if __name__ == "__main__":

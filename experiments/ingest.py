@@ -11,8 +11,13 @@ from experiments.cli import main_errors, parse_options
 from rsjax.annotate.windows import WindowConfig
 from rsjax.config import ConfigError
 from rsjax.data.actions import ActionConfig
+from rsjax.data.formats import FORMATS
 
 PROG = "python -m experiments.ingest"
+ABOUT = f"""Reads, annotates, cuts and packs episodes.
+
+SOURCE is the format: {", ".join(FORMATS)}. PATH is the folder or file of the data set, as docs/formats.md says of each;
+of sim it is a store of clips."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,8 @@ class Options:
     camera: str = ""
     """The camera that is taken; the episode's first if not given."""
     difficulty: tuple[str, ...] = ()
-    """Which tasks are how difficult, the first that matches: 'pick*=simple' '*fold*=difficult'."""
+    """Which tasks are how difficult, the first that matches: 'pick*=simple' '*fold*=difficult'. Where none matches the
+    task, they are tried on the text of the segment, and then on its skill."""
     scene: tuple[str, ...] = ()
     """Likewise, what descriptions of scenes come to."""
     test_share: float = 0.1
@@ -71,11 +77,13 @@ def main() -> None:
     argv = sys.argv[1:]
     asked = {"-h", "--help"} & {*argv}
     if not asked and (len(argv) < 2 or argv[0].startswith("-") or argv[1].startswith("-")):
-        raise ConfigError(f"name a source and its path first; usage: {PROG} SOURCE PATH --out STORE")
+        raise ConfigError(
+            f"name a source and its path first; usage: {PROG} SOURCE PATH --out STORE; sources: {', '.join(FORMATS)}"
+        )
     name, place, rest = ("", "", argv) if asked else (argv[0], argv[1], argv[2:])
-    options = parse_options(rest, f"{PROG} SOURCE PATH", "Reads, annotates, cuts and packs episodes.", Options())
+    options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, Options())
     from rsjax.annotate.ingest import ingest, is_made, listed
-    from rsjax.annotate.report import QUARANTINE, SUMMARY, WINDOWS, lines
+    from rsjax.annotate.report import lines, tables
     from rsjax.progress import Progress, note
 
     plan = make_plan(name, Path(place), options)
@@ -85,7 +93,7 @@ def main() -> None:
         return
     stages = ", ".join(stage.name for stage in plan.job.stages)
     print(f"{len(found[0])} episodes; steps of each: {stages}, packing", flush=True)
-    with Progress("ingest", plan.steps(found[0]), "steps") as progress:
+    with Progress("ingest", plan.steps(found[0]), "steps", settle=2 * len(plan.job.stages)) as progress:
         counts = ingest(
             plan,
             lambda: make_executor(plan.job, options),
@@ -98,7 +106,8 @@ def main() -> None:
         note("nothing is quarantined that could be tried again")
     else:
         print(*lines(counts), sep="\n")
-        print(f"what was left out, and why: {plan.job.folder}/{SUMMARY}, {QUARANTINE} and {WINDOWS}")
+        if tables(counts):
+            print(f"what was left out, and why: {tables(counts)} in {plan.job.folder}")
     print(f"store: {plan.out}")
 
 
@@ -160,14 +169,15 @@ def check(name: str, options: Options) -> Path:
 
 def make_executor(job: Any, options: Options) -> Any:
     """The workers that the arguments ask for."""
-    from rsjax.annotate.pool import ProcessPool
+    from rsjax.annotate.pool import ProcessPool, check_workers, count_workers
     from rsjax.annotate.runner import Inline
 
     if options.runner == "ray":
         from rsjax.annotate.ray_runner import RayExecutor
 
-        return RayExecutor(job, options.ray_address, most=None if options.workers < 0 else max(1, options.workers))
-    workers = len(os.sched_getaffinity(0)) if options.workers < 0 else options.workers
+        most = None if check_workers(options.workers) < 0 else max(1, options.workers)
+        return RayExecutor(job, options.ray_address, most=most)
+    workers = count_workers(options.workers)
     return ProcessPool(job, workers) if workers else Inline(job)
 
 

@@ -22,7 +22,9 @@ class Options:
     stage: Literal["world_model", "tokenizer"] = "world_model"
     """What was trained."""
     data_dir: Path = Path("data")
-    """Where the run's data set is kept."""
+    """Where the run's data set is kept, if it was simulated."""
+    store: Path | None = None
+    """Where the run's store of clips lies now, if it was ingested and has moved since."""
 
 
 @main_errors()
@@ -30,11 +32,13 @@ def main() -> None:
     """Prints a line per step, or a line per clip of one step."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.replay", Options.__doc__ or "", Options())
+    from rsjax.pipeline.own_data import relocated
     from rsjax.pipeline.replay import replay, skipped_steps
     from rsjax.pipeline.run import Run
     from rsjax.sample.generator import load_config
 
-    run = Run(load_config(options.run), options.run, options.data_dir)
+    config = load_config(options.run)
+    run = Run(relocated(config, options.store) if options.store else config, options.run, options.data_dir)
     if options.step is None:
         print("\n".join(skipped_steps(run, options.stage)) or f"{options.run}: no step of {options.stage} was left out")
         return

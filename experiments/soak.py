@@ -25,8 +25,10 @@ class Options:
     """What is disturbed; the stages before are taken from the reference."""
     out: Path | None = None
     """Where all of it is kept; runs/soak-PRESET if not given."""
+    store: Path | None = None
+    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
-    """Where the reference's clips are kept."""
+    """Where the reference's clips are kept, if they were simulated."""
     reference: Path | None = None
     """A finished run of the same configuration that was never stopped; made first if not given."""
     checkpoint_every: int = 0
@@ -72,8 +74,8 @@ def main() -> None:
 
 
 def training_arguments(argv: Sequence[str]) -> tuple[str, ...]:
-    """The arguments without this command's own options: what ``experiments.train`` is given."""
-    own = {f"--{field.name}" for field in dataclasses.fields(Options)}
+    """The arguments without those that this command alone has: what ``experiments.train`` is given."""
+    own = {f"--{field.name}" for field in dataclasses.fields(Options) if field.name != "store"}
     kept, words = [], iter(argv)
     for word in words:
         if word.partition("=")[0].replace("_", "-") not in {name.replace("_", "-") for name in own}:

@@ -21,9 +21,9 @@ class Split:
     """Options of ``split``."""
 
     into: Path = Path("parts")
-    """A folder, in which the new stores are made."""
+    """A folder, in which the new stores are made; parts, where you are, if not given."""
     by: str = "difficulty"
-    """A column of the labels (task, difficulty, scene): a store for each of its words."""
+    """A column of the labels (task, difficulty, scene, segment, skill): a store for each of its words."""
     parts: int = 0
     """So many stores of as many records each, instead."""
 
@@ -40,7 +40,7 @@ class Tokenize:
 def main() -> None:
     """Does one of them, and says what was made."""
     argv = sys.argv[1:]
-    if {"-h", "--help"} & {*argv}:
+    if len(argv) < 2 and {"-h", "--help"} & {*argv}:
         print(USAGE)
         return
     what, places = (argv[0] if argv else ""), [Path(word) for word in argv[1:]]
@@ -49,10 +49,12 @@ def main() -> None:
 
         made = [merge(places[1:], places[0])]
     elif what == "split" and places:
-        made = split_store(places[0], parse_options(argv[2:], f"{PROG} split STORE", Split.__doc__ or "", Split()))
+        rest = argv[1:] if places[0].name.startswith("-") else argv[2:]
+        made = split_store(places[0], parse_options(rest, f"{PROG} split STORE", "One store into several.", Split()))
     elif what == "tokenize" and places:
         tune_process()
-        options = parse_options(argv[2:], f"{PROG} tokenize STORE", Tokenize.__doc__ or "", Tokenize())
+        rest = argv[1:] if places[0].name.startswith("-") else argv[2:]
+        options = parse_options(rest, f"{PROG} tokenize STORE", "Tokens of every clip, beside the clips.", Tokenize())
         made = [tokenize(places[0], options.run)]
     else:
         raise ConfigError(USAGE)
@@ -65,6 +67,8 @@ def split_store(place: Path, options: Split) -> list[Any]:
     """The parts."""
     from rsjax.data.merge import by_label, into_parts, split
 
+    if options.parts < 0:
+        raise ConfigError(f"--parts is {options.parts}; it is how many stores to make")
     parts = into_parts(options.parts, options.into) if options.parts else None
     return list(split(place, parts or by_label(place, options.by, options.into)).values())
 

@@ -48,6 +48,7 @@ class Progress:
         console: where to show; standard output by default.
         clock: seconds, monotonic.
         per_unit: what each unit consists of and how many, such as ``("tokens", 16384)``: a second rate.
+        settle: units until which no rate is told, nor counted later: while workers start, it says nothing of the rest.
     """
 
     def __init__(
@@ -59,8 +60,10 @@ class Progress:
         console: Console | None = None,
         clock: Callable[[], float] = time.monotonic,
         per_unit: tuple[str, float] | None = None,
+        settle: int = 0,
     ) -> None:
         self.stage, self.total, self.unit, self.per_unit = stage, total, unit, per_unit
+        self._settled = start + settle
         self._console = console or Console()
         self._clock = clock
         self._first = self._done = start
@@ -85,6 +88,8 @@ class Progress:
         """
         now = self._clock()
         self._done = done
+        if done <= self._settled:
+            self._samples.clear()
         self._samples.append((now, done))
         while len(self._samples) > 2 and self._samples[1][0] <= now - RATE_WINDOW_SECONDS:
             self._samples.popleft()

@@ -28,11 +28,13 @@ class Counted:
         return 0.5
 
 
-def run(steps: list[tuple[float, int]], total: int, start: int = 0, terminal: bool = False) -> list[str]:
+def run(
+    steps: list[tuple[float, int]], total: int, start: int = 0, terminal: bool = False, settle: int = 0
+) -> list[str]:
     """The lines shown when (seconds, done) updates come in turn."""
     shown, clock = io.StringIO(), Clock()
     console = Console(file=shown, force_terminal=terminal, width=200)
-    with Progress("train", total, "steps", start, console, clock) as progress:
+    with Progress("train", total, "steps", start, console, clock, settle=settle) as progress:
         for seconds, done in steps:
             clock.now += seconds
             progress.update(done, loss=0.25)
@@ -55,6 +57,12 @@ def test_the_rate_forgets_a_slow_first_step() -> None:
     steady = [(1.0, done) for done in range(2, 2 + int(RATE_WINDOW_SECONDS) + 1)]
     lines = run([(300.0, 1), *steady], total=100)
     assert ", 1 steps/s, " in lines[-2]
+
+
+def test_what_comes_of_starting_up_is_in_no_rate() -> None:
+    lines = run([(12.0, 1), (12.0, 2), (5.0, 12), (5.0, 22)], total=42, settle=2)
+    assert lines[:2] == ["  train: 1/42 steps, loss=0.25", "  train: 2/42 steps, loss=0.25"]
+    assert lines[2] == "  train: 22/42 steps, 2 steps/s, 10 s left, loss=0.25"
 
 
 @given(st.lists(st.floats(0.01, 15), min_size=1, max_size=60))

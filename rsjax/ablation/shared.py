@@ -2,8 +2,8 @@
 
 The clips lie outside the runs. A tokenizer, the tokens and, where cells only differ in how they are decoded or scored,
 the world model are made under ``shared`` in a directory named by their content key, which is a run directory too. From
-there, or from a cell that has them, they come into a cell as hard links: every cell is a whole run directory that can
-be moved, resumed or deleted by itself, at no cost of disk.
+there, or from a cell that has them, they come into a cell as hard links, and tokens, which lie with the clips, as a
+link to them: every cell is a whole run directory that can be moved, resumed or deleted by itself, at no cost of disk.
 """
 
 import errno
@@ -33,7 +33,9 @@ def share(run: Run, others: Sequence[Run], place: Path) -> None:
         others: the other cells' runs.
         place: where what is shared is made and kept.
     """
-    with lock(run.clips.with_name(f".{run.clips.name}.lock"), wait="waiting for another process that collects"):
+    # A store of the user's own is only looked at, and may lie where nothing can be written.
+    locks = place / ".locks" if run.config.data.key else run.clips.parent
+    with lock(locks / f".{run.clips.name}.lock", wait="waiting for another process that collects"):
         if not run.finished("collect"):
             with run.stage("collect"):
                 stages.collect_clips(run)
@@ -83,7 +85,7 @@ def link_stage(source: Run, run: Run, stage: str) -> None:
     with disk_guard(building):
         shutil.rmtree(building, ignore_errors=True)
         left, place = shutil.ignore_patterns("checkpoints"), partial(_place, source.output(stage))
-        shutil.copytree(source.directory / stage, building, ignore=left, copy_function=place)
+        shutil.copytree(source.directory / stage, building, symlinks=True, ignore=left, copy_function=place)
         shutil.rmtree(target, ignore_errors=True)
         building.rename(target)
 

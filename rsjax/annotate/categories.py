@@ -14,16 +14,17 @@ class CategoryConfig:
     """The tables. The paper sorts whole tasks into simple and difficult by hand; so do these.
 
     Attributes:
-        difficulties: by the task's text.
+        difficulties: by the task's text; where none matches it, by a part's text, and then by its skill.
         scenes: by the episode's own description of its scene; without a table the description itself counts.
     """
 
     difficulties: Table = ()
     scenes: Table = ()
 
-    def difficulty(self, task: str) -> str:
-        """Of a clip with this task: ``unknown`` where no pattern matches."""
-        return look_up(self.difficulties, task)
+    def difficulty(self, task: str, segment: str = "", skill: str = "") -> str:
+        """Of a clip with this task, in this part of its episode: ``unknown`` where no pattern matches any of them."""
+        words = (look_up(self.difficulties, text) for text in (task, segment, skill))
+        return next((word for word in words if word != UNKNOWN), UNKNOWN)
 
     def scene(self, description: str) -> str:
         """Where it plays: ``unknown`` where that was not described, or no pattern matches."""

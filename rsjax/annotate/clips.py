@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from rsjax.annotate.categories import CategoryConfig
+from rsjax.annotate.categories import UNKNOWN, CategoryConfig
 from rsjax.annotate.depth import FilledDepths
 from rsjax.annotate.protocols import Tracked
 from rsjax.annotate.stored import StoredDepths, StoredTracks
@@ -56,8 +56,8 @@ class ClipConfig:
     categories: CategoryConfig = field(default_factory=CategoryConfig)
 
     def __post_init__(self) -> None:
-        require(8 <= self.image_size <= 4096, f"clips.image_size is {self.image_size}; choose one from 8 to 4096")
-        require(1 <= self.tracks <= 65536, f"clips.tracks is {self.tracks}; choose a number from 1 to 65536")
+        require(8 <= self.image_size <= 4096, f"--image-size is {self.image_size}; choose one from 8 to 4096")
+        require(1 <= self.tracks <= 65536, f"--points is {self.tracks}; choose a number from 1 to 65536")
         require(0 <= self.most_holes <= 1, f"most_holes is {self.most_holes}; it is a share of the pixels, 0 to 1")
 
 
@@ -68,7 +68,7 @@ class ClipStage:
     config: ClipConfig
     needs: tuple[str, ...] = ()
     name: str = "clips"
-    version: int = 1
+    version: int = 2
     cpus: float = 1.0
     gpus: float = 0.0
 
@@ -118,9 +118,10 @@ def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Sum
 
     Returns:
         ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason),
-        ``short_spans``, ``actions`` (statistics of the clips' actions), ``action_dim``, ``depth`` (its range),
-        ``depth_unit`` ("metres" or "relative"; both None without depth), ``success`` (clips that end so;
-        None where the data set does not say).
+        ``short`` (how many ``spans`` are too short for a window, the ``longest`` of all in recorded frames, what a
+        ``window`` takes, and the ``cure``, in words), ``actions`` (statistics of the clips' actions), ``action_dim``,
+        ``depth`` (its range), ``depth_unit`` ("metres" or "relative"; both None without depth), ``success`` (clips that
+        end so; None where the data set does not say).
 
     Raises:
         EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
@@ -162,12 +163,26 @@ def cut(annotated: Annotated, config: ClipConfig) -> Generator[Record, None, Sum
     return {
         "windows": tally(reasons),
         "left_out": starts_by_reason(index, reasons),
-        "short_spans": index.short,
+        "short": {
+            "spans": index.short,
+            "longest": max((end - first for first, end in spans), default=0),
+            **_room(index.span, episode.fps, windows),
+        },
         "actions": statistics.to_json() if statistics else None,
         "action_dim": len(statistics.mean) if statistics else None,
         "depth": [near, far] if far > 0 else None,
         "depth_unit": views.unit if far > 0 else None,
         "success": succeeded if "success" in episode.meta else None,
+    }
+
+
+def _room(span: int, fps: float, windows: WindowConfig) -> dict[str, str]:
+    """What a window takes of a recording, and how it could be less."""
+    faster = 0 < windows.rate < fps
+    at = f" at {windows.rate:g} Hz" if windows.rate else ""
+    return {
+        "window": f"{windows.frames} frames{at} take {span} of {fps:g} fps",
+        "cure": f"{'raise --windows.rate or ' if faster else ''}lower --windows.frames",
     }
 
 
@@ -187,7 +202,7 @@ def _words(
         "frames": frames.tolist(),
         "segment": segment.text,
         "skill": segment.skill,
-        "difficulty": config.categories.difficulty(task),
+        "difficulty": config.categories.difficulty(task, segment.text, segment.skill),
         "scene": config.categories.scene(annotated.scene),
         "depth_unit": unit,
     }
@@ -197,8 +212,9 @@ def _words(
 
 
 def words(record: Record) -> dict[str, str]:
-    """A clip's labels, by which a curriculum can choose."""
-    return {"task": record["task"]} | {name: record["provenance"][name] for name in ("difficulty", "scene")}
+    """A clip's labels, by which a curriculum or a split can choose."""
+    columns = ("difficulty", "scene", "segment", "skill")
+    return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in columns}
 
 
 def _camera(episode: Episode, name: str) -> str:

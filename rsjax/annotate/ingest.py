@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rsjax.annotate.packing import CLIPS, choose_contents, cuts_of, fitting, pack
-from rsjax.annotate.report import QUARANTINE, SUMMARY, Counts, count, write_tables, write_windows
+from rsjax.annotate.packing import CLIPS, Contents, choose_contents, cuts_of, fitting, pack
+from rsjax.annotate.report import Counts, count, nothing, write_tables, write_windows
 from rsjax.annotate.runner import Executor, run
 from rsjax.annotate.units import Job, Unit, mark_path
 from rsjax.config import content_key
@@ -84,7 +84,7 @@ def is_made(plan: Plan, refs: Sequence[EpisodeRef]) -> bool:
     Raises:
         StoreError: something else is there, which is not to be replaced.
     """
-    return _present(plan) == store_key(plan, refs)
+    return _present(plan) == asked_key(plan, refs)
 
 
 def _ingest(
@@ -112,18 +112,13 @@ def _ingest(
     write_tables(plan.job.folder, counts)
     write_windows(plan.job, refs)
     if not counts.done:
-        reasons = [row["error"] for row in counts.quarantined] + list(counts.filtered.values())
-        raise StoreError(
-            f"none of {counts.found} episodes gave a clip ({len(counts.filtered)} left out, {len(counts.quarantined)} "
-            f"not readable), the first one for: {reasons[0]}; {plan.job.folder} has all of them in {QUARANTINE} and "
-            f"{SUMMARY}"
-        )
+        raise StoreError(nothing(counts, plan.job.folder))
     pack(
         plan.job,
         plan.out,
         contents,
         counts,
-        plan.meta | {"key": store_key(plan, refs)},
+        plan.meta | {"asked": asked_key(plan, refs), "key": store_key(plan, refs, contents)},
         lambda packed: report(steps - counts.done + packed, steps),
     )
     _clean(plan.job.folder / "units", keep_clips)
@@ -131,7 +126,7 @@ def _ingest(
 
 
 def _present(plan: Plan) -> str | None:
-    """The content key of the store that is there already, if one is; errors as in :func:`is_made`."""
+    """What the store was asked for that is there already, if one is; errors as in :func:`is_made`."""
     out, name = plan.out, plan.job.source.name
     if out.exists() and not (out / MANIFEST).exists():
         raise StoreError(f"{out}: exists and is not a store; move it away or choose another --out")
@@ -143,7 +138,7 @@ def _present(plan: Plan) -> str | None:
     if not ours or manifest.get("kind") != "clips":
         what = f"{manifest.get('kind')} of {manifest.get('source', 'another origin')}"
         raise StoreError(f"{out}: holds {what}, not what this makes of {name}; move it away or choose another --out")
-    return manifest.get("key")
+    return manifest.get("asked")
 
 
 def _clean(units: Path, keep_clips: bool) -> None:
@@ -180,8 +175,14 @@ def listed(job: Job) -> Found:
     return refs, duplicates
 
 
-def store_key(plan: Plan, refs: Sequence[EpisodeRef]) -> str:
-    """The content key of the store that comes of these episodes."""
+def store_key(plan: Plan, refs: Sequence[EpisodeRef], contents: Contents) -> str:
+    """The content key of a store: what was asked for, and which episodes gave how many clips, as some may fail."""
+    made = [f"{cut.ref.id} {cut.records}" for cut in contents.made()]
+    return content_key(asked_key(plan, refs), contents.depth_unit, *made)
+
+
+def asked_key(plan: Plan, refs: Sequence[EpisodeRef]) -> str:
+    """A hash of all that was asked for: the episodes, and how they are made into clips."""
     digest = hashlib.sha256()
     for ref in refs:
         digest.update(plan.job.keys(ref)[CLIPS].encode())

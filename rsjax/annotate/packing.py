@@ -1,6 +1,7 @@
 """Cut clips into one store: whose they are, in which split, in which unit of depth, and what the manifest says."""
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -125,8 +126,17 @@ def pack(
     records = {
         split: _records(job, cuts, contents, lambda: packed(next(done))) for split, cuts in contents.splits.items()
     }
-    write_store(out, "clips", records, manifest | meta, words)
+    write_store(out, "clips", records, manifest | {name: finite(value) for name, value in meta.items()}, words)
     open_store(out)
+
+
+def finite(value: Any) -> Any:
+    """The same, with null for numbers that JSON has not: infinity, where an option bounds nothing."""
+    if isinstance(value, dict):
+        return {name: finite(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _records(job: Job, cuts: Sequence[Cut], contents: Contents, packed: Callable[[], None]) -> Iterator[Record]:

@@ -57,6 +57,7 @@ def count(job: Job, refs: Sequence[EpisodeRef], refused: Sequence[tuple[EpisodeR
         UserError: a unit has no mark.
     """
     filtered: dict[str, str] = {}
+    short: dict[str, dict[str, Any]] = {}
     quarantined = [dict(zip(_ROW, (ref.id, "list", ref.fingerprint, why, ""), strict=True)) for ref, why in refused]
     windows = Counter({"kept": 0})
     zeros = {"done": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0}
@@ -70,13 +71,16 @@ def count(job: Job, refs: Sequence[EpisodeRef], refused: Sequence[tuple[EpisodeR
                 stages[mark["stage"]][name] += mark[name]
         last = marks[-1]
         if last["status"] == "failed":
-            quarantined.append({name: last[name] for name in _ROW})
+            quarantined.append({name: last[name] for name in _ROW} | {"error": _plain(last["error"])})
             continue
         windows.update(last["summary"]["windows"])
         clips += last["records"]
         done += bool(last["records"])
         if not last["records"]:
             filtered[ref.id] = _told(last["summary"]["windows"])
+            if not filtered[ref.id]:
+                short[ref.id] = last["summary"]["short"]
+    filtered |= _too_short(short)
     for row in stages.values():
         row["clips_per_second"] = clips / row["seconds"] if row["seconds"] else None
     return Counts(len(refs) + len(refused), done, filtered, quarantined, dict(windows), stages)
@@ -127,7 +131,64 @@ _ROW = ("episode", "stage", "key", "error", "traceback")
 
 def _told(windows: dict[str, int]) -> str:
     left = [f"{number} {reason}" for reason, number in windows.items() if number]
-    return f"windows left out: {', '.join(left)}" if left else "shorter than a window"
+    return f"windows left out: {', '.join(left)}" if left else ""
+
+
+def _too_short(episodes: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Why these gave no window; in the same words where the same would cure it."""
+    told = {name: (short["window"], short["cure"]) for name, short in episodes.items()}
+    longest: dict[tuple[str, str], int] = {}
+    for name, same in told.items():
+        longest[same] = max(longest.get(same, 0), episodes[name]["longest"])
+    return {
+        name: f"shorter than a window ({same[0]}; the longest has {longest[same]}): {same[1]}"
+        for name, same in told.items()
+    }
+
+
+def _plain(error: str) -> str:
+    """A failure's words, without the name of its class where that is one that a user can put right."""
+    name, _, told = error.partition(": ")
+    return told if name in _names(UserError) else error
+
+
+def _names(kind: type[UserError]) -> set[str]:
+    parts: list[set[str]] = [_names(one) for one in kind.__subclasses__()]
+    return {kind.__name__}.union(*parts)
+
+
+_OPTIONS = {  # what the message of a quarantined episode says, where an option is the cause
+    "--camera": "cameras: ",
+    "--windows.rate": "lower windows.rate",
+    "--windows.within-segments": "turn within_segments off",
+}
+
+
+def blamed(counts: Counts) -> str:
+    """The one option for which all were quarantined; "" where there is none."""
+    errors = [row["error"] for row in counts.quarantined]
+    return next((option for option, mark in _OPTIONS.items() if errors and all(mark in told for told in errors)), "")
+
+
+def tables(counts: Counts) -> str:
+    """The files that say what was left out and why, as far as they hold something."""
+    windows = sum(number for reason, number in counts.windows.items() if reason != "kept")
+    held = {SUMMARY: counts.filtered, QUARANTINE: counts.quarantined, WINDOWS: windows}
+    return " and ".join(name for name, holds in held.items() if holds)
+
+
+def nothing(counts: Counts, folder: Path) -> str:
+    """Why no episode gave a clip, in one line.
+
+    Args:
+        folder: where the tables are.
+    """
+    option, reasons = blamed(counts), [row["error"] for row in counts.quarantined] + list(counts.filtered.values())
+    because = f", all {len(counts.quarantined)} of these because of {option}" if option else ""
+    return (
+        f"none of {counts.found} episodes gave a clip ({len(counts.filtered)} left out, {len(counts.quarantined)} "
+        f"quarantined{because}), the first one for: {reasons[0]}; {folder} has all of them in {tables(counts)}"
+    )
 
 
 def lines(counts: Counts) -> list[str]:
@@ -152,9 +213,11 @@ def lines(counts: Counts) -> list[str]:
             f"{name:<9} {row['done']} done, {row['failed']} failed, {_brief(row['seconds'])} on workers, "
             f"{_brief(row['cpu_seconds'])} on cores{rate}"
         )
-    found += [f"without   {reason}: {number}×" for reason, number in Counter(counts.filtered.values()).most_common(3)]
+    found += [f"without   {number}×: {reason}" for reason, number in Counter(counts.filtered.values()).most_common(3)]
     worst = [f"quarantined {row['episode']} at {row['stage']}: {row['error']}" for row in counts.quarantined[:3]]
-    return found + worst + ([f"… {len(counts.quarantined) - 3} more"] if len(counts.quarantined) > 3 else [])
+    option = blamed(counts)
+    because = [f"quarantined all {len(counts.quarantined)} because of {option}"] if option else []
+    return found + because + worst + ([f"… {len(counts.quarantined) - 3} more"] if len(counts.quarantined) > 3 else [])
 
 
 def _brief(seconds: float) -> str:

@@ -160,14 +160,16 @@ def judge(
         ``gap``, ``still``, ``shaking``, ``no key frame`` or "".
     """
     frames = index.starts[:, None] + index.offsets
-    interval = 1 / config.rate if config.rate else float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
-    gaps = np.diff(timestamps[frames], axis=1).max(1, initial=0.0) if len(index) else np.zeros(0)
+    recorded = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
+    # Rounding to recorded frames makes some steps longer than 1 / rate where nothing is missing.
+    steps = np.maximum(np.diff(index.offsets) * recorded, 1 / config.rate if config.rate else 0.0)
+    torn = (np.diff(timestamps[frames], axis=1) > config.most_gap * steps).any(1) if len(index) else np.zeros(0, bool)
     means = _window_means(motion, index) if motion is not None else None
     keys = np.sort(np.asarray(key_frames, np.int64))
     has_key = np.searchsorted(keys, index.starts) < np.searchsorted(keys, index.starts + index.span)
     reasons = []
     for window in range(len(index)):
-        if gaps[window] > config.most_gap * interval:
+        if torn[window]:
             reasons.append("gap")
         elif means is not None and means[window] < config.least_motion:
             reasons.append("still")

@@ -10,6 +10,7 @@ Axes: N recorded frames, T sampled frames, K rows between two of these, A record
 import itertools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -70,6 +71,23 @@ class ActionConfig:
                 raise ConfigError(f"actions.{name} is {getattr(self, name)!r}; choose one of {', '.join(allowed)}")
 
 
+def check_layout(layout: Layout, width: int, where: Path | str) -> None:
+    """Raises :class:`EpisodeError` where a layout names dimensions that actions of this width do not have.
+
+    Args:
+        where: what the message names.
+    """
+    named = {
+        "held": layout.held,
+        "quaternions": [dim for first in layout.quaternions for dim in (first, first + 3)],
+    }
+    for name, dims in named.items():
+        for wrong in (dim for dim in dims if not 0 <= dim < width):
+            raise EpisodeError(
+                f"{where}: {name} names dimension {wrong}, but actions have {width} (from 0 on); mend the option {name}"
+            )
+
+
 def led_into(commands: Float[np.ndarray, "N A"]) -> Float32[np.ndarray, "N A"]:
     """Commands given at each frame, aligned with the frame that each led into: row 0 is zeros, the last is dropped."""
     aligned = np.zeros(commands.shape, np.float32)
@@ -92,7 +110,7 @@ def sampled_actions(
         ConfigError: absolute actions are asked of deltas, or ``stack`` of frames that are not evenly spaced.
         EpisodeError: the layout names dimensions that the actions do not have.
     """
-    _check(layout, actions.shape[1])
+    check_layout(layout, actions.shape[1], "meta.actions")
     if config.kind == "absolute" and layout.kind == "delta":
         raise ConfigError("actions.kind is 'absolute', but the source records deltas; say 'recorded' or 'delta'")
     gaps = np.diff(frames)
@@ -164,12 +182,6 @@ class Statistics:
         mean, std, low, high = (np.array(values[f"action_{name}"]) for name in ("mean", "std", "min", "max"))
         count = values["action_count"]
         return cls(count, mean, std**2 * count, low, high)
-
-
-def _check(layout: Layout, width: int) -> None:
-    dims = [*layout.held, *layout.quaternions, *(first + 3 for first in layout.quaternions)]
-    for wrong in (dim for dim in dims if not 0 <= dim < width):
-        raise EpisodeError(f"meta.actions names dimension {wrong}, but actions have {width}; mend the source")
 
 
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:

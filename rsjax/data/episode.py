@@ -6,8 +6,10 @@ pictures stay on disk until somebody asks for them, so memory does not grow with
 Axes: N recorded frames, H×W pixels, A action dimensions, S state dimensions.
 """
 
+import errno
 import hashlib
 import re
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -21,6 +23,7 @@ from rsjax.errors import UserError
 
 _WHOLE, _EDGE = 2**18, 2**13  # bytes: files up to the first go whole into a fingerprint, others with both ends
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
+MAX_FPS = 10_000.0  # more is a mistake, not a camera
 
 
 class SourceError(UserError):
@@ -187,6 +190,18 @@ def checked(episode: Episode, where: Path | str) -> Episode:
     return episode
 
 
+def plain(path: Path) -> Path:
+    """The same path, unless it is a pipe or a device: opening one may wait for ever, and reading it may never end.
+
+    Raises:
+        OSError: it is.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
+    return path
+
+
 def safe_id(text: str) -> str:
     """A file name for any text: itself where it is one, otherwise what can be kept of it and a hash."""
     kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip(".-")[:100]
@@ -222,7 +237,7 @@ def _file_digest(path: Path, size: int, modified: int) -> bytes:
     large = size > _WHOLE
     digest = hashlib.sha256(_bytes(f"{path.name} {size} {modified if large else ''}"))
     try:
-        with path.open("rb") as file:
+        with plain(path).open("rb") as file:
             digest.update(file.read(_EDGE if large else _WHOLE))
             if large:
                 file.seek(size - _EDGE)

@@ -4,6 +4,14 @@ from pathlib import PurePosixPath
 from typing import Any
 
 _MOST = 2**50  # bytes or records
+_KINDS: dict[str, type] = {  # what a manifest may have beside its files, and what others rely on
+    "episodes": dict,
+    "counts": dict,
+    "filtered": dict,
+    "quarantine": dict,
+    "action_mean": list,
+    "action_std": list,
+}
 
 
 class ManifestError(Exception):
@@ -24,6 +32,8 @@ def check_manifest(manifest: Any, version: int) -> None:
     if manifest["format"] != version:
         raise ManifestError(f"format {manifest['format']!r:.80}, this code reads format {version}")
     _require("splits", isinstance(manifest.get("splits"), dict))
+    for name, kind in _KINDS.items():
+        _require(name, isinstance(manifest.get(name) or kind(), kind))
     for split, entry in manifest["splits"].items():
         name = f"splits.{split}"
         if not _is_plain(split):
@@ -45,6 +55,8 @@ def _check_file(field: str, file: Any, counted: bool) -> None:
     for number in ("bytes", "count") if counted else ("bytes",):
         value = file.get(number)
         _require(f"{field}.{number}", type(value) is int and 0 <= value < _MOST)
+    if counted and file["count"] > file["bytes"]:
+        raise ManifestError(f"{field}.count is {file['count']}, more than its {file['bytes']} bytes hold")
 
 
 def _is_plain(name: Any) -> bool:

@@ -6,6 +6,7 @@ Axes: T frames, H×W pixels, A action dimensions, N₀ tracks.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,11 +15,16 @@ from jaxtyping import UInt8
 from rsjax.data.codec import Record
 from rsjax.data.merge import NONE, shapes
 from rsjax.data.store import Store, StoreError
+from rsjax.data.token_sets import counts, token_sets
 from rsjax.tokenizer.depth_color import depth_to_color
 
 BARS = " ▁▂▃▄▅▆▇█"
 _GAP = 4  # pixels between pictures
+_CAPTION = 16  # pixels high
 _BACKGROUND = 30
+MOST_DIMENSIONS = 32  # of actions, whose means are told one by one
+SIDE = "% of a side per frame"
+SPEED = "px/s of a 256-pixel-wide picture (as --windows.least-motion)"
 
 
 @dataclass(frozen=True)
@@ -31,8 +37,15 @@ class Contents:
         words: records by word, by column of the labels (task, difficulty …); the splits together.
         lengths: records by their number of frames.
         motion: of each record looked at: how far its visible tracks move from frame to frame, % of the image's side.
+        speed: of each that has it: pixels per second of a 256-pixel-wide picture, by the stage ``motion``.
+        cameras: records looked at by the camera they are of, where they say it.
+        rates: likewise by recorded rate and step, in words.
         actions: (dimensions, least, mean, greatest) over the records looked at.
+        units: mean and deviation of each dimension of the train split's actions, as the manifest has them.
         depth: records looked at that have depth, and how many were looked at.
+        episodes: by split, as the manifest has them.
+        left_out: what the manifest counts of what is not in the store: episodes, windows, depth.
+        tokens: records by split of each set of tokens that lies beside the clips.
         damaged: messages of records that cannot be read.
     """
 
@@ -41,8 +54,15 @@ class Contents:
     words: dict[str, dict[str, int]]
     lengths: dict[int, int]
     motion: list[float]
+    speed: list[float]
+    cameras: dict[str, int]
+    rates: dict[str, int]
     actions: tuple[int, float, float, float] | None
+    units: list[tuple[float, float]]
     depth: tuple[int, int]
+    episodes: dict[str, int]
+    left_out: dict[str, int]
+    tokens: dict[str, dict[str, int]]
     damaged: list[str] = field(default_factory=list)
 
 
@@ -52,15 +72,20 @@ def look(store: Store, most: int = 200) -> Contents:
     Args:
         most: how many records are read, spread evenly over the splits; counts and words are of all.
     """
-    lengths, motion, depths = Counter[int](), [], 0
+    lengths, cameras, rates = Counter[int](), Counter[str](), Counter[str]()
+    motion, speed, depths = list[float](), list[float](), 0
     damaged: list[str] = []
     sums = np.zeros(2)  # values and their number
     low, high, width = np.inf, -np.inf, 0
     looked = 0
-    for record in sampled(store, most, damaged):
+    for _, _, record in sampled(store, most, damaged):
         looked += 1
+        provenance = record["provenance"]
         lengths[len(record["actions"])] += 1
         motion.append(motion_of(record))
+        speed += [provenance["motion"]] if "motion" in provenance else []
+        cameras.update([provenance["camera"]] if "camera" in provenance else [])
+        rates.update(_rate(provenance))
         depths += record.get("depth") is not None
         actions = record["actions"][1:]
         if actions.size:
@@ -72,10 +97,37 @@ def look(store: Store, most: int = 200) -> Contents:
         words=_words(store),
         lengths=dict(sorted(lengths.items())),
         motion=motion,
+        speed=speed,
+        cameras=dict(cameras),
+        rates=dict(rates),
         actions=(width, float(low), float(sums[0] / sums[1]), float(high)) if sums[1] else None,
+        units=list(zip(store.manifest.get("action_mean", []), store.manifest.get("action_std", []), strict=False)),
         depth=(depths, looked),
+        episodes={split: len(names) for split, names in store.manifest.get("episodes", {}).items()},
+        left_out=_left_out(store),
+        tokens={key: counts(tokens) for key, tokens in token_sets(store).items()},
         damaged=damaged,
     )
+
+
+def _rate(provenance: dict[str, Any]) -> list[str]:
+    """How a record's frames lie in its recording, if it says so."""
+    fps, frames = provenance.get("fps"), provenance.get("frames", [])
+    if not fps or len(frames) < 2:
+        return []
+    step = (frames[-1] - frames[0]) / (len(frames) - 1)
+    return [f"{fps:.4g} fps, every {f'{step:.3g} frames' if step != 1 else 'frame'} ({fps / step:.3g} Hz)"]
+
+
+def _left_out(store: Store) -> dict[str, int]:
+    """By what it was that was left out; of a merged store, whose counts are gone, its lists of episodes."""
+    told, manifest = store.manifest.get("counts", {}), store.manifest
+    found = {
+        "episodes without a clip": told.get("without", len(manifest.get("filtered", {}))),
+        "episodes quarantined": told.get("quarantined", len(manifest.get("quarantine", {}))),
+    }
+    found |= {f"windows {reason}": count for reason, count in told.get("windows", {}).items() if reason != "kept"}
+    return {what: count for what, count in (found | {"depths": told.get("depth_left_out", 0)}).items() if count}
 
 
 def motion_of(record: Record) -> float:
@@ -87,14 +139,23 @@ def motion_of(record: Record) -> float:
 
 def render(contents: Contents) -> list[str]:
     """As lines of text."""
-    lines = [f"splits    {', '.join(f'{name} {count}' for name, count in contents.splits.items())}"]
+    lines = [f"splits    {_counted(contents.splits)}"]
+    lines += [f"tokens    {key}: {_counted(splits)}" for key, splits in contents.tokens.items()]
+    lines += [f"episodes  {_counted(contents.episodes)}"] if contents.episodes else []
+    lines += [f"left out  {_counted(contents.left_out)}"] if contents.left_out else []
+    lines += [f"cameras   {_counted(contents.cameras)}"] if contents.cameras else []
+    lines += [f"rate      {rate} {count}×" for rate, count in contents.rates.items()]
     lines += [f"{name:<9} {shape}" for name, shape in contents.shapes.items() if shape != NONE]
     if contents.actions:
         width, low, mean, high = contents.actions
         lines.append(f"actions   {width} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}")
+    if 0 < len(contents.units) <= MOST_DIMENSIONS:
+        lines.append(f"mean±std  {', '.join(f'{mean:.3g}±{std:.2g}' for mean, std in contents.units)}")
     lines.append(f"depth     in {contents.depth[0]} of {contents.depth[1]} records read")
     lines.append("lengths   " + ", ".join(f"{length} frames {count}×" for length, count in contents.lengths.items()))
-    lines.append(f"motion    {histogram(contents.motion)}")
+    lines.append(f"motion    {histogram(contents.motion, SIDE)}")
+    if contents.speed:
+        lines.append(f"motion    {histogram(contents.speed, SPEED)}")
     for column, words in contents.words.items():
         ranked = sorted(words.items(), key=lambda pair: -pair[1])
         told = ", ".join(f"{word!r} {count}×" for word, count in ranked[:10])
@@ -102,28 +163,31 @@ def render(contents: Contents) -> list[str]:
     return lines + [f"damaged   {message}" for message in contents.damaged]
 
 
-def histogram(values: Sequence[float], bins: int = 24) -> str:
+def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:
     """A line such as ``0 ▁▃█▂ 4.2 % of a side per frame, median 1.3``."""
     if not values:
         return "not measured"
-    counts, edges = np.histogram(values, bins)
-    levels = np.ceil(counts / max(counts.max(), 1) * (len(BARS) - 1)).astype(int)
+    heights, edges = np.histogram(values, bins)
+    levels = np.ceil(heights / max(heights.max(), 1) * (len(BARS) - 1)).astype(int)
     bars = "".join(BARS[level] for level in levels)
-    return f"{edges[0]:.3g} {bars} {edges[-1]:.3g} % of a side per frame, median {np.median(values):.3g}"
+    return f"{edges[0]:.3g} {bars} {edges[-1]:.3g} {unit}, median {np.median(values):.3g}"
 
 
 def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -> UInt8[np.ndarray, "h w 3"]:
     """Some clips as rows, spread evenly over the store, with ``frames`` of their frames each, and depth below them.
 
+    Above each clip stands its split, its number there and its task.
+
     Raises:
         StoreError: the store has no readable clip with pictures.
     """
     rows, damaged = [], list[str]()
-    for record in sampled(store, clips, damaged):
+    for split, number, record in sampled(store, clips, damaged):
         if record["rgb"].ndim != 4:
             raise StoreError(f"{store.path}: holds tokens, not pictures; inspect the store of clips that they are of")
         times = np.linspace(0, len(record["rgb"]) - 1, frames).round().astype(int)
-        rows.append(_row(record["rgb"][times], side))
+        pictures = _row(record["rgb"][times], side)
+        rows += [_caption(f"{split} {number}: {record['task']}", pictures.shape[1]), pictures]
         if record.get("depth") is not None:
             depth = record["depth"]
             near, far = float(depth.min()), float(depth.max())
@@ -134,15 +198,16 @@ def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96
     return np.concatenate(rows)
 
 
-def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[Record]:
-    """Records spread evenly over all splits; what cannot be read is added to ``damaged``."""
+def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
+    """Records spread evenly over all splits, with split and number; what cannot be read is added to ``damaged``."""
     sources = [store.source(name) for name in store.splits]
     ends = np.cumsum([len(source) for source in sources])
     total = int(ends[-1]) if sources else 0
     for place in np.unique(np.linspace(0, total - 1, min(most, total)).round().astype(int)).tolist():
         part = int(np.searchsorted(ends, place, side="right"))
+        number = place - int(ends[part]) + len(sources[part])
         try:
-            yield sources[part][place - int(ends[part]) + len(sources[part])]
+            yield store.splits[part], number, sources[part][number]
         except StoreError as error:
             damaged.append(str(error))
 
@@ -161,3 +226,16 @@ def _row(pictures: UInt8[np.ndarray, "n H W 3"], side: int) -> UInt8[np.ndarray,
     small = [cv2.resize(picture, (side, height), interpolation=cv2.INTER_AREA) for picture in pictures]
     framed = [np.pad(one, ((0, _GAP), (0, _GAP), (0, 0)), constant_values=_BACKGROUND) for one in small]
     return np.concatenate(framed, axis=1)
+
+
+def _caption(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """A line of small text, cut off where the width ends; letters that OpenCV has not are question marks."""
+    strip = np.full((_CAPTION, width, 3), _BACKGROUND, np.uint8)
+    shown = " ".join(text.split()).encode("ascii", "replace").decode()
+    cv2.putText(strip, shown, (_GAP, _CAPTION - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (230, 230, 230), 1, cv2.LINE_AA)
+    return strip
+
+
+def _counted(numbers: dict[str, int]) -> str:
+    """As in ``train 7, test 2``."""
+    return ", ".join(f"{name} {number}" for name, number in numbers.items())

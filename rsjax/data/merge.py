@@ -53,6 +53,15 @@ def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
     return told
 
 
+def _episodes(stores: Sequence[Store]) -> dict[str, list[str]]:
+    """Of each split."""
+    told: dict[str, list[str]] = {}
+    for store in stores:
+        for split, episodes in store.manifest["episodes"].items():
+            told.setdefault(split, []).extend(episodes)
+    return told
+
+
 def _depth_range(store: Store) -> Any:
     return store.manifest.get("depth_range")
 
@@ -68,6 +77,8 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
         }
         | {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
     )
+    if all("episodes" in store.manifest for store in stores):
+        meta["episodes"] = _episodes(stores)
     if all(store.manifest.get("success_share") is not None for store in stores):
         meta["success_share"] = _weighted(stores, "success_share")
     stamp = meta["depth_range"]
@@ -94,10 +105,12 @@ def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
     """
     store = open_store(path)
     sets = token_sets(store)
-    for out, chosen in outs.items():
-        numbers = {name: _chosen(store, name, chosen) for name in store.splits}
+    parts = {out: {name: _chosen(store, name, chosen) for name in store.splits} for out, chosen in outs.items()}
+    for out, numbers in parts.items():
+        _check_free(out, [store])
         if not any(numbers.values()):
             raise StoreError(f"{out}: no record of {path} is chosen for it; choose otherwise")
+    for out, numbers in parts.items():
         key = content_key("split", store.manifest.get("key") or str(path), *(f"{n}{v}" for n, v in numbers.items()))
         _write_part(store, numbers, out, key)
         for tokenizer, tokens in sets.items():
@@ -190,9 +203,9 @@ def _chosen(store: Store, name: str, chosen: Chosen) -> list[int]:
 def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
     if len(stores) < 2:
         raise StoreError("merging takes two stores or more")
-    places = [store.path.resolve() for store in stores]
-    if len(set(places)) < len(places) or out.resolve() in places:
-        raise StoreError(f"{out}: a store can neither be merged with itself nor into itself; choose another place")
+    if len({store.path.resolve() for store in stores}) < len(stores):
+        raise StoreError("a store cannot be merged with itself; name each once")
+    _check_free(out, stores)
     one = stores[0]
     tokens = one.manifest.get("kind") == "tokens"
     columns = _columns(one)
@@ -216,6 +229,15 @@ def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
             )
         if columns is not None and _columns(other) not in (None, columns):
             raise StoreError(f"{other.path}: its labels are {_columns(other)}, those of {one.path} {columns}")
+
+
+def _check_free(out: Path, stores: Sequence[Store]) -> None:
+    """Raises :class:`StoreError` where something is already, or a store that is read would be written into."""
+    if out.exists():
+        raise StoreError(f"{out}: is there already; choose another place, or delete it")
+    for store in stores:
+        if store.path.resolve() in out.resolve().parents:
+            raise StoreError(f"{out}: lies in {store.path}, which is read; choose another place")
 
 
 def _differ(here: str | None, there: str | None) -> bool:
@@ -247,7 +269,8 @@ def _units(stores: Sequence[Store]) -> dict[str, Any]:
     """Of all train records together, each as they stand where all stores agree."""
     manifests = [store.manifest for store in stores]
     units = {name: manifests[0].get(name) for name in UNITS}
-    if all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests):
+    alike = all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests)
+    if alike and not all("action_count" in manifest for manifest in manifests):
         return units
     total: Statistics | None = None
     for store in stores:
@@ -257,7 +280,7 @@ def _units(stores: Sequence[Store]) -> dict[str, Any]:
     ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
     merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
     unit = next((manifest["depth_unit"] for manifest in manifests if manifest.get("depth_unit")), None)
-    return total.to_json() | {"depth_range": merged, "depth_unit": unit}
+    return total.to_json() | {"depth_range": merged, "depth_unit": unit} | (units if alike else {})
 
 
 def _measured(store: Store) -> Statistics:

@@ -38,11 +38,11 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     try:
         import rerun
     except ImportError as error:
-        raise UserError("--rerun needs the viewer: pip install 'rsjax[rerun]'") from error
+        raise UserError("--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'") from error
     damaged, shown = list[str](), 0
     recording = rerun.RecordingStream("rsjax")
     with _reported(file):
-        for record in sampled(store, clips, damaged):
+        for _, _, record in sampled(store, clips, damaged):
             if record["rgb"].ndim != 4:
                 raise StoreError(f"{store.path}: holds tokens, not pictures; open the store of clips that they are of")
             if not shown:

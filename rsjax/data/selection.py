@@ -83,6 +83,8 @@ def select(source: EpisodeSource, path: Path) -> Selected:
             (str(entry["id"]), str(entry["fingerprint"])): "; ".join(map(str, entry["reasons"]))
             for entry in content["left_out"]
         }
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SourceError(
             f"{path}: not a manifest of experiments.doctor ({error}); make it again with --fix"

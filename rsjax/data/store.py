@@ -152,22 +152,29 @@ def open_store(path: Path | str) -> Store:
     """Open a store, which may be somebody else's, and check that its files are all there and whole.
 
     Raises:
-        StoreError: the manifest or a shard is missing, truncated, of another format or cannot be reached (permissions,
-            a loop of links), or the manifest names a file outside the store or an impossible size.
+        StoreError: the place is missing or no store, the manifest or a shard is missing, truncated, of another format
+            or cannot be reached (permissions, a loop of links), or the manifest names a file outside the store or an
+            impossible size. To delete it is the cure only where there are shards, which nobody's own data are.
     """
     path = Path(path)
-    place, cure = path / MANIFEST, f"delete {path} and make it again"
+    place = path / MANIFEST
+    ours = any(path.glob("*.array_record"))
+    cure = f"delete {path} and make it again" if ours else "give a store, or make one with experiments.ingest"
     try:
         manifest = json.loads(place.read_text())
         check_manifest(manifest, FORMAT)
-    except FileNotFoundError as error:
-        raise StoreError(f"{place}: missing, so {path} is not a (whole) store; {cure}") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        if ours:
+            raise StoreError(f"{place}: missing, so {path} is not a whole store; {cure}") from error
+        there = f"no store (it has no {MANIFEST})" if path.exists() else "not there"
+        raise StoreError(f"{path}: {there}; {cure}") from error
     except OSError as error:
         raise StoreError(f"{place}: cannot be read ({error.strerror}); mend the link or permission") from error
     except ManifestError as error:
         raise StoreError(f"{place}: {error}; {cure}") from error
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{place}: not JSON ({error}); {cure}") from error
+    cure = f"delete {path} and make it again"  # what has such a manifest was a store
     for entry in manifest["splits"].values():
         for file in entry["files"] + ([entry["labels"]] if "labels" in entry else []):
             shard = path / file["name"]

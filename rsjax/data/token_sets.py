@@ -1,9 +1,18 @@
 """The token grids that lie beside a store's clips, one set for each tokenizer that ever made them."""
 
-from rsjax.config import content_key
+from rsjax.config import Config, content_key
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
+
+
+def tokenizer_key(config: Config, weights: str) -> str:
+    """What decides which tokens an image has: the tokenizer's weights, and how depth becomes an image.
+
+    Args:
+        weights: their fingerprint.
+    """
+    return content_key("tokenizer", weights, config.tokenizer.depth_scale)
 
 
 def tokens_key(clips: str, tokenizer: str) -> str:

@@ -4,8 +4,10 @@ Axes: B clips, T frames, A action dimensions.
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -39,7 +41,7 @@ class Units:
         """
         try:
             return cls._of(store.manifest)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             where = store.path / MANIFEST
             raise StoreError(f"{where}: no statistics of actions and depth ({error}); make the store again") from error
 
@@ -61,9 +63,14 @@ class Units:
         write_atomically(run / _FILE, json.dumps(asdict(self)).encode())
 
     @classmethod
-    def _of(cls, values: dict) -> "Units":
-        near_far = values["depth_range"]
-        return cls(tuple(values["action_mean"]), tuple(values["action_std"]), tuple(near_far) if near_far else None)
+    def _of(cls, values: dict[str, Any]) -> "Units":
+        mean, std, near_far = (values[name] for name in ("action_mean", "action_std", "depth_range"))
+        numbers = [*mean, *std, *(near_far or ())]
+        if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+            raise ValueError(f"numbers are expected, not {numbers!r:.80}")
+        if len(mean) != len(std) or (near_far and not (len(near_far) == 2 and near_far[0] < near_far[1])):
+            raise ValueError(f"action_mean has {len(mean)} values, action_std {len(std)}; depth_range is {near_far}")
+        return cls(tuple(mean), tuple(std), tuple(near_far) if near_far else None)
 
     def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
         """What the action encoder sees: actions at zero mean and unit variance; row 0, into the first frame, is zero.

@@ -84,6 +84,6 @@ def readable(
         try:
             record = source[number]
         except StoreError as error:
-            tell(f"{error}; it is left out of the held-out scores")
+            tell(f"{error}; it is left out here")
             continue
         yield number, record

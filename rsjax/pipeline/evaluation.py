@@ -14,7 +14,7 @@ from rsjax.data.store import Store, StoreError, decode, encode, write_atomically
 from rsjax.metrics import control, pixels
 from rsjax.metrics.depth import depth_scores, result_key
 from rsjax.metrics.statistics import bootstrap, over_predicted_frames
-from rsjax.pipeline.clips import Clips, spread
+from rsjax.pipeline.clips import Clips, readable, spread
 from rsjax.progress import Progress
 from rsjax.sample.generator import Generated, Generator, Tokens
 
@@ -95,7 +95,9 @@ def _plans(generator: Generator, actions: Float[np.ndarray, "B T A"], clips: Sto
     """The actions to generate under, by kind, each (R, B, T, A)."""
     draws = generator.config.eval.action_draws
     train = clips.source("train")
-    low, high = control.action_range(np.stack([train[i]["actions"] for i in spread(train, RANGE_CLIPS)]))
+    low, high = control.action_range(
+        np.stack([clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))])
+    )
     return {
         "own": actions[None],
         "other": actions[control.other_clips(len(actions), draws, seed=0)],

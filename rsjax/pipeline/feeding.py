@@ -1,7 +1,7 @@
 """What the trained stages read: records by the config's stages, and only those that can be read."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,9 @@ import jax
 import numpy as np
 
 from rsjax.config import LoopConfig
-from rsjax.data.codec import Record
 from rsjax.data.curriculum import Feed, plan
 from rsjax.data.order import Transform
-from rsjax.data.quarantine import NAME, Quarantine
-from rsjax.data.store import Source, Store, StoreError
+from rsjax.data.store import Store
 from rsjax.data.units import Units
 from rsjax.pipeline import transforms
 from rsjax.progress import note
@@ -37,38 +35,20 @@ def token_transform(own: Store, integrate: bool, store: Store) -> Transform:
 
     Args:
         own: the store of the model's own data.
-        integrate: whether the actions' sums follow them (see :meth:`rsjax.sample.generator.Units.action_inputs`).
+        integrate: whether the actions' sums follow them (see :meth:`rsjax.data.units.Units.action_inputs`).
         store: the one that is read.
     """
-    units, there = Units.create(own), Units.create(store)
-    if units.depth_range != there.depth_range and there.depth_range and is_lead():
-        note(
-            f"{store.path}: its depth tokens stand for {there.depth_range} m, this run's for {units.depth_range} m; "
-            f"the model is not told"
-        )
+    units = Units.create(own)
+    here, there = _depth_told(own), _depth_told(store)
+    if there and here != there and is_lead():
+        note(f"{store.path}: its depth tokens stand for {there}, this run's for {here}; the model is not told")
     return partial(transforms.token_clip, units, integrate)
 
 
-def readable(source: Source, split: str, directory: Path, max_damaged: float) -> Iterator[Record]:
-    """A split's clips, in order. A damaged one is listed and left out, but not of those that scores are made of.
-
-    Args:
-        directory: where the list is kept.
-        max_damaged: share of the clips that may be left out.
-
-    Raises:
-        StoreError: too many are damaged, or one of another split than ``train``.
-    """
-    quarantine = Quarantine(directory / NAME, len(source), max_damaged)
-    for index in range(len(source)):
-        try:
-            clip = source[index]
-        except StoreError as error:
-            if split != "train":
-                raise
-            quarantine.note(source.locate(index), error, instead="it is left out")
-            continue
-        yield clip
+def _depth_told(store: Store) -> str:
+    """What a store's depth tokens stand for; empty where no clip has depth."""
+    near_far = store.manifest.get("depth_range")
+    return f"{near_far[0]:g} to {near_far[1]:g} {store.manifest.get('depth_unit') or 'metres'}" if near_far else ""
 
 
 def fingerprint(params: Any) -> str:

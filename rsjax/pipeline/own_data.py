@@ -5,23 +5,30 @@ from pathlib import Path
 
 from rsjax.config import Config, DataConfig
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
+from rsjax.pipeline.clips import readable
 
 
 def on_store(config: Config, path: Path) -> Config:
     """A configuration that learns from a store of clips, as ``experiments.ingest`` makes it.
 
-    ``data`` says what its clips are like, and the model takes actions of their width; all else stays, and has to fit.
+    ``data`` says what its clips are like, and what has to fit them is made so: the size of the tokenizer's images, and
+    the model's grid, width of actions, positions and keypoints. All else stays.
 
     Raises:
         StoreError: there is no such store, it holds no clips, or was made without a content key.
-        ConfigError: the clips do not fit the model; the message names both fields.
+        ConfigError: pictures of this size have no whole number of tokens; the message names the fields.
     """
-    store = open_store(path)
-    data = _data(store)
-    if not config.model.action_dim:
-        return replace(config, data=data)
+    data = _data(open_store(path))
+    tokenizer = replace(config.tokenizer, image_size=data.image_size)
     width = data.action_dim * (2 if config.model.integrate_actions else 1)
-    return replace(config, data=data, model=replace(config.model, action_dim=width))
+    model = replace(
+        config.model,
+        grid=tokenizer.grid,
+        frames=max(config.model.frames, data.frames),
+        action_dim=width if config.model.action_dim else 0,
+    )
+    loss = replace(config.loss, num_keypoints=min(config.loss.num_keypoints, data.tracks))
+    return replace(config, data=data, tokenizer=tokenizer, model=model, loss=loss)
 
 
 def relocated(config: Config, path: Path) -> Config:
@@ -48,7 +55,9 @@ def _data(store: Store) -> DataConfig:
             f"{where}: {counts['train']} train and {counts['test']} test clips; training takes one and two at least: "
             f"ingest it with a larger --test-share, or more episodes"
         )
-    clip = store.source("train")[0]
+    clip = next((record for _, record in readable(store.source("train"), tell=lambda _: None)), None)
+    if clip is None:
+        raise StoreError(f"{store.path}: no clip of its train split can be read; get it again")
     return DataConfig(
         store=str(store.path.absolute()),
         key=manifest["key"],

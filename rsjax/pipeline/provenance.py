@@ -84,7 +84,14 @@ def record_start(run: Run, command: str) -> list[str]:
     differing = {name: value for name, value in now.items() if name == "time" or before.get(name) != value}
     _write(run.directory, [*_read(run.directory / NAME), differing])
     # What was not there yet is no change: data that are made later, a package that nothing used.
-    return [name for name in DECIDE if any(v != now[name].get(k) for k, v in before.get(name, {}).items())]
+    return [name for name in DECIDE if any(_other(v, now[name].get(k)) for k, v in before.get(name, {}).items())]
+
+
+def _other(before: Any, now: Any) -> bool:
+    """Whether two entries differ in more than the place where the data lie."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        return before | {"path": ""} != now | {"path": ""}
+    return before != now
 
 
 def record_data(run: Run) -> None:

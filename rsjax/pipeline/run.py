@@ -13,8 +13,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from rsjax.config import Config, content_key, to_dict
-from rsjax.data.store import Store, StoreError, disk_guard, open_store, write_atomically
+from rsjax.config import Config, ConfigError, content_key, from_dict, to_dict
+from rsjax.data.store import MANIFEST, Store, StoreError, disk_guard, open_store, write_atomically
+from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
 from rsjax.sim.collect import collection_key
 
@@ -57,7 +58,10 @@ class Run:
         Raises:
             StoreError: it is gone or damaged, or another one than the run was made for lies there.
         """
-        store, key = open_store(self.clips), self.config.data.key
+        key = self.config.data.key
+        if key and not (self.clips / MANIFEST).exists():
+            raise StoreError(f"{self.clips}: no store is there; if it was moved, say where it lies with --store")
+        store = open_store(self.clips)
         if key and store.manifest.get("key") != key:
             raise StoreError(
                 f"{self.clips}: is not the store that the run began with (key {store.manifest.get('key')}, not {key}); "
@@ -69,9 +73,17 @@ class Run:
         """The store of tokens, where it really lies.
 
         Raises:
-            StoreError: it is gone or damaged.
+            StoreError: it is gone or damaged, or the tokens of other clips are there now.
         """
-        return open_store(self.output("tokens").resolve())
+        store = open_store(self.output("tokens").resolve())
+        if not self._made_of_these_clips(store.manifest):
+            raise StoreError(f"{store.path}: holds tokens of other clips; the train command of this run makes its own")
+        return store
+
+    def _made_of_these_clips(self, tokens: dict[str, Any]) -> bool:
+        """Whether a store of tokens with this manifest belongs to the run's own store, which may have been moved."""
+        key, cfg = self.config.data.key, self.config
+        return not key or tokens.get("key") == tokens_key(key, tokenizer_key(cfg, str(tokens.get("tokenizer"))))
 
     def keys(self) -> dict[str, str]:
         """Each stage's content key: its own settings and the key of the stage before."""
@@ -113,8 +125,10 @@ class Run:
     def _differences(self, stage: str) -> str:
         """The fields that make the stage in the directory another one; not those that change no result."""
         try:
-            saved = _flat(json.loads((self.directory / "config.json").read_text()))
-        except (OSError, ValueError):
+            saved = _flat(to_dict(from_dict(Config, json.loads((self.directory / "config.json").read_text()))))
+        except ConfigError as error:
+            return f"of another version: {error}"
+        except (OSError, ValueError, TypeError):
             return "its config.json is missing or damaged"
         here, free = _flat(to_dict(self.config)), _runtime_fields(self.config)
         names = [
@@ -134,7 +148,16 @@ class Run:
         """Whether the stage's output is there and was made by this configuration."""
         mark = self.mark(stage)
         done = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
-        return done and self.output(stage).exists()
+        if not (done and self.output(stage).exists()):
+            return False
+        return stage != "tokens" or self._has_its_tokens()
+
+    def _has_its_tokens(self) -> bool:
+        try:
+            manifest = json.loads((self.output("tokens") / MANIFEST).read_text())
+        except (OSError, ValueError):
+            return True  # the stage that reads them says what is wrong
+        return self._made_of_these_clips(manifest)
 
     def mark(self, stage: str) -> dict[str, Any]:
         """What the directory knows of a stage: key, finished, seconds. Empty where it was not begun."""
@@ -182,7 +205,8 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _told(values: dict[str, Any], name: str) -> Any:
-    return values.get(name, "not set")
+    value = values.get(name, "not set")
+    return "empty" if value == "" else value
 
 
 def _runtime_fields(config: Any, prefix: str = "") -> set[str]:

@@ -16,6 +16,13 @@ def test_the_first_pattern_that_matches_counts_in_any_case(task: str, word: str)
     assert CONFIG.difficulty(task) == word
 
 
+def test_the_task_counts_before_the_parts_text_and_that_before_its_skill() -> None:
+    assert CONFIG.difficulty("fold the towel", "pick a corner", "Pick") == "difficult"
+    assert CONFIG.difficulty("towels", "pick a corner", "Fold") == "simple"
+    assert CONFIG.difficulty("towels", "take a corner", "Fold") == "difficult"
+    assert CONFIG.difficulty("towels", "take a corner", "Take") == "unknown"
+
+
 def test_a_scene_is_its_description_unless_a_table_says_otherwise() -> None:
     assert CONFIG.scene("a Kitchen table") == "home"
     assert CONFIG.scene("an office") == "unknown"

@@ -142,11 +142,16 @@ def test_the_tracks_of_a_shot_are_read_once() -> None:
 def test_words_are_the_tasks_and_the_segments() -> None:
     config = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("pick*", "simple"),)))
     found, _ = clips(episode("a"), config, motion=np.arange(40.0), scene="kitchen")
-    assert words(found[0]) == {"task": "pick a cup", "difficulty": "simple", "scene": "kitchen"}
+    named = {"task": "pick a cup", "difficulty": "simple", "scene": "kitchen"}
+    assert words(found[0]) == named | {"segment": "reach", "skill": "unknown"}
+    assert words(found[4]) == named | {"segment": "grasp", "skill": "Grasp"}
     assert [record["provenance"]["segment"] for record in found] == ["reach", "reach", "reach", "grasp", "grasp"]
     assert found[0]["provenance"]["motion"] == np.mean(np.arange(1, 16))
     unnamed, _ = clips(episode("a", task=""), config)
     assert unnamed[4]["task"] == "grasp"
+    by_skill = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("Grasp", "difficult"),)))
+    told = [record["provenance"]["difficulty"] for record in clips(episode("a", task="tidy up"), by_skill)[0]]
+    assert told == ["unknown"] * 3 + ["difficult"] * 2
 
 
 def test_success_is_the_data_sets_by_frame_or_for_the_whole() -> None:
@@ -168,9 +173,37 @@ def test_overlapping_windows_read_each_frame_once() -> None:
     assert read == [0, 5, 10, 15, 20, 25, 30, 35]
 
 
+@given(st.sampled_from([5.0, 10.0, 29.97]), st.floats(0.5, 5), st.integers(2, 12), st.integers(1, 200))
+@settings(deadline=None, max_examples=40)
+def test_an_episode_as_long_as_a_window_is_said_to_take_gives_one(
+    fps: float, rate: float, frames: int, count: int
+) -> None:
+    config = ClipConfig(WindowConfig(frames, rate, most_gap=3), 8, 1)
+    made = episode("a", count, fps=fps, timestamps=np.arange(count) / fps)
+    found, summary = clips(made, config)
+    needed = int(summary["short"]["window"].partition(" take ")[2].split()[0])
+    assert bool(found) == (count >= needed)
+    more = WindowConfig(frames, min(fps, 2 * rate), most_gap=3)
+    assert more.rate == rate or clips(made, ClipConfig(more, 8, 1))[1]["windows"]["kept"] >= len(found)
+
+
 def test_a_short_episode_gives_nothing_and_says_so() -> None:
     found, summary = clips(episode("a", count=5))
-    assert not found and summary["windows"] == {"kept": 0} and summary["short_spans"] == 1
+    assert not found and summary["windows"] == {"kept": 0}
+    assert summary["short"] == {
+        "spans": 1,
+        "longest": 5,
+        "window": "4 frames at 2 Hz take 16 of 10 fps",
+        "cure": "raise --windows.rate or lower --windows.frames",
+    }
+    made, recorded = episode("a", count=5), ClipConfig(WindowConfig(frames=8, rate=0), 8, 6)
+    short = clips(made, recorded, shots=[(0, 3), (3, 5)])[1]["short"]
+    assert short == {
+        "spans": 2,
+        "longest": 3,
+        "window": "8 frames take 8 of 10 fps",
+        "cure": "lower --windows.frames",
+    }
 
 
 @pytest.mark.parametrize(

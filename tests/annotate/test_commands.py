@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from experiments import doctor, ingest, inspect, store
+from rsjax.annotate.report import QUARANTINE
 from rsjax.data.store import open_store
 from tests.bridge import BRIDGE, needs_bridge
 from tests.data.clips import clip_store, numbers
@@ -58,6 +59,7 @@ def test_the_bundled_bridge_episodes_become_a_store(command: Command, tmp_path: 
     assert f"{out} is up to date" in command(ingest, *line)
     assert "nothing is quarantined" in command(ingest, *line, "--retry")
 
+    assert "what was left out" not in told  # nothing was
     told = command(inspect, out)
     assert "float32 (4, 7)" in told and "put carrot on plate" in told
     sheet = cv2.imread(str(tmp_path / "bridge-sheet.png"))
@@ -114,6 +116,25 @@ def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, num
     assert {path: path.stat().st_mtime_ns for path in marks} == marks
 
 
+def test_the_help_says_what_source_and_path_are(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        command(ingest, "--help")
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert (
+        "agibot, lerobot, robomimic, libero, rlds, bair, folder, sim" in told and "PATH is the folder or file" in told
+    )
+
+
+def test_recordings_that_are_too_short_are_told_in_numbers_with_a_cure(command: Command, tmp_path: Path) -> None:
+    source = folder_of_episodes(tmp_path / "source", 2)
+    line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, "--shots", "none"]
+    told = command.refused(ingest, *line)
+    assert "16 frames at 2 Hz take 76 of 10 fps; the longest has 12" in told
+    assert "raise --windows.rate or lower --windows.frames" in told and QUARANTINE not in told
+    cured = command(ingest, *line, "--windows.rate", 10, "--windows.frames", 12)
+    assert "2 found = 2 with clips" in cured
+
+
 def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
     clip_store(tmp_path / "a")
     told = command(store, "split", tmp_path / "a", "--into", tmp_path / "parts", "--by", "difficulty")
@@ -123,6 +144,16 @@ def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
     assert sorted(numbers(open_store(tmp_path / "c"))) == list(range(6))
     command(store, "split", tmp_path / "c", "--into", tmp_path / "halves", "--parts", 2)
     assert len(numbers(open_store(tmp_path / "halves" / "part-001"))) == 3
+
+
+@pytest.mark.parametrize("option", ["--rerun", "--rerun-file=a.rrd"])
+def test_without_the_viewer_both_of_its_options_are_named(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    clip_store(tmp_path / "a")
+    told = command.refused(inspect, tmp_path / "a", option)
+    assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in told
 
 
 def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Command, tmp_path: Path) -> None:
@@ -150,12 +181,19 @@ def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Comman
         (ingest, ["folder", ".", "--runner", "ray", "--cpus", "0"], "--cpus is 0.0"),
         (ingest, ["folder", ".", "--out", "/"], "--out is /; name a directory"),
         (ingest, ["folder", ".", "--depth", "recorded:most_holes=2"], "most_holes is 2.0"),
-        (ingest, ["folder", ".", "--manifest", "nowhere.json"], "nowhere.json: not a manifest of experiments.doctor"),
+        (
+            ingest,
+            ["folder", ".", "--manifest", "nowhere.json"],
+            "nowhere.json: not there; make it with experiments.doctor",
+        ),
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
-        (ingest, ["folder", ".", "--image-size", "1000000"], "image_size is 1000000"),
+        (ingest, ["folder", ".", "--image-size", "1000000"], "--image-size is 1000000"),
+        (ingest, ["folder", ".", "--points", "0"], "--points is 0"),
         (inspect, [], "name a store first"),
         (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
-        (inspect, ["nowhere"], "not a (whole) store"),
+        (inspect, ["nowhere"], "nowhere: not there; give a store"),
+        (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
+        (doctor, [], "usage: python -m experiments.doctor STORE, or python -m experiments.doctor SOURCE PATH"),
         (store, ["merge", "a", "b"], "usage"),
     ],
 )

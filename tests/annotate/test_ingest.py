@@ -2,6 +2,7 @@ import errno
 import hashlib
 import json
 import pickle
+import re
 import tracemalloc
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from rsjax.annotate.clips import ClipConfig
 from rsjax.annotate.ingest import LOCK, Plan, ingest
 from rsjax.annotate.packing import split_episodes
 from rsjax.annotate.protocols import AnnotationError
-from rsjax.annotate.report import Counts, lines
+from rsjax.annotate.report import Counts, lines, tables
 from rsjax.annotate.runner import Inline, Outcome
 from rsjax.annotate.stages import Annotators, make_stages
 from rsjax.annotate.units import Job, Unit
@@ -56,15 +57,17 @@ def test_every_episode_is_a_clip_a_reason_or_a_row(tmp_path: Path) -> None:
     counts = made(plan(tmp_path, Source(8, broken=(1, 5), short=(2,), depth=True)))
     assert counts is not None
     assert (counts.found, counts.done) == (8, 5)
-    assert counts.filtered == {"episode_002": "shorter than a window"}
+    short = "shorter than a window (4 frames at 2 Hz take 16 of 10 fps; the longest has 5): "
+    assert counts.filtered == {"episode_002": f"{short}raise --windows.rate or lower --windows.frames"}
     assert [row["episode"] for row in counts.quarantined] == ["episode_001", "episode_005"]
     assert counts.windows == {"kept": 25}
     store = open_store(tmp_path / "store")
     assert sum(len(store.source(split)) for split in store.splits) == 25
-    assert store.manifest["quarantine"]["episode_001"].startswith("clips: EpisodeError: video_1.mp4")
+    assert store.manifest["quarantine"]["episode_001"].startswith("clips: video_1.mp4")
     told = lines(counts)
     assert told[0] == "episodes  8 found = 5 with clips + 1 without + 2 quarantined"
-    assert any(line.startswith("quarantined episode_001 at clips: ") for line in told)
+    assert "quarantined episode_001 at clips: video_1.mp4: truncated; copy it again" in told
+    assert "EpisodeError" in counts.quarantined[0]["traceback"]
 
 
 def test_which_windows_are_left_out_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +92,10 @@ def test_a_store_has_units_and_labels_that_training_reads(tmp_path: Path) -> Non
     assert len(depths) == len(clips) and store.manifest["depth_unit"] == "metres"
     assert low == min(depth.min() for depth in depths) and high == max(depth.max() for depth in depths)
     assert all(clip.provenance["depth_range"] == [low, high] for clip in clips)
-    assert store.labels("train").counts()["difficulty"] == {"simple": len(clips)}
+    labels = store.labels("train").counts()
+    assert labels["difficulty"] == {"simple": len(clips)}
+    assert set(labels["segment"]) == {"reach", "grasp"} and set(labels["skill"]) == {"unknown", "Grasp"}
+    assert labels["skill"]["Grasp"] == sum(clip.provenance["skill"] == "Grasp" for clip in clips)
 
 
 def test_no_episode_is_in_both_splits(tmp_path: Path) -> None:
@@ -287,7 +293,7 @@ def test_what_a_killed_worker_left_is_swept_up(tmp_path: Path) -> None:
         (Source(0), r"the toy data set has no episode"),
         (
             Source(2, broken=(0,), short=(1,)),
-            r"none of 2 episodes gave a clip \(1 left out, 1 not readable\).*video_0.mp4: truncated",
+            r"none of 2 episodes gave a clip \(1 left out, 1 quarantined\).*video_0.mp4: truncated",
         ),
     ],
 )
@@ -295,6 +301,50 @@ def test_where_nothing_comes_of_it_one_line_says_so(tmp_path: Path, source: Sour
     with pytest.raises(StoreError, match=match):
         made(plan(tmp_path, source))
     assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        (
+            ClipConfig(CONFIG.windows, 8, 6, camera="fronty"),
+            "(0 left out, 3 quarantined, all 3 of these because of --camera)",
+        ),
+        (
+            ClipConfig(WindowConfig(4, 20), 8, 6),
+            "(0 left out, 3 quarantined, all 3 of these because of --windows.rate)",
+        ),
+    ],
+)
+def test_an_option_for_which_all_are_quarantined_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: ClipConfig, told: str
+) -> None:
+    monkeypatch.setattr("tests.annotate.test_ingest.CONFIG", config)
+    with pytest.raises(StoreError, match=re.escape(told)):
+        made(plan(tmp_path, Source(3)))
+    monkeypatch.undo()
+    with pytest.raises(StoreError, match=r"\(0 left out, 2 quarantined\), the first"):
+        made(plan(tmp_path, Source(2, broken=(0, 1))))
+
+
+def test_only_tables_that_hold_something_are_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"the longest has 5\).* has all of them in summary.json$"):
+        made(plan(tmp_path, Source(2, short=(0, 1))))
+    with pytest.raises(StoreError, match=r" has all of them in quarantine.jsonl$"):
+        made(plan(tmp_path / "broken", Source(2, broken=(0, 1))))
+    counts = made(plan(tmp_path / "sound", Source(2)))
+    assert counts is not None and tables(counts) == ""
+
+
+def test_a_manifest_is_json_for_others_too(tmp_path: Path) -> None:
+    work = plan(tmp_path, Source(2))
+    made(Plan(work.job, work.out, 0.25, {"config": {"most": float("inf"), "deep": [{"x": float("nan")}], "y": 1.5}}))
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    manifest = json.loads((tmp_path / "store" / "manifest.json").read_text(), parse_constant=refuse)
+    assert manifest["config"] == {"most": None, "deep": [{"x": None}], "y": 1.5}
 
 
 def test_memory_does_not_grow_with_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,15 +5,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import pytest
 
-from rsjax.annotate.pool import ProcessPool
+from experiments.ingest import Options, make_executor
+from rsjax.annotate.pool import ProcessPool, check_workers, count_workers
 from rsjax.annotate.report import Counts, count, write_tables
 from rsjax.annotate.runner import Executor, Inline, limit_threads, run
 from rsjax.annotate.units import Job, Unit, mark_path
+from rsjax.config import ConfigError
 from rsjax.data.episode import EpisodeRef
 from rsjax.data.store import StoreError
 from rsjax.errors import UserError
@@ -103,7 +107,7 @@ def test_a_failing_unit_is_quarantined_with_its_traceback_and_the_others_go_on(t
     assert counts.done == 2
     broken, failing = counts.quarantined
     assert (broken["episode"], broken["stage"]) == ("episode_001", "first")
-    assert broken["error"] == "EpisodeError: video_1.mp4: truncated; copy it again"
+    assert broken["error"] == "video_1.mp4: truncated; copy it again"
     assert failing["error"] == "ValueError: no such colour" and "in _work" in failing["traceback"]
     write_tables(tmp_path, counts)
     rows = [json.loads(line) for line in (tmp_path / "quarantine.jsonl").read_text().splitlines()]
@@ -129,9 +133,57 @@ def test_a_killed_worker_costs_its_unit_one_more_try(tmp_path: Path, always: boo
 
 def test_an_idle_worker_that_was_killed_is_replaced(tmp_path: Path) -> None:
     work = job(tmp_path, Source(3))
+    refs = list(work.source.episodes())
     with ProcessPool(work, 1) as pool:
+        run(work, refs[:1], pool, lambda done, total: None)
         os.kill(pool.pids()[0], signal.SIGKILL)
         assert finish(work, pool).done == 3
+
+
+def test_a_worker_is_started_when_there_is_a_unit_for_it(tmp_path: Path) -> None:
+    work = job(tmp_path, Source(1))
+    with ProcessPool(work, 4) as pool:
+        assert pool.pids() == [] and pool.accepts("first")
+        assert finish(work, pool).done == 1
+        assert len(pool.pids()) == 1
+        assert finish(work, pool).done == 1
+        assert len(pool.pids()) == 1
+
+
+def test_workers_are_as_many_as_asked_for_within_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2})
+    assert [count_workers(asked) for asked in (-1, 0, 1, 12)] == [3, 0, 1, 12]
+    for asked in (-7, -2, 13, 100_000):
+        with pytest.raises(ConfigError, match=rf"^--workers is {asked};"):
+            count_workers(asked)
+    assert [check_workers(asked) for asked in (-1, 0, 100_000)] == [-1, 0, 100_000]  # of a cluster
+    with pytest.raises(ConfigError, match=r"^--workers is -2;"):
+        check_workers(-2)
+
+
+@pytest.mark.parametrize("runner", ["pool", "ray"])
+def test_the_command_refuses_numbers_of_workers_that_cannot_be(tmp_path: Path, runner: Literal["pool", "ray"]) -> None:
+    with pytest.raises(ConfigError, match=r"^--workers is -7;"):
+        make_executor(job(tmp_path, Source(1)), Options(runner=runner, workers=-7))
+
+
+def test_a_start_that_is_interrupted_leaves_no_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = BaseProcess.start
+
+    def interrupted(process: BaseProcess) -> None:
+        start(process)
+        os.kill(os.getpid(), signal.SIGINT)
+        monkeypatch.undo()
+
+    work = job(tmp_path, Source(1))
+    pool = ProcessPool(work, 2)
+    monkeypatch.setattr(BaseProcess, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        finish(work, pool)
+    (pid,) = pool.pids()
+    assert Path(f"/proc/{pid}").exists()
+    pool.close()
+    assert not Path(f"/proc/{pid}").exists()
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -150,8 +202,7 @@ from tests.annotate.toy import Source, job
 if __name__ == "__main__":
     work = job(Path(sys.argv[1]), Source(6), seconds=0.2)
     with ProcessPool(work, 2) as pool:
-        print(*pool.pids(), flush=True)
-        run(work, list(work.source.episodes()), pool, lambda done, total: None)
+        run(work, list(work.source.episodes()), pool, lambda done, total: print(*pool.pids(), flush=True))
 """
 
 
@@ -160,19 +211,63 @@ def test_a_killed_driver_takes_its_workers_along_and_only_the_rest_is_run(tmp_pa
     program.write_text(PROGRAM)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     line = [sys.executable, str(program), str(tmp_path)]
-    driver = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, text=True)
-    assert driver.stdout is not None
+    driver = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert driver.stdout is not None and driver.stderr is not None
     pids = [int(word) for word in driver.stdout.readline().split()]
     wait_for(lambda: len(list(tmp_path.rglob("units/second/**/*.json"))) >= 1)
     driver.kill()
     driver.wait()
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    assert driver.stderr.read() == ""
     marks = len(list(tmp_path.rglob("units/**/*.json")))
     assert 0 < marks < 12
     started = len(runs(tmp_path))
     assert finish(job(tmp_path, Source(6), seconds=0.0)).done == 6
     assert len(runs(tmp_path)) - started == 12 - marks
     assert len(list(tmp_path.rglob("units/**/*.array_record"))) == 12
+
+
+SLOW = """
+import sys
+import time
+from pathlib import Path
+from rsjax.annotate.pool import ProcessPool
+from rsjax.annotate.units import Unit
+from tests.annotate.toy import Source, job
+
+def load(place):
+    Path(place).touch()
+    time.sleep(100)
+
+class Slow(Source):
+    def __reduce__(self):
+        return load, (sys.argv[1] + "/loading",)
+
+if __name__ == "__main__":
+    work = job(Path(sys.argv[1]), Slow(2))
+    pool = ProcessPool(work, 2)
+    for ref in work.source.episodes():
+        pool.submit(Unit(ref, "first"))
+    print(*pool.pids(), flush=True)
+    time.sleep(100)
+"""
+
+
+@pytest.mark.parametrize("loading", [False, True])
+def test_a_driver_that_is_killed_leaves_no_worker_that_is_starting(tmp_path: Path, loading: bool) -> None:
+    """Killed at once, or when a worker reads what it is to do."""
+    program = tmp_path / "program.py"
+    program.write_text(SLOW)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    line = [sys.executable, str(program), str(tmp_path)]
+    driver = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert driver.stdout is not None
+    pids = [int(word) for word in driver.stdout.readline().split()]
+    wait_for(lambda: not loading or (tmp_path / "loading").exists())
+    driver.kill()
+    _, told = driver.communicate(timeout=60)
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    assert len(pids) == 2 and told == "" and (tmp_path / "loading").exists() == loading
 
 
 def test_a_full_disk_ends_the_job_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

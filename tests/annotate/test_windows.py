@@ -136,6 +136,16 @@ def test_each_filter_leaves_out_what_it_names() -> None:
     assert judge(index, np.arange(60) / 10, None, [], WindowConfig(frames=3, rate=2)) == [""] * 5
 
 
+@pytest.mark.parametrize(("fps", "rate"), [(5.0, 4.0), (30.0, 24.0), (30.0, 29.0), (10.0, 3.0)])
+def test_rounding_to_recorded_frames_is_no_gap(fps: float, rate: float) -> None:
+    config = WindowConfig(frames=8, rate=rate)
+    index = index_windows(fps, [(0, 200)], config)
+    times = np.arange(200) / fps
+    assert set(judge(index, times, None, (), config)) == {""}
+    times[100:] += 2 / rate
+    assert "gap" in judge(index, times, None, (), config)
+
+
 @given(FPS, spans(), CONFIGS, st.integers(0, 2**32 - 1))
 def test_reasons_are_one_for_each_window(fps: float, parts: list[Span], config: WindowConfig, seed: int) -> None:
     index = index_windows(fps, parts, config)

@@ -303,3 +303,20 @@ def test_the_command_tells_by_its_status(
     assert "all are 'no-task': if that is as it should be, --ignore no-task" in capsys.readouterr().out
     assert run(monkeypatch, "rlds", tmp_path / "nowhere") == 2
     assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split") == 2
+
+
+def test_a_fix_that_keeps_nothing_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode(4, task=""), bridge_episode(5, task="")])
+    line = ("rlds", tmp_path / "data", "--fix", tmp_path / "m.json")
+    assert run(monkeypatch, *line) == 1
+    (told,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith(str(tmp_path / "m.json"))]
+    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in told
+    assert run(monkeypatch, *line, "--ignore", "no-task") == 0
+    assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
+
+
+def test_a_list_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="m.json: not there"):
+        select(source(), tmp_path / "m.json")

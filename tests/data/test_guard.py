@@ -108,3 +108,16 @@ def test_a_manifest_of_nothing_but_brackets_is_told(path: Path) -> None:
     (path / MANIFEST).write_text("[" * 100_000)
     with pytest.raises(StoreError, match=r"manifest.json: not JSON"):
         open_store(path)
+
+
+@pytest.mark.parametrize("field", ["episodes", "counts", "filtered", "quarantine", "action_mean", "action_std"])
+def test_what_others_rely_on_has_its_kind(path: Path, field: str) -> None:
+    change(path, "of another kind", field)
+    with pytest.raises(StoreError, match=rf"manifest.json: {field} is missing or not what it should be"):
+        open_store(path)
+
+
+def test_more_records_than_bytes_are_refused(path: Path) -> None:
+    change(path, 10**13, "splits", "train", "files", 0, "count")
+    with pytest.raises(StoreError, match=r"splits.train.files.0.count is 10000000000000, more than its \d+ bytes"):
+        open_store(path)

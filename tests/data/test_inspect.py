@@ -5,9 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.data.inspect import contact_sheet, histogram, look, motion_of, render
-from rsjax.data.store import StoreError
+from rsjax.data.inspect import contact_sheet, histogram, look, motion_of, render, sampled
+from rsjax.data.store import StoreError, open_store, write_store
+from rsjax.data.token_sets import FOLDER, tokens_key
 from tests.data.clips import clip, clip_store
+
+CAPTION = 16  # pixels above each clip
 
 
 def test_counts_words_and_shapes_are_those_of_the_store(tmp_path: Path) -> None:
@@ -51,19 +54,68 @@ def test_a_damaged_record_is_told_and_the_others_are_shown(tmp_path: Path) -> No
     assert len(contact_sheet(store)) > 0
 
 
+def test_what_the_manifest_and_the_clips_say_of_their_origin_is_told(tmp_path: Path) -> None:
+    store = clip_store(tmp_path / "a", count=3)
+    records = [store.source("train")[number] for number in range(3)]
+    for record, motion in zip(records, (1.0, 3.0, 5.0), strict=True):
+        record["provenance"] |= {"camera": "front", "fps": 30.0, "frames": [0, 15, 30, 45], "motion": motion}
+    windows = {"kept": 3, "still": 7}
+    counts = {"without": 1, "quarantined": 2, "windows": windows, "depth_left_out": 0}
+    meta = {"action_mean": [0.5, -1.0], "action_std": [1.0, 2.0], "episodes": {"train": ["x", "y"], "test": []}}
+    write_store(tmp_path / "b", "clips", {"train": records}, meta | {"key": "b", "counts": counts})
+    clip_store(tmp_path / "b" / FOLDER / "abc", count=3, kind="tokens")
+    tokens = tmp_path / "b" / FOLDER / "set"
+    write_store(tokens, "tokens", {"train": records}, {"key": tokens_key("b", "set")})
+    told = render(look(open_store(tmp_path / "b")))
+    for line in (
+        "tokens    set: train 3",
+        "episodes  train 2, test 0",
+        "left out  episodes without a clip 1, episodes quarantined 2, windows still 7",
+        "cameras   front 3",
+        "rate      30 fps, every 15 frames (2 Hz) 3×",
+        "mean±std  0.5±1, -1±2",
+    ):
+        assert line in told
+    assert not any("abc" in line for line in told)  # tokens of other clips
+    (speed,) = [line for line in told if "px/s of a 256-pixel-wide picture" in line]
+    assert speed.startswith("motion    1 ") and " 5 px/s" in speed and speed.endswith("median 3")
+
+
+def test_a_merged_store_tells_what_was_left_out_of_its_parts(tmp_path: Path) -> None:
+    store = clip_store(tmp_path / "a", count=2)
+    records = [store.source("train")[0]]
+    write_store(
+        tmp_path / "b", "clips", {"train": records}, {"filtered": {"x": "still"}, "quarantine": {"y": "", "z": ""}}
+    )
+    assert look(open_store(tmp_path / "b")).left_out == {"episodes without a clip": 1, "episodes quarantined": 2}
+
+
 @pytest.mark.parametrize("depth_range", [None, [1.0, 2.0]])
 def test_the_sheet_shows_the_clips_frames(tmp_path: Path, depth_range: list[float] | None) -> None:
     sheet = contact_sheet(clip_store(tmp_path / "a", depth_range=depth_range), clips=3, frames=2, side=10)
     rows = 3 if depth_range is None else 6
-    assert sheet.shape == (rows * 14, 2 * 14, 3) and sheet.dtype == np.uint8
-    assert sheet[0, 0].tolist() == [0, 0, 0]
+    assert sheet.shape == (rows * 14 + 3 * CAPTION, 2 * 14, 3) and sheet.dtype == np.uint8
+    assert sheet[CAPTION, 0].tolist() == [0, 0, 0]
     assert sheet[-14 if depth_range is None else -28, 0].tolist() == [91, 91, 91]
+
+
+def test_each_row_of_the_sheet_is_called_by_its_own_number_and_task(tmp_path: Path) -> None:
+    store = clip_store(tmp_path / "a", count=4, depth_range=[1.0, 2.0])
+    sheet = contact_sheet(store, clips=6, frames=3)
+    height = len(sheet) // 6
+    captions = [sheet[row * height : row * height + CAPTION] for row in range(6)]
+    assert len({caption.tobytes() for caption in captions}) == 6 and all(caption.max() > 200 for caption in captions)
+    places = [(split, number) for split, number, _ in sampled(store, 6, [])]
+    assert places == [("train", 0), ("train", 1), ("train", 2), ("train", 3), ("test", 0), ("test", 1)]
+    for split, number, record in sampled(store, 6, []):
+        assert record["provenance"]["number"] == number + (90 if split == "test" else 0)
 
 
 @given(st.lists(st.floats(0, 100)))
 def test_a_histogram_is_one_line(values: list[float]) -> None:
-    assert "\n" not in histogram(values)
-    assert (f"median {np.median(values):.3g}" if values else "not measured") in histogram(values)
+    told = histogram(values, "px")
+    assert "\n" not in told
+    assert (f"px, median {np.median(values):.3g}" if values else "not measured") in told
 
 
 def test_a_store_without_a_readable_clip_has_no_sheet(tmp_path: Path) -> None:

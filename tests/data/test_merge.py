@@ -82,15 +82,21 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
     a = tmp_path / "a"
     for paths, match in (
         ([a], r"two stores or more"),
-        ([a, a], r"neither be merged with itself"),
+        ([a, a], r"cannot be merged with itself"),
         ([a, tmp_path / "large"], r"large: rgb is uint8 \(4, 16, 16, 3\), in .*a uint8 \(4, 8, 8, 3\)"),
         ([a, tmp_path / "tokens"], r"its kind is tokens, that of .*a is clips"),
     ):
         with pytest.raises(StoreError, match=match):
             merge(paths, tmp_path / "out")
         assert not (tmp_path / "out").exists()
-    with pytest.raises(StoreError, match=r"nor into itself"):
+    with pytest.raises(StoreError, match=r"a: is there already; choose another place"):
         merge([a, tmp_path / "deep"], a)
+    with pytest.raises(StoreError, match=r"inside: lies in .*a, which is read"):
+        merge([a, tmp_path / "deep"], a / "inside")
+    before = numbers(open_store(a))
+    with pytest.raises(StoreError, match=r"a: is there already"):
+        split(a, {tmp_path / "new": lambda *_: True, a: lambda split, number, words: number == 0})
+    assert numbers(open_store(a)) == before and not (tmp_path / "new").exists()
     with pytest.raises(StoreError, match=r"no label 'colour'; it has task, difficulty"):
         by_label(a, "colour", tmp_path)
     with pytest.raises(StoreError, match=r"no record of .* is chosen"):

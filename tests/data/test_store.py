@@ -139,7 +139,7 @@ def test_missing_parts_are_named(path: Path, tmp_path: Path) -> None:
     (path / "test-00000.array_record").unlink()
     with pytest.raises(StoreError, match=r"test-00000.array_record: missing"):
         open_store(path)
-    with pytest.raises(StoreError, match=r"manifest.json: missing"):
+    with pytest.raises(StoreError, match=r"nothing: not there"):
         open_store(tmp_path / "nothing")
     (path / MANIFEST).write_text("{")
     with pytest.raises(StoreError, match=r"not JSON"):
@@ -207,3 +207,29 @@ def test_a_reader_that_went_stale_is_opened_again(path: Path) -> None:
     source = open_store(path).source("train")
     source._reader = Stale()
     assert source[3]["name"] == "record 3"
+
+
+@pytest.mark.parametrize("manifest", [None, "not JSON", '{"name": "my web page"}'])
+def test_only_what_holds_shards_is_to_be_deleted(path: Path, tmp_path: Path, manifest: str | None) -> None:
+    theirs = tmp_path / "recordings"
+    theirs.mkdir()
+    (theirs / "video.mp4").touch()
+    for place in (path, theirs):
+        (place / MANIFEST).unlink(missing_ok=True)
+        if manifest is not None:
+            (place / MANIFEST).write_text(manifest)
+    with pytest.raises(StoreError, match=f"delete {path} and make it again"):
+        open_store(path)
+    with pytest.raises(StoreError, match=r"; give a store, or make one with experiments.ingest") as told:
+        open_store(theirs)
+    assert "delete" not in str(told.value)
+    if manifest is None:
+        assert f"{theirs}: no store (it has no manifest.json)" in str(told.value)
+
+
+def test_a_place_that_is_none_is_told(tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").touch()
+    with pytest.raises(StoreError, match=f"{tmp_path}/nowhere: not there"):
+        open_store(tmp_path / "nowhere")
+    with pytest.raises(StoreError, match=r"video.mp4: no store"):
+        open_store(tmp_path / "video.mp4")

@@ -11,10 +11,12 @@ import pytest
 
 from rsjax.config import LoopConfig
 from rsjax.config.stages import parse_stage
+from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
 from rsjax.pipeline import jobs, stages
-from rsjax.pipeline.feeding import fingerprint, planned, readable, token_transform
+from rsjax.pipeline.feeding import fingerprint, planned, token_transform
 from rsjax.pipeline.run import Run
+from rsjax.pipeline.tokens import tokenize_store
 from rsjax.tokenizer.magvit2 import Tokenizer
 from rsjax.train.checkpoint import save_weights
 from tests.pipeline import toy
@@ -71,9 +73,29 @@ def loop(*words: str) -> LoopConfig:
 def test_a_clip_that_scores_need_is_not_left_out(tmp_path: Path) -> None:
     clips = toy.store(tmp_path / "clips")
     damage(clips, "test", 2)
+    params = jax.jit(Tokenizer(toy.config().tokenizer).init_params)(jax.random.key(0))
     with pytest.raises(StoreError, match="number 2 of the split"):
-        list(readable(clips.source("test"), "test", tmp_path, 1.0))
+        tokenize_store(clips, toy.config(), params, tmp_path)
     assert not (tmp_path / "quarantine.jsonl").exists()
+
+
+def test_every_run_lists_the_clips_that_lack_tokens_until_they_are_mended(tmp_path: Path) -> None:
+    clips, config = toy.store(tmp_path / "clips"), toy.config()
+    sound = (clips.path / "train-00000.array_record").read_bytes()
+    params = jax.jit(Tokenizer(config.tokenizer).init_params)(jax.random.key(0))
+    damage(clips, "train", 1)
+    first = tokenize_store(clips, config, params, tmp_path / "a")
+    made = (first / "manifest.json").stat().st_mtime_ns
+    assert tokenize_store(clips, config, params, tmp_path / "b") == first
+    assert (first / "manifest.json").stat().st_mtime_ns == made, "they were there"
+    rows = [[row["record"] for row in read_quarantine(tmp_path / run / "quarantine.jsonl")] for run in "ab"]
+    assert rows == [[1], [1]]
+    strict = replace(config, train=replace(config.train, max_damaged=0.0))
+    with pytest.raises(StoreError, match="max_damaged"):
+        tokenize_store(clips, strict, params, tmp_path / "c")
+    (clips.path / "train-00000.array_record").write_bytes(sound)
+    again = open_store(tokenize_store(clips, config, params, tmp_path / "b"))
+    assert len(again.source("train")) == toy.TRAIN and not (tmp_path / "b" / "quarantine.jsonl").exists()
 
 
 def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:

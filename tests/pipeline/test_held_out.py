@@ -168,7 +168,7 @@ def test_every_readable_clip_counts_once_and_under_its_own_number(split: tuple[i
 def test_a_damaged_record_is_told_and_a_split_without_any_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     told: list[str] = []
     assert [number for number, _ in readable(Damaged(3, {1}), tell=told.append)] == [0, 2]
-    assert told == ["record 1 is damaged; it is left out of the held-out scores"]
+    assert told == ["record 1 is damaged; it is left out here"]
     none: Any = WorldModelObjective.create(config())
     with pytest.raises(ValueError, match="no held-out clips"):
         held_out_loss(none, {}, token_batches(Damaged(2, {0, 1}), plain, 2))

@@ -6,11 +6,14 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from experiments import train
+from experiments.cli import parse
 from rsjax import presets
 from rsjax.config import ConfigError
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
@@ -20,11 +23,14 @@ from rsjax.pipeline import evaluation
 from rsjax.pipeline.held_out import token_batches
 from rsjax.pipeline.own_data import on_store, relocated
 from rsjax.pipeline.run import Run
+from rsjax.pipeline.stages import tokenize
 from rsjax.pipeline.tokens import tokenize_store
 from rsjax.pipeline.transforms import token_clip
+from rsjax.train.checkpoint import save_weights
 from tests.bridge import BRIDGE, needs_bridge
 from tests.pipeline import toy
 from tests.pipeline.conftest import ROOT
+from tests.pipeline.test_feeding import damage
 
 
 @pytest.fixture
@@ -32,26 +38,32 @@ def clips(tmp_path: Path) -> Path:
     return toy.store(tmp_path / "clips").path
 
 
-def test_the_configuration_takes_what_the_clips_are_like(clips: Path) -> None:
-    debug = presets.debug()
-    made = on_store(dataclasses.replace(debug, model=dataclasses.replace(debug.model, frames=9)), clips)
-    sim = toy.config().sim
+def test_what_has_to_fit_the_clips_is_made_so(clips: Path) -> None:
+    debug, sim = presets.debug(), toy.config().sim
+    made = on_store(debug, clips)
     assert made.clips == dataclasses.replace(sim.clips, test_clips=toy.TEST)
     assert made.model.action_dim == sim.action_dim
-    tiny = presets.get("tiny")
-    wide = dataclasses.replace(tiny, loss=dataclasses.replace(tiny.loss, num_keypoints=4))
-    assert on_store(wide, clips).model.action_dim == 2 * sim.action_dim, "their sums come with the actions"
+    tiny = on_store(presets.get("tiny"), clips)
+    assert tiny.model.action_dim == 2 * sim.action_dim, "their sums come with the actions"
+    assert tiny.model.frames == presets.get("tiny").model.frames, "fewer frames leave positions over"
+    large = on_store(presets.get("roboscape_s"), clips)
+    assert (large.tokenizer.image_size, large.model.grid) == (64, 4)
+    short = dataclasses.replace(debug.model, frames=5)
+    few = dataclasses.replace(debug, sim=dataclasses.replace(debug.sim, frames=4), model=short)
+    assert on_store(few, clips).model.frames == 6
 
 
-def test_what_does_not_fit_names_both_fields(clips: Path, tmp_path: Path) -> None:
+def test_fields_on_the_command_line_are_checked_against_the_store(clips: Path) -> None:
+    argv = ["debug", "--store", str(clips), "--model.frames", "7", "--loss.num-keypoints", "3"]
+    config, options = parse(argv, "train", "", train.Options())
+    assert (config.model.frames, config.loss.num_keypoints, config.data.key) == (7, 3, "toy")
+    assert options.store == clips
+    with pytest.raises(ConfigError, match="data.frames is 6 but model.frames holds positions for 5"):
+        parse(["debug", f"--store={clips}", "--model.frames", "5"], "train", "", train.Options())
+
+
+def test_what_cannot_be_trained_on_is_told(tmp_path: Path) -> None:
     debug = presets.debug()
-    short = dataclasses.replace(
-        debug, sim=dataclasses.replace(debug.sim, frames=4), model=dataclasses.replace(debug.model, frames=5)
-    )
-    with pytest.raises(ConfigError, match=r"data.frames is 6 but model.frames holds positions for 5"):
-        on_store(short, clips)
-    with pytest.raises(ConfigError, match=r"data.image_size is 64 but tokenizer.image_size is 256"):
-        on_store(presets.get("roboscape_s"), clips)
     write_store(tmp_path / "few", "clips", {"train": [encode_clip(toy.clip(0))], "test": []}, {"key": "few"})
     with pytest.raises(StoreError, match="1 train and 0 test clips.*--test-share"):
         on_store(debug, tmp_path / "few")
@@ -60,10 +72,48 @@ def test_what_does_not_fit_names_both_fields(clips: Path, tmp_path: Path) -> Non
         on_store(debug, tmp_path / "tokens")
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"action_mean": [0.0] * 3}, {"action_std": ["a"] * 28}, {"depth_range": "abc"}, {"depth_range": [2.0, 1.0]}],
+)
+def test_units_that_are_none_are_told(clips: Path, changes: dict[str, Any]) -> None:
+    place = clips / "manifest.json"
+    place.write_text(json.dumps(json.loads(place.read_text()) | changes))
+    with pytest.raises(StoreError, match=r"manifest.json: no statistics of actions and depth \(.*\); make the store"):
+        Units.create(open_store(clips))
+
+
+def test_tokens_of_other_clips_do_not_count_as_this_runs(tmp_path: Path) -> None:
+    """The store is moved, and another one with tokens of the same tokenizer is put in its place."""
+    own, other = (toy.store(tmp_path / name) for name in ("own", "other"))
+    place = other.path / "manifest.json"
+    place.write_text(json.dumps(json.loads(place.read_text()) | {"key": "other"}))
+    config = on_store(toy.config(), own.path)
+    run = Run(config, tmp_path / "run", tmp_path)
+    (run.directory / "tokenizer").mkdir(parents=True)
+    params = toy.generator(own).codec.params
+    save_weights(run.output("tokenizer"), params)
+    with run.stage("tokens"):
+        tokenize(run)
+    assert run.finished("tokens")
+    own.path.rename(tmp_path / "moved")
+    other.path.rename(own.path)
+    tokenize_store(open_store(own.path), config, params, tmp_path)
+    there = Run(relocated(config, tmp_path / "moved"), run.directory, tmp_path)
+    assert not there.finished("tokens")
+    with pytest.raises(StoreError, match="holds tokens of other clips"):
+        there.open_tokens()
+    tokenize(there)
+    assert there.finished("tokens")
+    assert there.open_tokens().path.parents[1] == tmp_path / "moved"
+
+
 def test_a_moved_store_is_the_same_and_another_one_in_its_place_is_not(clips: Path, tmp_path: Path) -> None:
     config = on_store(presets.debug(), clips)
     keys = Run(config, tmp_path / "run", tmp_path).keys()
     clips.rename(tmp_path / "moved")
+    with pytest.raises(StoreError, match="no store is there; if it was moved, say where it lies with --store"):
+        Run(config, tmp_path / "run", tmp_path).open_clips()
     there = relocated(config, tmp_path / "moved")
     assert Run(there, tmp_path / "run", tmp_path).keys() == keys
     assert Run(there, tmp_path / "run", tmp_path).open_clips().path == tmp_path / "moved"
@@ -128,6 +178,14 @@ def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
     assert not [name for name in found.metrics if "depth" in name]
     assert "predicted_depth" not in found.shown
     assert np.isfinite(found.metrics["psnr"])
+
+
+def test_a_damaged_train_clip_does_not_keep_a_run_from_its_scores(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    damage(clips, "train", 0)
+    generator = toy.generator(clips)
+    assert np.isfinite(evaluation.evaluate(generator, clips).metrics["delta_psnr_uniform"])
+    assert on_store(presets.debug(), clips.path).data.key == "toy"
 
 
 def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ asked for.
 """
 
 import importlib
-import re
 import types
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,13 @@ from rsjax.data.formats.files import is_there
 from rsjax.errors import did_you_mean
 
 FORMATS = ("agibot", "lerobot", "robomimic", "libero", "rlds", "bair", "folder", "sim")
+
+_WORDS = {  # one, several
+    bool: ("true or false", "true or false"),
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    str: ("text", "texts"),
+}
 
 
 def open_source(name: str, path: Path | str, **options: Any) -> EpisodeSource:
@@ -34,9 +40,7 @@ def open_source(name: str, path: Path | str, **options: Any) -> EpisodeSource:
                 f"{name}: no option {option!r}{did_you_mean(option, known)}; it has {', '.join(known) or 'none'}"
             )
         if not _fits(value, known[option]):
-            hint = known[option]
-            wanted = hint.__name__ if isinstance(hint, type) else re.sub(r"typing\.|collections\.abc\.", "", str(hint))
-            raise SourceError(f"{name}: option {option} is {value!r}, should be {wanted}")
+            raise SourceError(f"{name}: option {option} is {value!r}, should be {_told(known[option])}")
     if not is_there(Path(path)):
         raise SourceError(f"{path}: not there; give the folder or file of the {name} data set")
     return opener(Path(path), **options)
@@ -51,6 +55,18 @@ def _fits(value: Any, hint: Any) -> bool:
         return value in inner
     if origin is Sequence:
         return isinstance(value, list | tuple) and all(_fits(item, inner[0]) for item in value)
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return isinstance(value, hint)
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, int | float if hint is float else hint)
+
+
+def _told(hint: Any, many: bool = False) -> str:
+    """What a value of an option's type is to be, in words."""
+    inner = [one for one in get_args(hint) if one is not types.NoneType]
+    if get_origin(hint) in (types.UnionType, Union):
+        return " or ".join(_told(one, many) for one in inner)
+    if get_origin(hint) is Literal:
+        return " or ".join(inner)
+    if get_origin(hint) is Sequence:
+        return f"a list of {_told(inner[0], many=True)}"
+    return _WORDS[hint][many]

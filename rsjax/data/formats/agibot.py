@@ -19,7 +19,7 @@ from jaxtyping import Float32
 from rsjax.data.actions import Layout, led_into
 from rsjax.data.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, safe_id
 from rsjax.data.formats.agibot_proprio import Proprio
-from rsjax.data.formats.files import broken, inside, is_there, location_of, read_json, subfolders
+from rsjax.data.formats.files import broken, inside, is_there, location_of, media, read_json, subfolders
 from rsjax.data.formats.hdf5 import open_file
 from rsjax.data.pictures import DepthFiles
 from rsjax.data.video import VideoFrames
@@ -84,7 +84,7 @@ class AgiBot:
             timestamps=times,
             actions=actions,
             states=states,
-            cameras={name: VideoFrames(folder / "videos" / f"{name}_color.mp4") for name in self._cameras},
+            cameras={name: VideoFrames(media(folder / "videos" / f"{name}_color.mp4")) for name in self._cameras},
             depth={"head": depth} if depth and "head" in self._cameras else {},
             segments=segments,
             meta={
@@ -174,7 +174,7 @@ def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
     except OSError as error:
         return None, f"{folder.name} cannot be listed ({error.strerror})"
     chosen = sorted(fnmatch.filter(names, "head_depth*.png"), key=lambda name: (len(name), name))
-    paths = [folder / name for name in chosen]
+    paths = [media(folder / name) for name in chosen]
     if len(paths) != count:
         return None, f"{len(paths)} depth maps for {count} frames" if paths else ""
     return DepthFiles(paths, unit=0.001), ""

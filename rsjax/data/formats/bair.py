@@ -14,7 +14,16 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.data.actions import Layout, led_into
-from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint, safe_id
+from rsjax.data.episode import (
+    MAX_FPS,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    fingerprint,
+    safe_id,
+)
 from rsjax.data.formats.tfrecord import Example, Span, read_payload, spans
 
 SIDE = 64
@@ -30,10 +39,10 @@ def open_source(path: Path, fps: float = 5.0) -> "BairSource":
         fps: steps per second. The files do not say; only times in seconds depend on it.
 
     Raises:
-        SourceError: there are no such files, or ``fps`` is not positive.
+        SourceError: there are no such files, or ``fps`` is not possible.
     """
-    if fps <= 0:
-        raise SourceError(f"bair: fps is {fps}; it must be positive")
+    if not 0 < fps <= MAX_FPS:
+        raise SourceError(f"bair: option fps is {fps}; it must be above 0 and at most {MAX_FPS:g}")
     if path.is_file():
         return BairSource(path.parent, (path.name,), fps)
     found = [file for depth in ("", "*/", "*/*/") for file in path.glob(f"{depth}*.tfrecords") if file.is_file()]

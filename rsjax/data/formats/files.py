@@ -1,5 +1,6 @@
 """Reading other people's metadata: JSON, JSON lines, Parquet and NumPy tables, with errors that name file and field."""
 
+import errno
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
@@ -11,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, Float64, Int64
 
-from rsjax.data.episode import EpisodeError, EpisodeRef, SourceError
+from rsjax.data.episode import EpisodeError, EpisodeRef, SourceError, plain
 
 _CURE = "fetch the file again or leave the episode out"
 MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
@@ -53,6 +54,20 @@ def filled(template: str, **fields: int | str) -> str:
 _WIDTHS = ("", *(f"{zero}{width}" for zero in ("", "0") for width in range(1, 10)))
 
 
+def media(path: Path) -> Path:
+    """As :func:`plain`, for a video or picture that is opened later; what is missing is told then.
+
+    Raises:
+        EpisodeError: it is a pipe or a device.
+    """
+    try:
+        return plain(path)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            return path
+        raise EpisodeError(f"{path}: {_reason(error)}; {_CURE}", "undecodable") from error
+
+
 def read_json(path: Path) -> Any:
     """A JSON file.
 
@@ -60,7 +75,7 @@ def read_json(path: Path) -> Any:
         SourceError: it is missing or damaged.
     """
     try:
-        return json.loads(path.read_text("utf-8"))
+        return json.loads(plain(path).read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise SourceError(f"{path}: {_reason(error)}; fetch the file again") from error
 
@@ -72,7 +87,7 @@ def json_lines(path: Path) -> Iterator[tuple[int, Any]]:
         SourceError: the file cannot be opened.
     """
     try:
-        with path.open("rb") as file:
+        with plain(path).open("rb") as file:
             for number, line in enumerate(file, 1):
                 if line.strip():
                     try:
@@ -90,7 +105,7 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
         SourceError: it is missing or damaged.
     """
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(plain(path)) as file:
             there = set(file.schema_arrow.names)
             for batch in file.iter_batches(4096, columns=[name for name in columns if name in there]):
                 yield from batch.to_pylist()
@@ -105,7 +120,7 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
         EpisodeError: it is missing or damaged, or too large.
     """
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(plain(path)) as file:
             there = file.schema_arrow.names
             chosen = there if columns is None else [name for name in columns if name in there]
             _check_size(file.metadata, MAX_CELLS if filters is None else _MOST_ROWS, path)
@@ -180,7 +195,7 @@ def load_npy(path: Path) -> np.ndarray:
         EpisodeError: it is missing, damaged, too large or of another kind.
     """
     try:
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        mapped = np.load(plain(path), mmap_mode="r", allow_pickle=False)
         if not isinstance(mapped, np.ndarray) or mapped.dtype.kind not in "fiub" or mapped.size > MAX_CELLS:
             raise ValueError(f"holds no table of numbers but {getattr(mapped, 'dtype', type(mapped).__name__)}")
         return np.array(mapped)

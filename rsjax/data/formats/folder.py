@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, Float32
 
-from rsjax.data.actions import Kind, Layout, led_into
+from rsjax.data.actions import Kind, Layout, check_layout, led_into
 from rsjax.data.episode import (
     Episode,
     EpisodeError,
@@ -51,7 +51,8 @@ class Folder:
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Folders first, then the files that make up flat episodes, each by name."""
-        for folder in subfolders(self._root):
+        folders, flat = subfolders(self._root), 0
+        for folder in folders:
             yield self._ref(folder.name, flat=False)
         beside: dict[str, list[Path]] = {}
         for path in self._root.iterdir():
@@ -59,7 +60,10 @@ class Folder:
                 beside.setdefault(path.stem, []).append(path)
         for name, files in sorted(beside.items()):
             if any(path.suffix.lower() != ".json" for path in files):
+                flat += 1
                 yield self._ref(name, flat=True, files=sorted(files))
+        if not folders and not flat:
+            raise SourceError(f"{self._root}: holds no episode: no folder, video or table; give the one that does")
 
     def read(self, ref: EpisodeRef) -> Episode:
         """One episode."""
@@ -82,6 +86,8 @@ class Folder:
         table, fps = parts.read_table(table_path), told.fps or self._config.fps
         actions, states = parts.action_columns(table), parts.state_columns(table)
         commands = parts.columns(table, actions, table_path)
+        layout = Layout(self._config.kind, self._config.quaternions, self._config.held)
+        check_layout(layout, commands.shape[1], table_path)
         times = self._times(table, cameras, fps, count, place)
         if len(times) != count:
             rows = f"{len(times)} timestamps for {count} pictures"
@@ -98,7 +104,7 @@ class Folder:
             depth=depth,
             segments=told.segments(count),
             meta={
-                "actions": Layout(self._config.kind, self._config.quaternions, self._config.held).to_json(),
+                "actions": layout.to_json(),
                 "action_names": actions,
             },
         )
@@ -108,7 +114,7 @@ class Folder:
         """What an episode is made of, as far as names tell."""
         try:
             if flat:
-                found = [path for path in self._root.iterdir() if path.stem == name and path.is_file()]
+                found = [path for path in self._root.iterdir() if path.stem == name and not path.is_dir()]
             else:
                 found = [path for path in (self._root / name).iterdir() if not path.name.startswith(".")]
         except OSError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rsjax.data.actions import Kind
-from rsjax.data.episode import SourceError
+from rsjax.data.episode import MAX_FPS, SourceError
 from rsjax.errors import did_you_mean
 
 Rows = Literal["given", "led"]
@@ -40,15 +40,16 @@ class FolderConfig:
             raise SourceError(f"{where}: should be an object with fields; mend it")
         known = [field.name for field in dataclasses.fields(cls)]
         for name, value in values.items():
-            good = {
-                "task": isinstance(value, str),
-                "fps": isinstance(value, int | float) and 0 <= value < 1e6,
-                "rows": value in get_args(Rows),
-                "kind": value in get_args(Kind),
-            }.get(name, isinstance(value, list | tuple) and all(isinstance(item, int) for item in value))
+            numbers = isinstance(value, list | tuple) and all(type(item) is int for item in value)
+            good, wanted = {
+                "task": (isinstance(value, str), "text"),
+                "fps": (type(value) in (int, float) and 0 <= value <= MAX_FPS, f"a number from 0 to {MAX_FPS:g}"),
+                "rows": (value in get_args(Rows), " or ".join(get_args(Rows))),
+                "kind": (value in get_args(Kind), " or ".join(get_args(Kind))),
+            }.get(name, (numbers, "a list of whole numbers"))
             if name not in known:
                 raise SourceError(f"{where}: no field {name!r}{did_you_mean(name, known)}; it has {', '.join(known)}")
             if not good:
-                raise SourceError(f"{where}: {name} is {value!r}, which it cannot be; mend it")
+                raise SourceError(f"{where}: {name} is {value!r}, should be {wanted}; mend it")
         fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**fields)

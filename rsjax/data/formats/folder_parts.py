@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from jaxtyping import Float32
 
-from rsjax.data.episode import Depths, EpisodeError, Frames, Segment, SourceError
-from rsjax.data.formats.files import is_there, load_npy, matrix, parquet_columns, read_json
+from rsjax.data.episode import MAX_FPS, Depths, EpisodeError, Frames, Segment, SourceError, plain
+from rsjax.data.formats.files import is_there, load_npy, matrix, media, parquet_columns, read_json
 from rsjax.data.pictures import DepthFiles, PictureFiles
 from rsjax.data.video import VideoFrames
 
@@ -49,7 +49,7 @@ class Told:
             raise EpisodeError(str(error)) from error
         try:
             fps, task = float(values.get("fps") or 0), values.get("task")
-            if not 0 <= fps < 1e6 or not isinstance(task, str | None):
+            if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
                 raise ValueError(f"fps {fps}, task {task!r}")
             return cls(path, task, fps, tuple(values.get("segments") or ()))
         except (AttributeError, TypeError, ValueError) as error:
@@ -83,7 +83,7 @@ def cameras_of(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], di
             name = "main" if flat else path.stem
             if name in cameras:
                 raise EpisodeError(f"{path}: a second camera {name!r}; rename or remove one")
-            cameras[name] = VideoFrames(path)
+            cameras[name] = VideoFrames(media(path))
         elif path.is_dir() and path.suffix == _DEPTH:
             depth[path.stem] = DepthFiles(_pictures(path, (".png",)))
         elif path.is_dir() and (pictures := _pictures(path, PICTURES)):
@@ -121,7 +121,7 @@ def read_table(path: Path) -> pa.Table:
     try:
         if (size := path.stat().st_size) > _MOST_BYTES:
             raise ValueError(f"{size} bytes are more than an episode's table can have")
-        with path.open("rb") as file:
+        with plain(path).open("rb") as file:
             table = pa_csv.read_csv(file)
         names = table.column_names  # decoded here, not before
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -151,7 +151,7 @@ def columns(table: pa.Table, names: Sequence[str], path: Path) -> Float32[np.nda
 
 def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
     try:
-        found = [path for path in folder.iterdir() if path.suffix.lower() in endings]
+        found = [media(path) for path in folder.iterdir() if path.suffix.lower() in endings]
     except OSError as error:
         raise EpisodeError(f"{folder}: cannot be listed ({error.strerror}); leave the episode out") from error
     return sorted(found, key=lambda path: (len(path.name), path.name))

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.data.episode import MAX_PIXELS, EpisodeError
+from rsjax.data.episode import MAX_PIXELS, EpisodeError, plain
 from rsjax.data.formats.files import MAX_CELLS
 
 _MOST_CHUNK = 2**30  # bytes that HDF5 unpacks at once, whatever of them is asked for
@@ -25,7 +25,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         EpisodeError: it is missing, truncated or no HDF5.
     """
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with h5py.File(plain(path), "r", locking=False) as file:
             yield file
     except FileNotFoundError as error:
         raise EpisodeError(f"{path}: missing; {_CURE}") from error

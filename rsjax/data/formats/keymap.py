@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.data.actions import Kind
-from rsjax.data.episode import SourceError
+from rsjax.data.episode import MAX_FPS, SourceError, plain
 from rsjax.errors import did_you_mean
 
 
@@ -132,7 +132,7 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
 
 def _from_file(path: Path) -> KeyMap:
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(plain(path).read_text())
     except (OSError, ValueError, RecursionError) as error:
         raise SourceError(f"{path}: not a readable key map ({error}); write the fields of KeyMap as JSON") from error
     known = [entry.name for entry in fields(KeyMap)]
@@ -159,8 +159,8 @@ def _checked(path: Path, values: Mapping[str, Any]) -> KeyMap:
     cameras = values["cameras"]
     if not isinstance(cameras, dict) or not all(isinstance(key, str) for key in cameras.values()):
         raise SourceError(f"{path}: cameras is {cameras!r}, should be an object of feature names")
-    if not isinstance(values["fps"], int | float) or not 0 < values["fps"] < 1e6:
-        raise SourceError(f"{path}: fps is {values['fps']!r}, should be a positive number")
+    if not isinstance(values["fps"], int | float) or not 0 < values["fps"] <= MAX_FPS:
+        raise SourceError(f"{path}: fps is {values['fps']!r}, should be a number above 0 and at most {MAX_FPS:g}")
     if values.get("kind", "delta") not in ("delta", "absolute"):
         raise SourceError(f"{path}: kind is {values['kind']!r}, should be delta or absolute")
     if not isinstance(values.get("after", False), bool):
@@ -171,7 +171,7 @@ def _checked(path: Path, values: Mapping[str, Any]) -> KeyMap:
 def read_json(path: Path) -> dict[str, Any]:
     """A file of one JSON object; empty where there is no file."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(plain(path).read_text())
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError) as error:

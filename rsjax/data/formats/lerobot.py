@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, UInt8
 
-from rsjax.data.actions import Kind, Layout, led_into
+from rsjax.data.actions import Kind, Layout, check_layout, led_into
 from rsjax.data.episode import (
     Episode,
     EpisodeError,
@@ -33,6 +33,7 @@ from rsjax.data.formats.files import (
     json_lines,
     location_of,
     matrix,
+    media,
     parquet_columns,
     parquet_rows,
     seconds,
@@ -91,6 +92,8 @@ class LeRobot:
             raise EpisodeError(told, "length")
         times = seconds(table, "timestamp", path)
         self._check_rows(table, times, location, path)
+        actions = matrix(table, self._action, path)
+        check_layout(self._layout, actions.shape[1], path)
         states = matrix(table, self._state, path) if self._state in table.column_names else None
         tasks = self._task_of_rows(table, path)
         task = tasks[0] if tasks and len(set(tasks)) == 1 else "; ".join(location["tasks"])
@@ -100,7 +103,7 @@ class LeRobot:
             task=task,
             fps=self._info.fps,
             timestamps=times - times[0],
-            actions=led_into(matrix(table, self._action, path)),
+            actions=led_into(actions),
             states=states,
             cameras=self._cameras(location, times, path),
             segments=_runs(tasks),
@@ -186,7 +189,7 @@ class LeRobot:
     def _cameras(self, location: dict[str, Any], times: Float[np.ndarray, " N"], path: Path) -> dict[str, Frames]:
         cameras: dict[str, Frames] = {}
         for key, video in location["videos"].items():
-            file = inside(self._root, video["path"])
+            file = media(inside(self._root, video["path"]))
             cameras[_camera(key)] = at_times(file, times + video["from"], _tolerance(times))
         for key in self._info.of_type("image"):
             cameras[_camera(key)] = TablePictures(path, key, location, len(times))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rsjax.data.episode import SourceError
-from rsjax.data.formats.files import read_json
+from rsjax.data.episode import MAX_FPS, SourceError
+from rsjax.data.formats.files import is_there, read_json
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Info:
     @classmethod
     def read(cls, path: Path) -> "Info":
         """Raises :class:`SourceError` where a field is missing or of a version that is not known."""
+        if not is_there(path):
+            raise SourceError(f"{path}: missing; fetch the file again, or give the folder that has meta/")
         values = read_json(path)
         try:
             version = str(values["codebase_version"])
@@ -41,7 +43,9 @@ class Info:
             fps, features = float(values["fps"]), dict(values["features"])
             chunks = int(values.get("chunks_size", 1000))
             total = values.get("total_episodes")
-            if not (0 < fps < 1e6 and chunks > 0 and all(isinstance(feature, dict) for feature in features.values())):
+            if not (
+                0 < fps <= MAX_FPS and chunks > 0 and all(isinstance(feature, dict) for feature in features.values())
+            ):
                 raise ValueError(f"fps {fps}, chunks_size {chunks}")
             paths = str(values["data_path"]), str(values.get("video_path") or "")
             return cls(version.startswith("v3."), fps, chunks, *paths, features, None if total is None else int(total))

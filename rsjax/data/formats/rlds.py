@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.data.actions import Layout, led_into
+from rsjax.data.actions import Layout, check_layout, led_into
 from rsjax.data.episode import (
     Episode,
     EpisodeError,
@@ -116,6 +116,8 @@ class RldsSource:
             raise EpisodeError(f"{where}: {', '.join(blank)} hold placeholders of one colour; leave the episode out")
         count = len(next(iter(cameras.values())))
         actions = _joined(example, self.keys.action, count)
+        layout = Layout(self.keys.kind, self.keys.quaternions, self.keys.held)
+        check_layout(layout, actions.shape[1], f"{where}: key map")
         texts = _texts(example, self.keys.task, count)
         episode = Episode(
             id=ref.id,
@@ -130,7 +132,7 @@ class RldsSource:
             meta={
                 "source": "rlds",
                 "file": path.name,
-                "actions": Layout(self.keys.kind, self.keys.quaternions, self.keys.held).to_json(),
+                "actions": layout.to_json(),
                 "blank": blank,
                 "episode": _metadata(example),
             },

@@ -16,7 +16,16 @@ import numpy as np
 from jaxtyping import Float32
 
 from rsjax.data.actions import Layout, led_into, unflipped
-from rsjax.data.episode import Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint, safe_id
+from rsjax.data.episode import (
+    MAX_FPS,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    fingerprint,
+    safe_id,
+)
 from rsjax.data.formats.hdf5 import H5Depths, H5Frames, attribute, open_file, own, rows
 from rsjax.errors import did_you_mean
 
@@ -249,7 +258,7 @@ def _fps(told: dict[str, Any], path: Path) -> float:
     """What the simulator was run at; 0 where the file does not say."""
     settings = told.get("env_kwargs")
     fps = settings.get("control_freq", 0) if isinstance(settings, dict) else 0
-    if not isinstance(fps, int | float) or not 0 <= fps < 1e6:
+    if not isinstance(fps, int | float) or not 0 <= fps <= MAX_FPS:
         raise EpisodeError(f"{path}: control_freq in data.env_args is {fps!r}, should be steps per second; mend it")
     return float(fps)
 

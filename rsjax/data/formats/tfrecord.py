@@ -16,7 +16,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from jaxtyping import Float32, UInt32
 
-from rsjax.data.episode import EpisodeError
+from rsjax.data.episode import EpisodeError, plain
 
 _HEAD, _FOOT = 12, 4  # bytes around a payload
 _POLYNOMIAL = 0x82F63B78  # of CRC-32C, bits reversed
@@ -44,7 +44,7 @@ class Span:
 def spans(path: Path) -> Iterator[Span]:
     """Every record of a file, in order, from the heads alone. Where the file is damaged, the last one says how."""
     try:
-        with path.open("rb") as file:
+        with plain(path).open("rb") as file:
             yield from _spans(file, path.stat().st_size)
     except OSError as error:
         yield Span(0, 0, damage=f"cannot be read ({error.strerror})")
@@ -78,7 +78,7 @@ def read_payload(path: Path, offset: int, length: int) -> bytes:
         EpisodeError: the file cannot be read, has changed, or its checksum is wrong.
     """
     try:
-        with path.open("rb") as file:
+        with plain(path).open("rb") as file:
             file.seek(offset)
             record = file.read(_HEAD + length + _FOOT)
     except OSError as error:

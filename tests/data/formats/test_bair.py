@@ -108,5 +108,6 @@ def test_nothing_to_read_is_told(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no .*tfrecords"):
         open_source("bair", tmp_path)
     write(tmp_path, episode_bytes())
-    with pytest.raises(SourceError, match="fps is 0"):
-        open_source("bair", tmp_path, fps=0)
+    for fps in (0, -5.0, 10_001, float("inf"), float("nan"), 10**400):
+        with pytest.raises(SourceError, match="option fps is .*; it must be above 0 and at most 10000"):
+            open_source("bair", tmp_path, fps=fps)

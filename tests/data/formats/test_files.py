@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.data.episode import EpisodeError, SourceError
-from rsjax.data.formats import FORMATS, open_source
-from rsjax.data.formats.files import MAX_CELLS, filled, inside, json_lines, matrix, parquet_columns, seconds
+from rsjax.data.episode import EpisodeError, SourceError, fingerprint
+from rsjax.data.formats import FORMATS, keymap, open_source
+from rsjax.data.formats.files import (
+    MAX_CELLS,
+    filled,
+    inside,
+    json_lines,
+    load_npy,
+    matrix,
+    media,
+    parquet_columns,
+    parquet_rows,
+    read_json,
+    seconds,
+)
+from rsjax.data.formats.folder_parts import read_table
+from rsjax.data.formats.hdf5 import open_file
+from rsjax.data.formats.tfrecord import read_payload, spans
+from rsjax.errors import UserError
 
 ROOT = Path("/data/set")
 
@@ -60,11 +77,15 @@ def test_unknown_formats_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("agibot", {"tasks": 327}, "option tasks is 327, should be Sequence"),
-        ("agibot", {"cameras": "head"}, "option cameras is 'head', should be Sequence"),
-        ("lerobot", {"held": ["x"]}, r"option held is \['x'\]"),
-        ("lerobot", {"kind": "relative"}, "option kind is 'relative', should be Literal.'absolute', 'delta'"),
-        ("folder", {"fps": "fast"}, "option fps is 'fast'"),
+        ("agibot", {"tasks": 327}, "option tasks is 327, should be a list of whole numbers or texts$"),
+        ("agibot", {"cameras": "head"}, "option cameras is 'head', should be a list of texts$"),
+        ("lerobot", {"held": ["x"]}, r"option held is \['x'\], should be a list of whole numbers$"),
+        ("lerobot", {"held": [True]}, r"option held is \[True\], should be a list of whole numbers$"),
+        ("lerobot", {"kind": "relative"}, "option kind is 'relative', should be absolute or delta$"),
+        ("folder", {"fps": "fast"}, "option fps is 'fast', should be a number$"),
+        ("folder", {"rows": "after"}, "option rows is 'after', should be given or led$"),
+        ("robomimic", {"depth": 1}, "option depth is 1, should be true or false$"),
+        ("rlds", {"split": 1}, "option split is 1, should be text$"),
         ("folder", {"rate": 3}, "no option 'rate'; it has task, fps, rows, kind, held, quaternions"),
     ],
 )
@@ -100,3 +121,32 @@ def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> 
     wide = pa.table({"action": pa.ListArray.from_arrays(pa.array([0, len(values)], pa.int32()), values)})
     with pytest.raises(EpisodeError, match=r"f: column 'action' has \d+ bytes, more than it can have"):
         matrix(wide, "action", "f")
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        read_json,
+        load_npy,
+        parquet_columns,
+        lambda path: list(json_lines(path)),
+        lambda path: list(parquet_rows(path, ["x"])),
+        lambda path: read_payload(path, 0, 8),
+        lambda path: open_file(path).__enter__(),
+        keymap.read_json,
+        lambda path: keymap.key_map(str(path), "", path),
+        read_table,
+        media,
+    ],
+)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_pipes_and_devices_are_refused_where_they_would_never_end(tmp_path: Path, read: Any, kind: str) -> None:
+    path = tmp_path / "data.json"
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(UserError, match=r"data.json: .*a pipe or device, not a file"):
+        read(path)
+    assert [span.damage for span in spans(path)] == ["cannot be read (a pipe or device, not a file)"]
+    assert fingerprint([path]) == fingerprint([path])

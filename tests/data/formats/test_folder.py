@@ -201,11 +201,49 @@ def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
     assert "loop.mp4: not a readable video (Too many levels of symbolic links)" in error_of(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["one/front.mp4", "one/actions.csv", "one/episode.json", "one/top/0.png"])
+def test_a_pipe_among_the_files_is_told_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    write_episode(tmp_path)
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    assert "a pipe or device, not a file" in (told := error_of(tmp_path)) and path.name in told
+
+
+def test_a_flat_pipe_is_told_and_not_waited_for(tmp_path: Path) -> None:
+    write_csv(tmp_path / "one.csv")
+    os.mkfifo(tmp_path / "one.mp4")
+    assert "one.mp4: cannot be read (a pipe or device, not a file)" in error_of(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "first"), [("held", 2), ("held", -1), ("quaternions", 0), ("quaternions", 99)])
+def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str, first: int) -> None:
+    write_episode(tmp_path)
+    told = error_of(tmp_path, **{name: [first]})
+    assert f"actions.csv: {name} names dimension {first + 3 if first == 0 else first}, but actions have 2" in told
+
+
+def test_a_folder_of_nothing_is_told(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(SourceError, match=f"^{tmp_path}: holds no episode"):
+        list(open_source("folder", tmp_path).episodes())
+
+
+@pytest.mark.parametrize("fps", [-1, 1e-400 - 1, 10_001, float("inf"), float("nan"), 10**400])
+def test_a_rate_that_no_camera_has_is_told_before_anything_is_read(tmp_path: Path, fps: float) -> None:
+    with pytest.raises(SourceError, match=r": fps is .*, should be a number from 0 to 10000; mend it"):
+        open_source("folder", tmp_path, fps=fps)
+
+
 def test_settings_that_cannot_be(tmp_path: Path) -> None:
     for text, message in (
         ('{"row": "led"}', "no field 'row'; did you mean 'rows'"),
         ('{"rows": "after"}', "rows is 'after'"),
-        ('{"held": "2"}', "held is '2'"),
+        ('{"rows": null}', "rows is None, should be given or led"),
+        ('{"held": "2"}', "held is '2', should be a list of whole numbers"),
+        ('{"held": [true]}', "held is .True., should be a list of whole numbers"),
+        ('{"fps": true}', "fps is True, should be a number"),
         ("[]", "should be an object"),
         ("{", "dataset.json: cannot be read"),
     ):

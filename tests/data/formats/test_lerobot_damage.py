@@ -1,5 +1,6 @@
 """Damaged LeRobotDatasets: what is wrong is named, and the other episodes are read."""
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -151,13 +152,16 @@ def test_paths_lead_nowhere_else(tmp_path: Path, template: str, message: str) ->
 
 
 def test_an_unreadable_data_set_is_told(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"info.json: missing"):
+    with pytest.raises(SourceError, match=r"meta/info.json: missing; .*or give the folder that has meta/"):
         open_source("lerobot", tmp_path)
     write_info(write_v2(tmp_path), "v1.6", V2_PATHS)
     with pytest.raises(SourceError, match=r"info.json: codebase_version v1.6; v2.0, v2.1 and v3.0 can be read"):
         open_source("lerobot", tmp_path)
     write_info(tmp_path, "v2.1", V2_PATHS, fps=0)
     with pytest.raises(SourceError, match="fps 0"):
+        open_source("lerobot", tmp_path)
+    write_info(tmp_path, "v2.1", V2_PATHS, fps=1e5)
+    with pytest.raises(SourceError, match="fps 100000"):
         open_source("lerobot", tmp_path)
     write_info(tmp_path, "v2.1", V2_PATHS)
     with pytest.raises(SourceError, match="no column 'actions'; choose among action, observation.state"):
@@ -167,3 +171,19 @@ def test_an_unreadable_data_set_is_told(tmp_path: Path) -> None:
     (tmp_path / "meta/tasks.jsonl").write_text("[]\n")
     with pytest.raises(SourceError, match="table of tasks is damaged"):
         open_source("lerobot", tmp_path)
+
+
+@pytest.mark.parametrize(("name", "wrong"), [("held", 99), ("held", -1), ("quaternions", 99)])
+def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str, wrong: int) -> None:
+    write_v2(tmp_path)
+    source = open_source("lerobot", tmp_path, **{name: [wrong]})
+    with pytest.raises(EpisodeError, match=rf"parquet: {name} names dimension {wrong}, but actions have"):
+        source.read(next(source.episodes()))
+
+
+def test_a_pipe_in_place_of_a_video_is_told_and_not_waited_for(tmp_path: Path) -> None:
+    write_v2(tmp_path)
+    video = next(tmp_path.rglob("episode_000001.mp4"))
+    video.unlink()
+    os.mkfifo(video)
+    assert "a pipe or device, not a file" in only_error(tmp_path)

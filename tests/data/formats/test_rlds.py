@@ -80,6 +80,7 @@ def test_a_key_map_of_ones_own(tmp_path: Path) -> None:
         ({"cameras": {"a": "action"}}, "steps/action is of kind tensor"),
         ({"actoin": ["action"]}, "no field 'actoin'; did you mean 'action'"),
         ({"fps": -1}, "fps is -1"),
+        ({"fps": 1e5}, "fps is 100000.0, should be a number above 0 and at most 10000"),
         ({"action": "action"}, "action is 'action', should be a list"),
         ({"kind": "relative"}, "kind is 'relative'"),
     ],
@@ -90,6 +91,16 @@ def test_a_key_map_that_does_not_fit_is_told(tmp_path: Path, change: dict, said:
     (tmp_path / "map.json").write_text(json.dumps(keys))
     with pytest.raises(SourceError, match=said):
         open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
+
+
+@pytest.mark.parametrize("name", ["held", "quaternions"])
+def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode()])
+    keys = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2, name: [99]}
+    (tmp_path / "map.json").write_text(json.dumps(keys))
+    source = open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
+    with pytest.raises(EpisodeError, match=f"key map: {name} names dimension 99, but actions have 7"):
+        source.read(next(source.episodes()))
 
 
 def test_every_named_map_is_whole() -> None:
