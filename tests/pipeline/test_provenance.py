@@ -35,6 +35,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def test_a_start_holds_all_that_made_the_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    jax.devices()  # which reads the flags, and would not take this one
     monkeypatch.setenv("XLA_FLAGS", "--some_flag")
     monkeypatch.setenv("WANDB_API_KEY", "secret")
     assert record_start(run, "train debug") == []
@@ -108,6 +109,17 @@ def test_data_that_a_start_makes_complete_it_and_are_no_change_at_the_next(run: 
     assert record_start(run, "train") == []
     store(run.output("tokens"), key="another")
     assert record_start(run, "train") == ["data"]
+
+
+def test_data_that_were_moved_are_no_change(run: Run) -> None:
+    store(run.clips)
+    record_start(run, "train")
+    moved = replace(run, data_directory=run.data_directory.with_name("moved"))
+    moved.clips.parent.mkdir(parents=True)
+    run.clips.rename(moved.clips)
+    assert record_start(moved, "train") == []
+    before, now = (start["data"]["clips"]["path"] for start in read_starts(run.directory))
+    assert before != now
 
 
 def test_a_damaged_file_is_moved_aside_and_told(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
