@@ -3,7 +3,7 @@
 Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,7 @@ class Clips:
         return tokens
 
 
-def spread(source: RecordSource, count: int) -> list[int]:
+def spread(source: Sized, count: int) -> list[int]:
     """The numbers of ``count`` records spread evenly over a split: neighbours may be windows of one episode."""
     return np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int)).tolist()
 
