@@ -153,7 +153,7 @@ def render(contents: Contents) -> list[str]:
         lines.append(f"mean±std  {', '.join(f'{mean:.3g}±{std:.2g}' for mean, std in contents.units)}")
     lines.append(f"depth     in {contents.depth[0]} of {contents.depth[1]} records read")
     lines.append("lengths   " + ", ".join(f"{length} frames {count}×" for length, count in contents.lengths.items()))
-    lines.append(f"motion    {histogram(contents.motion, SIDE)}")
+    lines.append(f"tracks    {histogram(contents.motion, SIDE)}")
     if contents.speed:
         lines.append(f"motion    {histogram(contents.speed, SPEED)}")
     for column, words in contents.words.items():
