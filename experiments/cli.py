@@ -13,8 +13,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from rsjax import presets
-from rsjax.config import Config, ConfigError, StageConfig
+from rsjax.config import Config, ConfigError, StageConfig, presets
 from rsjax.config.stages import GRAMMAR, format_stage, parse_stage
 from rsjax.errors import Preempted, UserError, did_you_mean
 from rsjax.runtime import sigterm_stops
@@ -130,7 +129,7 @@ def _exit(line: str, status: int) -> None:
 
 
 def _one_of_several() -> bool:
-    distributed = sys.modules.get("rsjax.train.distributed")
+    distributed = sys.modules.get("rsjax.training.distributed")
     return distributed is not None and distributed.jax.distributed.is_initialized()
 
 

@@ -8,7 +8,7 @@ import tyro
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
-from rsjax.data.formats import FORMATS
+from rsjax.ingest.formats import FORMATS
 
 PROG = "python -m experiments.doctor"
 
@@ -56,10 +56,10 @@ def main() -> None:
     from rich.table import Table
 
     from experiments.ingest import source_options
-    from rsjax.annotate.pool import count_workers
-    from rsjax.data.doctor import examine, open_any
-    from rsjax.data.selection import write_selection
-    from rsjax.data.symptoms import KINDS, Thresholds
+    from rsjax.ingest.checks import KINDS, Thresholds
+    from rsjax.ingest.doctor import examine, open_any
+    from rsjax.ingest.jobs.pool import count_workers
+    from rsjax.ingest.selection import write_selection
 
     console = Console()
     source = open_any(options.what, options.path, **source_options(options.option))

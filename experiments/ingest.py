@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments.cli import main_errors, parse_options
-from rsjax.annotate.windows import WindowConfig
 from rsjax.config import ConfigError
-from rsjax.data.actions import ActionConfig
-from rsjax.data.formats import FORMATS
+from rsjax.ingest.actions import ActionConfig
+from rsjax.ingest.formats import FORMATS
+from rsjax.ingest.windows import WindowConfig
 
 PROG = "python -m experiments.ingest"
 ABOUT = f"""Reads, annotates, cuts and packs episodes.
@@ -82,8 +82,8 @@ def main() -> None:
         )
     name, place, rest = ("", "", argv) if asked else (argv[0], argv[1], argv[2:])
     options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, Options())
-    from rsjax.annotate.ingest import ingest, is_made, listed
-    from rsjax.annotate.report import lines, tables
+    from rsjax.ingest.ingest import ingest, is_made, listed
+    from rsjax.ingest.report import lines, tables
     from rsjax.progress import Progress, note
 
     plan = make_plan(name, Path(place), options)
@@ -113,15 +113,15 @@ def main() -> None:
 
 def make_plan(name: str, place: Path, options: Options) -> Any:
     """What the arguments ask for, checked before anything is run."""
-    from rsjax.annotate.categories import CategoryConfig, parse_table
-    from rsjax.annotate.choose import choose_annotators, choose_recorded
-    from rsjax.annotate.clips import ClipConfig
-    from rsjax.annotate.ingest import Plan
-    from rsjax.annotate.stages import make_stages
-    from rsjax.annotate.units import Job
     from rsjax.config import content_key, to_dict
-    from rsjax.data.formats import open_source
-    from rsjax.data.selection import select
+    from rsjax.ingest.annotators.categories import CategoryConfig, parse_table
+    from rsjax.ingest.annotators.choose import choose_annotators, choose_recorded
+    from rsjax.ingest.clips import ClipConfig
+    from rsjax.ingest.formats import open_source
+    from rsjax.ingest.ingest import Plan
+    from rsjax.ingest.jobs.work_items import Job
+    from rsjax.ingest.selection import select
+    from rsjax.ingest.stages import make_stages
 
     out = check(name, options)
     words = {stage: getattr(options, stage) for stage in ("shots", "motion", "depth", "tracks", "semantics")}
@@ -169,11 +169,11 @@ def check(name: str, options: Options) -> Path:
 
 def make_executor(job: Any, options: Options) -> Any:
     """The workers that the arguments ask for."""
-    from rsjax.annotate.pool import ProcessPool, check_workers, count_workers
-    from rsjax.annotate.runner import Inline
+    from rsjax.ingest.jobs.pool import ProcessPool, check_workers, count_workers
+    from rsjax.ingest.jobs.runner import Inline
 
     if options.runner == "ray":
-        from rsjax.annotate.ray_runner import RayExecutor
+        from rsjax.ingest.jobs.ray_runner import RayExecutor
 
         most = None if check_workers(options.workers) < 0 else max(1, options.workers)
         return RayExecutor(job, options.ray_address, most=most)

@@ -76,8 +76,8 @@ def split_store(place: Path, options: Split) -> list[Any]:
 def tokenize(place: Path, run: Path) -> Any:
     """The store of tokens."""
     from rsjax.data.store import open_store
+    from rsjax.pipeline.generator import load_config, load_tokenizer
     from rsjax.pipeline.tokens import tokenize_store
-    from rsjax.sample.generator import load_config, load_tokenizer
 
     clips, config = open_store(place), load_config(run)
     return open_store(tokenize_store(clips, config, load_tokenizer(config, run), place / "tokens"))

@@ -44,7 +44,7 @@ def main() -> None:
     config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
     config = config.with_loops(**{n: value for n in ("wandb", "profile") if (value := getattr(options, n))})
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.train import distributed
+    from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
     from rsjax.pipeline.run import Run

@@ -13,13 +13,13 @@ from rich.tree import Tree
 
 from rsjax.clip import Batch
 from rsjax.config import Config, ModelConfig
-from rsjax.model.flops import forward_flops, train_flops
-from rsjax.model.world_model import empty_cache
-from rsjax.objective import losses
-from rsjax.objective.world_model_terms import world_model_terms
-from rsjax.tokenizer.flops import tokenizer_flops
-from rsjax.train.objectives import TokenizerObjective, WorldModelObjective
-from rsjax.train.state import make_optimizer
+from rsjax.models.roboscape import losses
+from rsjax.models.roboscape.flops import forward_flops, train_flops
+from rsjax.models.roboscape.terms import world_model_terms
+from rsjax.models.roboscape.world_model import empty_cache
+from rsjax.tokenizers.flops import tokenizer_flops
+from rsjax.training.objectives import TokenizerObjective, WorldModelObjective
+from rsjax.training.state import make_optimizer
 
 Shapes = dict[str, Any]  # nested, with ShapeDtypeStructs at the leaves
 
@@ -78,8 +78,8 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
 
     - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch with what it shares, which is the
       model without depth.
-    - ``flops_…``: matrix products and convolutions at 2 a multiply-add, formulas in :mod:`rsjax.model.flops` and
-      :mod:`rsjax.tokenizer.flops`. Per frame: a forward pass over a clip by its frames, and about a pass of one frame
+    - ``flops_…``: matrix products and convolutions at 2 a multiply-add, formulas in
+      :mod:`rsjax.models.roboscape.flops` and :mod:`rsjax.tokenizers.flops`. Per frame: a forward pass over a clip by its frames, and about a pass of one frame
       through the cache. Training: three forwards, without what remat repeats.
     - ``bytes_train_state``: of the world model's parameters, optimizer, averages and gradients. Once a device.
     - ``bytes_activations_per_clip``: what the backward pass keeps of the forward pass, that and the loss as autodiff

@@ -34,7 +34,7 @@ def sigterm_stops() -> Iterator[None]:
     """Around a command: SIGTERM, by which schedulers say that a process has to go, raises :class:`Preempted`.
 
     Such a command ends with the exit status 75 (EX_TEMPFAIL), on which a scheduler is to start it again. Training loops
-    save first (:mod:`rsjax.train.preemption`). SIGUSR1 prints what every thread is doing, should a command stand still.
+    save first (:mod:`rsjax.training.preemption`). SIGUSR1 prints what every thread is doing.
     Does nothing off the main thread, which alone may handle signals.
     """
 

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.cli import main_errors, parse, parse_options
-from rsjax import presets
-from rsjax.config import Config, ConfigError
+from rsjax.config import Config, ConfigError, presets
 from rsjax.errors import UserError, did_you_mean
 
 

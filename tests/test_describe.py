@@ -12,15 +12,14 @@ import pytest
 from rich.console import Console
 
 from experiments import describe as command
-from rsjax import presets
 from rsjax.clip import Batch
-from rsjax.config import Config
+from rsjax.config import Config, presets
 from rsjax.describe import activation_bytes, cache_bytes, count, describe, render
-from rsjax.model.world_model import empty_cache
-from rsjax.objective import losses
-from rsjax.objective.world_model_terms import world_model_terms
-from rsjax.train.objectives import WorldModelObjective
-from rsjax.train.state import create_state
+from rsjax.models.roboscape import losses
+from rsjax.models.roboscape.terms import world_model_terms
+from rsjax.models.roboscape.world_model import empty_cache
+from rsjax.training.objectives import WorldModelObjective
+from rsjax.training.state import create_state
 
 DEBUG = presets.get("debug")
 described = cache(describe)

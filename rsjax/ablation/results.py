@@ -11,7 +11,7 @@ import numpy as np
 from rsjax.ablation.grid import Cell
 from rsjax.data.lock import is_held
 from rsjax.pipeline.run import STAGES, Run
-from rsjax.train.log import read_log
+from rsjax.training.log import read_log
 
 ERROR = "error.json"  # in the directory of a cell that failed
 FINAL_SHARE = 0.1  # of the logged steps, over which a loss term is averaged

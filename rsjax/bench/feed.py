@@ -16,9 +16,9 @@ from rsjax.data.curriculum import plan
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
 from rsjax.pipeline.transforms import token_batch
-from rsjax.train.objectives import WorldModelObjective
-from rsjax.train.placement import Placement
-from rsjax.train.state import create_state
+from rsjax.training.objectives import WorldModelObjective
+from rsjax.training.placement import Placement
+from rsjax.training.state import create_state
 
 CLIPS = 256
 WARM_UP, LEAST, MOST = 3, 10, 200  # steps

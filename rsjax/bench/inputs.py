@@ -12,10 +12,10 @@ import numpy as np
 
 from rsjax.clip import Batch
 from rsjax.config import Config, ModelConfig
+from rsjax.data.normalization import Units
 from rsjax.data.order import Transform
 from rsjax.data.store import Record
-from rsjax.data.units import Units
-from rsjax.model.world_model import WorldModel, branches
+from rsjax.models.roboscape.world_model import WorldModel, branches
 from rsjax.pipeline.transforms import token_batch, token_clip
 
 

@@ -18,17 +18,17 @@ from rsjax.bench import inputs
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config
 from rsjax.data import loader
+from rsjax.data.normalization import Units
 from rsjax.data.store import open_store, write_store
-from rsjax.data.units import Units
-from rsjax.model.flops import train_flops
-from rsjax.model.world_model import branches
+from rsjax.models.roboscape.flops import train_flops
+from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.world_model import branches
+from rsjax.pipeline.generator import Codec
 from rsjax.pipeline.transforms import token_batch
-from rsjax.sample.generator import Codec
-from rsjax.sample.rollout import rollout
-from rsjax.tokenizer.magvit2 import Tokenizer
-from rsjax.train.objectives import WorldModelObjective
-from rsjax.train.placement import Placement
-from rsjax.train.state import create_state
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.training.objectives import WorldModelObjective
+from rsjax.training.placement import Placement
+from rsjax.training.state import create_state
 
 Numbers = dict[str, Any]
 

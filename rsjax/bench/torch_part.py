@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from rsjax.baselines.plain import check_plain
+from rsjax.bench.plain import check_plain
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config, ModelConfig
 from rsjax.errors import UserError
@@ -36,7 +36,7 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     check_torch(config.model)
     import torch
 
-    from rsjax.baselines import genie_torch as genie
+    from rsjax.bench import genie_torch as genie
 
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     torch.manual_seed(0)

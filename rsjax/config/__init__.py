@@ -1,6 +1,6 @@
 """Every setting of the project: frozen dataclasses, checked where they are made, hashable, serialisable.
 
-A :class:`Config` names everything that one run depends on. Presets live in :mod:`rsjax.presets`.
+A :class:`Config` names everything that one run depends on. Presets live in :mod:`rsjax.config.presets`.
 The loss weights λ₁, λ₂, λ₃ and γ of the paper live in :class:`LossConfig` and nowhere else.
 
 A field made with :func:`runtime` changes how fast or how talkatively a run goes but not what it makes;

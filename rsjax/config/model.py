@@ -90,7 +90,7 @@ class ModelConfig:
 class MaskConfig:
     """Masked training with corruption, after the public Genie (reference: 1xgpt).
 
-    Rates are probabilities; see :mod:`rsjax.objective.masking` for the recipe's three steps.
+    Rates are probabilities; see :mod:`rsjax.models.roboscape.masking` for the recipe's three steps.
     """
 
     prompt_frames: int = 1  # frames given at generation; the paper gives one

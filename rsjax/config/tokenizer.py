@@ -72,7 +72,7 @@ class TokenizerTrainConfig(LoopConfig):
     l1: float = 1.0
     l2: float = 0.0  # not in the reference, which has LPIPS; small models reach a higher PSNR with it
     perceptual: float = 0.0  # LPIPS, 1.0 in the reference; off where lpips_weights is empty
-    lpips_weights: str = ""  # a safetensors file as rsjax.metrics.lpips.load_lpips reads it
+    lpips_weights: str = ""  # a safetensors file as rsjax.tokenizers.lpips.load_lpips reads it
     entropy: float = 0.1
     entropy_temperature: float = 0.01
     commitment: float = 0.25

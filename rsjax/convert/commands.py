@@ -9,9 +9,9 @@ from rsjax.convert import genie, lpips, tokenizer
 from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
 from rsjax.data.store import disk_guard, write_atomically
-from rsjax.train.parts import load_part, save_part
+from rsjax.training.pretrained import load_part, save_part
 
-METADATA = "rsjax.tokenizer"  # the configuration in the metadata of a tokenizer that was written here
+METADATA = "rsjax.tokenizers"  # the configuration in the metadata of a tokenizer that was written here
 
 
 def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> list[str]:

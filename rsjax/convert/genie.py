@@ -13,7 +13,7 @@ import jax
 from rsjax.config import ModelConfig
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
-from rsjax.model.world_model import WorldModel
+from rsjax.models.roboscape.world_model import WorldModel
 
 CONFIG = "config.json"
 

@@ -1,4 +1,4 @@
-"""LPIPS weights out of public files into the one file that :func:`rsjax.metrics.lpips.load_lpips` reads.
+"""LPIPS weights out of public files into the one file that :func:`rsjax.tokenizers.lpips.load_lpips` reads.
 
 The backbone is torchvision's AlexNet or VGG16, the heads are PerceptualSimilarity's. Each of these may hold them: one
 file each, one state dict of the whole, or a tokenizer's training checkpoint.
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import check
-from rsjax.metrics.lpips import NETS, lpips_shapes
+from rsjax.tokenizers.lpips import NETS, lpips_shapes
 
 _WITHIN = r"(?:loss\.perceptual_loss\.)?"  # where a tokenizer's checkpoint holds it
 NAMES = (

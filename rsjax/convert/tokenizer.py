@@ -12,7 +12,7 @@ import jax
 from rsjax.config import TokenizerConfig
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
-from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.tokenizers.magvit2 import Tokenizer
 
 Weights = Literal["raw", "ema"]
 

@@ -74,7 +74,7 @@ def plan(
 
     Returns:
         The loop with ``steps`` (each stage's rounded up to whole batches) and ``restarts`` set, and what makes its
-        loaders, for :func:`rsjax.train.loop.fit`.
+        loaders, for :func:`rsjax.training.loop.fit`.
 
     Raises:
         StoreError: a part's store cannot be read or does not go with ``own``, or nothing passes its patterns.

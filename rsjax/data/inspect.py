@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rsjax.data.codec import Record
+from rsjax.data.depth_color import depth_to_color
 from rsjax.data.merge import NONE, shapes
 from rsjax.data.store import Store, StoreError
 from rsjax.data.token_sets import counts, token_sets
-from rsjax.tokenizer.depth_color import depth_to_color
 
 BARS = " ▁▂▃▄▅▆▇█"
 _GAP = 4  # pixels between pictures

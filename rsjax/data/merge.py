@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import content_key
-from rsjax.data.actions import Statistics
 from rsjax.data.codec import Record
-from rsjax.data.episode import safe_id
 from rsjax.data.labels import Labels
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, token_sets, tokens_key
+from rsjax.ingest.actions import Statistics
+from rsjax.ingest.episode import safe_id
 
 UNITS = ("action_mean", "action_std", "depth_range")  # what a store's numbers are told in
 LEFT_OUT = ("filtered", "quarantine")  # by episode, why

@@ -19,8 +19,8 @@ from array_record.python.array_record_module import ArrayRecordWriter
 
 from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
-from rsjax.data.guard import ManifestError, check_manifest
 from rsjax.data.labels import Label, Labels, LabelWriter
+from rsjax.data.manifest import ManifestError, check_manifest
 from rsjax.errors import UserError
 
 FORMAT = 1

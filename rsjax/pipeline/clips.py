@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from rsjax.data.codec import Record
 from rsjax.data.records import RecordSource
 from rsjax.data.store import StoreError
+from rsjax.pipeline.generator import Codec, Tokens
 from rsjax.progress import note
-from rsjax.sample.generator import Codec, Tokens
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Clips:
         index: each one's number in the split.
         depth: zeros for clips that have none.
         has_depth: which have depth.
-        metric: which have depth in metres, and not relative (see :mod:`rsjax.annotate.depth`).
+        metric: which have depth in metres, and not relative (see :mod:`rsjax.ingest.annotators.depth`).
     """
 
     index: Int[np.ndarray, " B"]

@@ -11,12 +11,12 @@ import numpy as np
 
 from rsjax.config import LoopConfig
 from rsjax.data.curriculum import Feed, plan
+from rsjax.data.normalization import Units
 from rsjax.data.order import Transform
 from rsjax.data.store import Store
-from rsjax.data.units import Units
 from rsjax.pipeline import transforms
 from rsjax.progress import note
-from rsjax.train.distributed import is_lead
+from rsjax.training.distributed import is_lead
 
 
 def planned(
@@ -35,7 +35,7 @@ def token_transform(own: Store, integrate: bool, store: Store) -> Transform:
 
     Args:
         own: the store of the model's own data.
-        integrate: whether the actions' sums follow them (see :meth:`rsjax.data.units.Units.action_inputs`).
+        integrate: whether the actions' sums follow them (see :meth:`rsjax.data.normalization.Units.action_inputs`).
         store: the one that is read.
     """
     units = Units.create(own)

@@ -9,15 +9,15 @@ from typing import Any, Generic, TypeVar
 from rsjax.config import LoopConfig
 from rsjax.data.curriculum import Feed
 from rsjax.data.order import Arrays
-from rsjax.model.world_model import branches
+from rsjax.models.roboscape.world_model import branches
 from rsjax.pipeline import transforms
 from rsjax.pipeline.feeding import planned, token_transform
-from rsjax.pipeline.held_out import TokenizerHeldOut, WorldModelHeldOut
 from rsjax.pipeline.run import Run
-from rsjax.train.loop import Watch, fit
-from rsjax.train.objectives import Objective, TokenizerObjective, WorldModelObjective
-from rsjax.train.parts import start_tokenizer, start_world_model
-from rsjax.train.state import TrainState
+from rsjax.pipeline.validation import TokenizerHeldOut, WorldModelHeldOut
+from rsjax.training.loop import Watch, fit
+from rsjax.training.objectives import Objective, TokenizerObjective, WorldModelObjective
+from rsjax.training.pretrained import start_tokenizer, start_world_model
+from rsjax.training.state import TrainState
 
 O = TypeVar("O", bound=Objective)  # noqa: E741
 
@@ -36,7 +36,7 @@ class Job(Generic[O]):
     watch: Watch
 
     def fit(self, resume: bool) -> TrainState:
-        """:func:`rsjax.train.loop.fit` with these."""
+        """:func:`rsjax.training.loop.fit` with these."""
         return fit(
             self.objective,
             self.loop,

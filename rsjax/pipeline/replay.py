@@ -13,14 +13,14 @@ import optax
 from jaxtyping import Array
 
 from rsjax.errors import UserError
-from rsjax.objective import losses
+from rsjax.models.roboscape import losses
 from rsjax.pipeline.jobs import Job, tokenizer_job, world_model_job
 from rsjax.pipeline.run import Run
-from rsjax.train.checkpoint import Checkpoints
-from rsjax.train.objectives import Objective, Surroundings
-from rsjax.train.placement import Placement
-from rsjax.train.skipped import NAME, read_skipped
-from rsjax.train.state import TrainState
+from rsjax.training.checkpoint import Checkpoints
+from rsjax.training.objectives import Objective, Surroundings
+from rsjax.training.placement import Placement
+from rsjax.training.skipped import NAME, read_skipped
+from rsjax.training.state import TrainState
 
 
 @dataclass(frozen=True)

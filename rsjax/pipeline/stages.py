@@ -6,23 +6,23 @@ from pathlib import Path
 
 from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.curriculum import check_stages
+from rsjax.data.normalization import Units
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import disk_guard
-from rsjax.data.units import Units
-from rsjax.pipeline import evaluation
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.pipeline.generator import Generator, load_tokenizer
 from rsjax.pipeline.jobs import tokenizer_job, world_model_job
 from rsjax.pipeline.provenance import record_data, record_start
 from rsjax.pipeline.run import STAGES, TRAINED, Run
 from rsjax.pipeline.summary import write_summary
 from rsjax.pipeline.tokens import link, tokenize_store
 from rsjax.progress import Progress, duration, note, stage
-from rsjax.sample.generator import Generator, load_tokenizer
 from rsjax.sim.collect import collect
-from rsjax.train.checkpoint import save_weights
-from rsjax.train.distributed import agree, barrier, is_lead, on_lead
-from rsjax.train.parts import check_part
-from rsjax.train.placement import Placement
-from rsjax.train.wandb_run import find_wandb
+from rsjax.training.checkpoint import save_weights
+from rsjax.training.distributed import agree, barrier, is_lead, on_lead
+from rsjax.training.placement import Placement
+from rsjax.training.pretrained import check_part
+from rsjax.training.wandb_run import find_wandb
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:

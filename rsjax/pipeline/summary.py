@@ -11,12 +11,12 @@ import numpy as np
 
 from rsjax.config import LossConfig, to_dict
 from rsjax.data.store import disk_guard, write_atomically
-from rsjax.objective.keypoints import motion_magnitude
-from rsjax.pipeline import evaluation
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.models.roboscape.keypoints import motion_magnitude
 from rsjax.pipeline.run import STAGES, Run
 from rsjax.report.figures import ClipFigure
 from rsjax.report.page import Report, write_report
-from rsjax.train.log import read_log
+from rsjax.training.log import read_log
 
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "robosuite", "mujoco")
 

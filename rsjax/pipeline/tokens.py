@@ -13,15 +13,15 @@ from typing import Any
 from rsjax.config import Config
 from rsjax.data.codec import Record
 from rsjax.data.lock import lock
+from rsjax.data.normalization import Units
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
-from rsjax.data.units import Units
 from rsjax.pipeline.clips import readable
 from rsjax.pipeline.feeding import fingerprint
+from rsjax.pipeline.generator import Codec
 from rsjax.progress import Progress, note
-from rsjax.sample.generator import Codec
 from rsjax.sim.expert import difficulty
 
 UNITS = ("action_mean", "action_std", "action_count", "depth_range", "depth_unit")  # of a manifest

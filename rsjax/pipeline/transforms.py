@@ -6,9 +6,9 @@ import numpy as np
 
 from rsjax.clip import Batch
 from rsjax.data.codec import Record
+from rsjax.data.depth_color import depth_to_color
+from rsjax.data.normalization import Units
 from rsjax.data.order import Arrays
-from rsjax.data.units import Units
-from rsjax.tokenizer.depth_color import depth_to_color
 
 
 def tokenizer_images(

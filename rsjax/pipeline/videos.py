@@ -13,11 +13,11 @@ from rsjax.config import Config, SampleConfig
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
 from rsjax.pipeline.clips import Clips
+from rsjax.pipeline.generator import Generated, Generator
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.report.figures import ClipFigure, animation
 from rsjax.report.video import write_gif, write_mp4
-from rsjax.sample.generator import Generated, Generator
 
 
 @dataclass(frozen=True)

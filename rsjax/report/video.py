@@ -95,7 +95,7 @@ def depth_to_colors(depth: Float[np.ndarray, "..."], near: float, far: float) ->
     """Depth in metres as colours: ``near`` and closer is red, ``far`` and farther is violet (the turbo map).
 
     Even steps of colour are even steps of 1/depth, so that what lies close is told apart well. Unknown (not a number)
-    counts as far. For looking at only; the colours that the tokenizer sees are :mod:`rsjax.tokenizer.depth_color`'s.
+    counts as far. For looking at only; the colours that the tokenizer sees are :mod:`rsjax.data.depth_color`'s.
 
     Raises:
         ValueError: not 0 < ``near`` < ``far``.

@@ -11,8 +11,8 @@ import orbax.checkpoint as ocp
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store, encode, open_store
 from rsjax.soak.watch import checkpoints
-from rsjax.train.log import read_curve
-from rsjax.train.skipped import NAME as SKIPPED
+from rsjax.training.log import read_curve
+from rsjax.training.skipped import NAME as SKIPPED
 
 LISTS = (SKIPPED, QUARANTINE)  # that a stage may leave, one JSON object a line
 

@@ -17,7 +17,7 @@ from rsjax.soak.compare import compare_stages, compare_stores
 from rsjax.soak.disturb import copy_tree
 from rsjax.soak.rounds import Stage, Target
 from rsjax.soak.watch import Attempt, last_logged
-from rsjax.train.log import read_log
+from rsjax.training.log import read_log
 
 CHECKPOINTS = 40  # of a disturbed run, if not told otherwise
 NEVER_STOPPED = "never-stopped"  # a file in a reference that was made here, once it is whole

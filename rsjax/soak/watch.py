@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from rsjax.train.checkpoint import UNFINISHED
+from rsjax.training.checkpoint import UNFINISHED
 
 POLL_SECONDS = 0.002  # a small model's checkpoint is written in 50 ms
 

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from rsjax.train.log import read_log
+from rsjax.training.log import read_log
 from tests.pipeline.conftest import Commands
 
 

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax import presets
 from rsjax.ablation.fields import GridError, leaves, parse_value, with_values
-from rsjax.config import Config, ConfigError, from_dict, to_dict
+from rsjax.config import Config, ConfigError, from_dict, presets, to_dict
 
 DEBUG = presets.debug()
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax import presets
 from rsjax.ablation.fields import GridError, leaves
 from rsjax.ablation.grid import DEFAULT_AXES, Choice, cell_name, expand, idle, parse_axes, task_number
+from rsjax.config import presets
 from tests.ablation import toy
 
 DEBUG = presets.debug()

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rsjax import presets
 from rsjax.ablation import runner
 from rsjax.ablation.grid import Cell, expand, parse_axes
-from rsjax.config import Config
+from rsjax.config import Config, presets
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import STAGES, Run
 

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from rsjax import presets
 from rsjax.bench import feed, parts
 from rsjax.bench.run import PARTS, bench, ratios, table
-from rsjax.config import Config, ConfigError, MaskConfig
+from rsjax.config import Config, ConfigError, MaskConfig, presets
 from rsjax.errors import UserError
 
 

@@ -11,8 +11,8 @@ import pytest
 from rsjax.config import ModelConfig, TokenizerConfig, to_dict
 from rsjax.convert.__main__ import main
 from rsjax.convert.files import read_tensors, write_safetensors
-from rsjax.metrics.lpips import load_lpips
-from rsjax.train.parts import load_part, save_part
+from rsjax.tokenizers.lpips import load_lpips
+from rsjax.training.pretrained import load_part, save_part
 from tests.convert.public import Tensors, genie_shapes, random_tensors, tokenizer_shapes
 from tests.convert.test_lpips import backbone, heads
 

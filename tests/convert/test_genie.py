@@ -10,7 +10,7 @@ from rsjax.config import ModelConfig
 from rsjax.convert.files import ConvertError
 from rsjax.convert.genie import from_public, infer_config, read_settings, settings_of, table
 from rsjax.convert.table import public_shapes, to_tensors
-from rsjax.model.world_model import WorldModel
+from rsjax.models.roboscape.world_model import WorldModel
 from tests.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
 
 LAYERS, WIDTH, HEADS, FRAMES, CELLS, CODES = 3, 16, 2, 3, 4, 8

@@ -10,8 +10,8 @@ from rsjax.config import TokenizerConfig
 from rsjax.convert.files import ConvertError
 from rsjax.convert.table import public_shapes, to_tensors
 from rsjax.convert.tokenizer import Weights, from_public, infer_config, public_name, table
-from rsjax.tokenizer import lfq
-from rsjax.tokenizer.magvit2 import Tokenizer, to_unit
+from rsjax.tokenizers import lfq
+from rsjax.tokenizers.magvit2 import Tokenizer, to_unit
 from tests.convert.public import Tensors, TokenizerNet, random_tensors, tokenizer_shapes
 
 MULT, BITS = (1, 1, 2), 6

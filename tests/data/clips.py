@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rsjax.data.actions import Statistics
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, open_store, write_store
+from rsjax.ingest.actions import Statistics
 
 DIFFICULTIES = ("simple", "difficult")
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.data.actions import Statistics
 from rsjax.data.merge import by_label, into_parts, merge, split
 from rsjax.data.store import Store, StoreError, open_store
+from rsjax.ingest.actions import Statistics
 from tests.data.clips import clip_store, numbers, words
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from experiments.train import main
 from rsjax.pipeline import tokens
-from rsjax.train.checkpoint import Checkpoints
+from rsjax.training.checkpoint import Checkpoints
 
 
 def die() -> None:

@@ -17,8 +17,8 @@ from rsjax.pipeline import jobs, stages
 from rsjax.pipeline.feeding import fingerprint, planned, token_transform
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.tokens import tokenize_store
-from rsjax.tokenizer.magvit2 import Tokenizer
-from rsjax.train.checkpoint import save_weights
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.training.checkpoint import save_weights
 from tests.pipeline import toy
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from rsjax import presets
-from rsjax.model.world_model import WorldModel
-from rsjax.train.checkpoint import save_weights
+from rsjax.config import presets
+from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.training.checkpoint import save_weights
 from tests.pipeline.conftest import Commands
 
 PROGRAM = "experiments.generate"

@@ -14,19 +14,18 @@ import pytest
 
 from experiments import train
 from experiments.cli import parse
-from rsjax import presets
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, presets
+from rsjax.data.normalization import Units
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
-from rsjax.data.units import Units
-from rsjax.metrics.depth import depth_scores
-from rsjax.pipeline import evaluation
-from rsjax.pipeline.held_out import token_batches
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.depth import depth_scores
 from rsjax.pipeline.own_data import on_store, relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.stages import tokenize
 from rsjax.pipeline.tokens import tokenize_store
 from rsjax.pipeline.transforms import token_clip
-from rsjax.train.checkpoint import save_weights
+from rsjax.pipeline.validation import token_batches
+from rsjax.training.checkpoint import save_weights
 from tests.bridge import BRIDGE, needs_bridge
 from tests.pipeline import toy
 from tests.pipeline.conftest import ROOT

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import pytest
 
-from rsjax import presets
-from rsjax.config import Config, PartConfig, StageConfig, from_dict
+from rsjax.config import Config, PartConfig, StageConfig, from_dict, presets
 from rsjax.data.store import write_store
 from rsjax.pipeline import provenance
 from rsjax.pipeline.provenance import (

@@ -11,9 +11,9 @@ from rsjax.errors import UserError
 from rsjax.pipeline import stages
 from rsjax.pipeline.replay import replay, skipped_steps
 from rsjax.pipeline.run import Run
-from rsjax.tokenizer.magvit2 import Tokenizer
-from rsjax.train.checkpoint import save_weights
-from rsjax.train.skipped import read_skipped
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.training.checkpoint import save_weights
+from rsjax.training.skipped import read_skipped
 from tests.pipeline import toy
 
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from rsjax import presets
-from rsjax.config import Config, PartConfig, StageConfig
+from rsjax.config import Config, PartConfig, StageConfig, presets
 from rsjax.pipeline import run as module
 from rsjax.pipeline.run import STAGES, TRAINED, Run, RunError
 

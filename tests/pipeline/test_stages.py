@@ -12,10 +12,10 @@ import pytest
 from rsjax.config import LoopConfig, TokenizerTrainConfig
 from rsjax.data.store import write_store
 from rsjax.pipeline import jobs, stages
+from rsjax.pipeline.generator import load_tokenizer
 from rsjax.pipeline.run import Run
-from rsjax.sample.generator import load_tokenizer
-from rsjax.train.objectives import TokenizerObjective
-from rsjax.train.state import TrainState, create_state
+from rsjax.training.objectives import TokenizerObjective
+from rsjax.training.state import TrainState, create_state
 from tests.pipeline import toy
 
 WHOLE = TokenizerTrainConfig(steps=2, perceptual=1.0, adversarial=0.1)

@@ -8,11 +8,11 @@ import pytest
 
 from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.store import write_store
-from rsjax.model.world_model import WorldModel
+from rsjax.models.roboscape.world_model import WorldModel
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.stages import run_all, train_tokenizer, train_world_model
-from rsjax.tokenizer.magvit2 import Tokenizer
-from rsjax.train.parts import PartError, load_part, save_part
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.training.pretrained import PartError, load_part, save_part
 from tests.pipeline import toy
 
 

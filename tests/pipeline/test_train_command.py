@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from experiments import train
-from rsjax import presets
+from rsjax.config import presets
+from rsjax.pipeline.generator import load_tokenizer, load_world_model
 from rsjax.pipeline.run import STAGES
-from rsjax.sample.generator import load_tokenizer, load_world_model
 from rsjax.sim import gl as gl_module
-from rsjax.train.log import read_log
+from rsjax.training.log import read_log
 from tests.pipeline.conftest import Commands
 
 WANTED = (

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Batch
+from rsjax.data.depth_color import depth_to_color
+from rsjax.data.normalization import Units
 from rsjax.data.store import Record, encode_clip
-from rsjax.data.units import Units
 from rsjax.pipeline import transforms
-from rsjax.tokenizer.depth_color import depth_to_color
 from tests.pipeline import toy
 
 

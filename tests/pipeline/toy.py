@@ -6,14 +6,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from rsjax import presets
 from rsjax.clip import Clip
-from rsjax.config import Config, EvalConfig, SampleConfig
+from rsjax.config import Config, EvalConfig, SampleConfig, presets
+from rsjax.data.normalization import Units
 from rsjax.data.store import Store, encode_clip, open_store, write_store
-from rsjax.data.units import Units
-from rsjax.model.world_model import WorldModel
-from rsjax.sample.generator import Codec, Generator
-from rsjax.tokenizer.magvit2 import Tokenizer
+from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.pipeline.generator import Codec, Generator
+from rsjax.tokenizers.magvit2 import Tokenizer
 
 TRAIN, TEST = 3, 5
 SUCCESS = (False, False, True, False, True)  # of the test clips, at their end

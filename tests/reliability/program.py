@@ -19,9 +19,9 @@ from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.data.loader import batches
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store, write_atomically, write_store
-from rsjax.objective.losses import Term
-from rsjax.train.checkpoint import save_weights
-from tests.train import toy
+from rsjax.models.roboscape.losses import Term
+from rsjax.training.checkpoint import save_weights
+from tests.training import toy
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from rsjax.soak.disturb import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, S
 from rsjax.soak.rounds import Event, Target, run_round
 from rsjax.soak.runs import run_through
 from rsjax.soak.watch import Attempt, checkpoints, last_logged
-from rsjax.train.skipped import read_skipped
+from rsjax.training.skipped import read_skipped
 from tests.reliability.conftest import EVERY, STEPS, Targets
 
 SEED = 0

@@ -8,8 +8,8 @@ import pytest
 
 from rsjax.config import LoopConfig
 from rsjax.soak.compare import compare_arrays, compare_logs, compare_stages, listed, read_arrays, same_bits
-from rsjax.train.checkpoint import save_weights
-from tests.train.toy import train
+from rsjax.training.checkpoint import save_weights
+from tests.training.toy import train
 
 
 def floats(*values: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from experiments.soak import training_arguments
-from rsjax import presets
+from rsjax.config import presets
 from rsjax.soak import soak as module
 from rsjax.soak.bad_record import Trial
 from rsjax.soak.disturb import FULL_DISK, SHARES

@@ -1,1 +1,0 @@
-"""What rsjax is compared with."""

@@ -1,0 +1,149 @@
+"""The RGB branch as a plain eager PyTorch program, to be timed beside this one (architecture: 1xgpt's STMaskGIT).
+
+Written as the public code is: ``scaled_dot_product_attention``, ``nn.LayerNorm``, exact GELU, AdamW, no compilation, no
+cache in sampling. Parameter names are the public checkpoints'. Needs torch, an extra: import this module only where it
+is used.
+
+Axes: B clips, T frames, S cells, C width, n vocabularies of V codes.
+"""
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rsjax.bench.plain import check_plain
+from rsjax.config import ModelConfig, OptimizerConfig
+
+
+class Attention(nn.Module):
+    """Multi-head attention over the second axis of (N, L, C)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, causal: bool) -> Tensor:
+        n, length, width = x.shape
+        q, k, v = self.qkv(x).reshape(n, length, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
+        out = F.scaled_dot_product_attention(q, k, v, is_causal=causal)
+        return self.proj(out.transpose(1, 2).reshape(n, length, width))
+
+
+class Mlp(nn.Module):
+    """Two linear layers around the exact GELU."""
+
+    def __init__(self, width: int, ratio: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, ratio * width)
+        self.fc2 = nn.Linear(ratio * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class STBlock(nn.Module):
+    """x += Spatial(norm1 x); x += Temporal(x), which has no norm before it; x += MLP(norm2 x)."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.spatial_attn = Attention(config.width, config.heads)
+        self.temporal_attn = Attention(config.width, config.heads)
+        self.mlp = Mlp(config.width, config.mlp_ratio)
+
+    def forward(self, x: Tensor) -> Tensor:
+        b, t, s, c = x.shape
+        x = x + self.spatial_attn(self.norm1(x).reshape(b * t, s, c), causal=False).reshape(b, t, s, c)
+        columns = x.transpose(1, 2).reshape(b * s, t, c)
+        x = (columns + self.temporal_attn(columns, causal=True)).reshape(b, s, t, c).transpose(1, 2)
+        return x + self.mlp(self.norm2(x))
+
+
+class GenieTorch(nn.Module):
+    """Logits (B, T, S, n, V) of tokens (B, T, S); no actions, as in the public Genie.
+
+    Raises:
+        ConfigError: the model has something that the public code has not (other norms, rotary positions, …).
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        check_plain(config)
+        self.config = config
+        self.pos_embed_TSC = nn.Parameter(torch.zeros(1, config.frames, config.grid**2, config.width))
+        self.factored_embeds = nn.ModuleList(
+            nn.Embedding(config.vocabulary_size, config.width) for _ in range(config.vocabularies)
+        )
+        self.mask_token_embed = nn.Parameter(torch.zeros(1, config.width))
+        self.layers = nn.ModuleList(STBlock(config) for _ in range(config.blocks))
+        self.out_x_proj = nn.Linear(config.width, config.vocabularies * config.vocabulary_size)
+
+    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+        parts = sub_tokens(tokens, self.config)
+        embedded = torch.stack([embed(part) for embed, part in zip(self.factored_embeds, parts, strict=True)]).sum(0)
+        x = torch.where(mask[..., None], self.mask_token_embed, embedded) + self.pos_embed_TSC[:, : tokens.shape[1]]
+        for layer in self.layers:
+            x = layer(x)
+        return self.out_x_proj(x).reshape(*tokens.shape, self.config.vocabularies, self.config.vocabulary_size)
+
+
+def sub_tokens(tokens: Tensor, config: ModelConfig) -> list[Tensor]:
+    """Tokens to their sub-tokens, little-endian, one per vocabulary."""
+    bits = config.code_bits // config.vocabularies
+    return [(tokens >> (k * bits)) & (2**bits - 1) for k in range(config.vocabularies)]
+
+
+def masked_loss(model: GenieTorch, tokens: Tensor, mask: Tensor) -> Tensor:
+    """Mean over the masked cells of the sum of both vocabularies' cross-entropies, in nats."""
+    logits = model(tokens, mask).float()
+    targets = torch.stack(sub_tokens(tokens, model.config), dim=-1)
+    cross_entropy = F.cross_entropy(logits.flatten(0, -2), targets.flatten(), reduction="none")
+    return (cross_entropy.reshape(targets.shape).sum(-1) * mask).sum() / mask.sum()
+
+
+def make_adamw(model: GenieTorch, optimizer: OptimizerConfig) -> Any:
+    """AdamW with this project's settings."""
+    return torch.optim.AdamW(
+        model.parameters(),
+        lr=optimizer.learning_rate,
+        betas=(optimizer.beta1, optimizer.beta2),
+        weight_decay=optimizer.weight_decay,
+    )
+
+
+def train_step(
+    model: GenieTorch, adamw: Any, tokens: Tensor, mask: Tensor, bf16: bool, grad_clip: float = 1.0
+) -> Tensor:
+    """One step; ``bf16`` runs it under autocast; ``grad_clip`` 0 clips nothing. Returns the loss before it."""
+    with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
+        loss = masked_loss(model, tokens, mask)
+    adamw.zero_grad()
+    loss.backward()
+    if grad_clip > 0:
+        nn.utils.clip_grad_norm_(model.parameters(), grad_clip)
+    adamw.step()
+    return loss.detach()
+
+
+@torch.no_grad()
+def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, bf16: bool) -> Tensor:
+    """Tokens with frame ``t`` filled in by MaskGIT decoding, random unmasking, each step a pass over all frames."""
+    hidden = torch.ones_like(tokens[:, t], dtype=torch.bool)
+    bits = model.config.code_bits // model.config.vocabularies
+    tokens = tokens.clone()
+    for step in range(steps):
+        mask = torch.zeros_like(tokens, dtype=torch.bool)
+        mask[:, t] = hidden
+        with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
+            codes = model(tokens, mask)[:, t].argmax(-1)
+        drawn = (codes << (bits * torch.arange(codes.shape[-1], device=codes.device))).sum(-1)
+        tokens[:, t] = torch.where(hidden, drawn, tokens[:, t])
+        left = 0 if step + 1 == steps else math.ceil(math.cos((step + 1) / steps * math.pi / 2) * hidden.shape[-1])
+        order = torch.where(hidden, torch.rand(hidden.shape, device=tokens.device), torch.inf)
+        hidden = order.argsort(-1).argsort(-1) < left
+    return tokens

@@ -1,0 +1,1 @@
+"""What is computed from recordings: shots, motion, depth, keypoint tracks and semantics."""

@@ -1,0 +1,102 @@
+"""A list of episodes that are left out of a data set, with reasons, and a source that heeds it."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsjax.data.store import disk_guard, write_atomically
+from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError, fingerprint
+
+FORMAT = 1
+
+
+def write_selection(
+    path: Path, about: str, refs: tuple[tuple[str, str], ...], reasons: Mapping[str, list[str]]
+) -> tuple[int, int]:
+    """Writes which episodes are kept, and which are left out and why.
+
+    Args:
+        path: the list, JSON.
+        about: what data set it is about, for its readers.
+        refs: every episode's id and fingerprint.
+        reasons: of those left out, by id.
+
+    Returns:
+        How many are kept, how many are left out.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    kept = [{"id": name, "fingerprint": mark} for name, mark in refs if name not in reasons]
+    out = [{"id": name, "fingerprint": mark, "reasons": reasons[name]} for name, mark in refs if name in reasons]
+    content = {"format": FORMAT, "data_set": about, "kept": kept, "left_out": out}
+    with disk_guard(path):
+        write_atomically(path, json.dumps(content, indent=1).encode())
+    return len(kept), len(out)
+
+
+@dataclass
+class Selected:
+    """A source whose episodes are refused where a list leaves them out: they are still counted, and told why.
+
+    An episode that is no longer as it was when the list was written is read again.
+
+    Attributes:
+        source: what is read.
+        reasons: by id and fingerprint.
+        name: of the source.
+    """
+
+    source: EpisodeSource
+    reasons: dict[tuple[str, str], str]
+    name: str
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """All of them; one that is left out has a fingerprint of its own, so that earlier work on it is not used."""
+        for ref in self.source.episodes():
+            why = self.reasons.get((ref.id, ref.fingerprint))
+            if why is None:
+                yield ref
+            else:
+                yield EpisodeRef(ref.id, fingerprint((), ref.fingerprint, why), {"left_out": why})
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """One episode; :class:`EpisodeError` with the reasons where it is left out."""
+        if "left_out" in ref.location:
+            raise EpisodeError(f"{ref.id}: left out by the manifest: {ref.location['left_out']}")
+        return self.source.read(ref)
+
+
+def select(source: EpisodeSource, path: Path) -> Selected:
+    """The source without what the list at ``path`` leaves out.
+
+    Raises:
+        SourceError: the list cannot be read, or is about other episodes or about these with other options.
+    """
+    try:
+        content = json.loads(path.read_text())
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']}, this code reads format {FORMAT}")
+        listed = {(str(entry["id"]), str(entry["fingerprint"])) for entry in [*content["kept"], *content["left_out"]]}
+        reasons = {
+            (str(entry["id"]), str(entry["fingerprint"])): "; ".join(map(str, entry["reasons"]))
+            for entry in content["left_out"]
+        }
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise SourceError(
+            f"{path}: not a manifest of experiments.doctor ({error}); make it again with --fix"
+        ) from error
+    names, known = {name for name, _ in listed}, False
+    for ref in source.episodes():
+        known = known or ref.id in names
+        if (ref.id, ref.fingerprint) in listed:
+            return Selected(source, reasons, source.name)
+    if known:
+        raise SourceError(
+            f"{path}: the data set was read with other options then, or all its files have changed; run "
+            f"experiments.doctor --fix again, with the same --option"
+        )
+    raise SourceError(f"{path}: names no episode of this data set; give the manifest that was made for it")

@@ -1,0 +1,223 @@
+"""Multi-head attention over the cells of a frame (bidirectional) and over time (causal, with an exact cache).
+
+Axes: B clips, T frames, S cells of a frame, C width, h heads, e = C/h head width, q queries, k keys.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Bool, Float, Int
+
+from rsjax.config import ModelConfig
+from rsjax.models.roboscape.frame_attention import attend_in_frames
+from rsjax.models.roboscape.matmul import matmul_bf16
+
+# torch's default for linear layers, U(±1/√fan_in), which the public weights were trained from.
+TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
+FEW = 2  # frames that a pass of a rollout is over
+LARGE_FRAME = 128  # cells per frame from which bf16 products in attention gain more than their transposes cost
+
+
+@struct.dataclass
+class KeyValues:
+    """Temporal keys and values of one branch; with a leading axis over blocks where all blocks' are held.
+
+    A head's frames lie together, as its products read them: otherwise every pass would move the whole cache.
+    """
+
+    k: Float[Array, "*L B S h T e"]
+    v: Float[Array, "*L B S h T e"]
+
+
+class Dense(nn.Module):
+    """A linear layer with float32 parameters; ``bf16`` multiplies in bf16 and accumulates in float32."""
+
+    features: int
+    bf16: bool = False
+    use_bias: bool = True
+    kernel_init: nn.initializers.Initializer = TORCH_KERNEL
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
+        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
+        if self.bf16:
+            out = matmul_bf16(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
+        else:
+            out = x @ kernel
+        out = checkpoint_name(out, PRODUCT)
+        return out + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else out
+
+
+def layer_norm(name: str | None) -> nn.LayerNorm:
+    """LayerNorm with torch's epsilon, in float32."""
+    return nn.LayerNorm(epsilon=1e-5, name=name)
+
+
+def attend(
+    q: Float[Array, "*N q h e"],
+    k: Float[Array, "*N k h e"],
+    v: Float[Array, "*N k h e"],
+    mask: Bool[Array, "q k"] | None,
+) -> Float[Array, "*N q h e"]:
+    """softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax in float32."""
+    scores = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+    if mask is not None:
+        scores = jnp.where(mask, scores, jnp.finfo(jnp.float32).min)
+    return jnp.einsum("...hqk,...khe->...qhe", jax.nn.softmax(scores, axis=-1).astype(v.dtype), v)
+
+
+def attend_parts(
+    q: Float[Array, "*N q e"], parts: Sequence[tuple[KeyValues, Bool[Array, "q k"]]]
+) -> Float[Array, "*N q e"]:
+    """:func:`attend` over keys and values that lie in several places, each with its mask, as if they were one."""
+    scores = []
+    for held, mask in parts:
+        product = jnp.einsum("...qe,...ke->...qk", q, held.k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+        scores.append(jnp.where(mask, product, jnp.finfo(jnp.float32).min))
+    weights = jax.nn.softmax(jnp.concatenate(scores, axis=-1), axis=-1)
+    shares = jnp.split(weights, np.cumsum([x.shape[-1] for x in scores])[:-1], axis=-1)
+    outs = [
+        jnp.einsum("...qk,...ke->...qe", share.astype(held.v.dtype), held.v)
+        for share, (held, _) in zip(shares, parts, strict=True)
+    ]
+    return sum(outs[1:], start=outs[0])
+
+
+def attend_cells(
+    q: Float[Array, "B T S h e"], k: Float[Array, "B T S h e"], v: Float[Array, "B T S h e"], bf16: bool
+) -> Float[Array, "B T S h e"]:
+    """:func:`attend` within each frame, in the form that is fastest on this platform."""
+    frames = [x.reshape(-1, *x.shape[2:]) for x in (q, k, v)]
+    if bf16 and jax.default_backend() != "cpu":
+        out = jax.nn.dot_product_attention(*(x.astype(jnp.bfloat16) for x in frames)).astype(q.dtype)
+    elif bf16 and q.shape[-3] >= LARGE_FRAME:
+        out = attend_in_frames(*frames)
+    else:
+        out = attend(frames[0], frames[1], frames[2], None)
+    return out.reshape(q.shape)
+
+
+def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[Array, "B T S h e"]:
+    """Rotary position embedding: channels i and i + e/2 of a head turn by position · 10000^(-2i/e), in float32.
+
+    The product of a query and a key so turned depends on their positions' difference alone.
+    """
+    half = x.shape[-1] // 2
+    angles = positions[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
+    cos, sin = (f(angles)[:, None, None] for f in (jnp.cos, jnp.sin))
+    first, second = jnp.split(x, 2, axis=-1)
+    return jnp.concatenate([first * cos - second * sin, second * cos + first * sin], axis=-1)
+
+
+def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
+    """The frame in each slot of a cache after frame ``last`` is written; negative where none is yet."""
+    return last - (last - jnp.arange(slots)) % slots
+
+
+def put_frames(cache: KeyValues, new: KeyValues, start: Any, ring: bool) -> KeyValues:
+    """A cache with the frames from ``start`` on written in; both with a leading axis over blocks.
+
+    Args:
+        ring: slots are taken over where positions pass their number.
+    """
+
+    def put(held: Float[Array, "L B S h N e"], fresh: Float[Array, "L B S h T e"]) -> Float[Array, "L B S h N e"]:
+        fresh = fresh.astype(held.dtype)
+        if not ring:
+            return jax.lax.dynamic_update_slice_in_dim(held, fresh, start, axis=-2)
+        for i in range(fresh.shape[-2]):  # frame by frame, for the slots may go around the end
+            slot = (start + i) % held.shape[-2]
+            held = jax.lax.dynamic_update_slice_in_dim(held, fresh[..., i : i + 1, :], slot, axis=-2)
+        return held
+
+    return jax.tree.map(put, cache, new)
+
+
+class Attention(nn.Module):
+    """Projections around :func:`attend`. Rows of the qkv projection: (3, heads, head width)."""
+
+    config: ModelConfig
+
+    def setup(self) -> None:
+        cfg = self.config
+        bf16 = cfg.compute_dtype == "bfloat16"
+        self.qkv = Dense(3 * cfg.width, bf16, use_bias=False)
+        self.proj = Dense(cfg.width, bf16)
+        if cfg.qk_norm:
+            self.norm = layer_norm(None)
+
+    def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
+        """Every cell attends to every cell of its own frame."""
+        q, k, v = (self._heads(y) for y in self._project(x))
+        return self.proj(attend_cells(q, k, v, self.config.compute_dtype == "bfloat16").reshape(x.shape))
+
+    def temporal(
+        self, x: Float[Array, "B T S C"], start: Any = 0, cache: KeyValues | None = None
+    ) -> tuple[Float[Array, "B T S C"], KeyValues | None]:
+        """Every cell attends to the same cell in its own frame and the ``config.frames - 1`` before it.
+
+        Args:
+            x: frames start … start + T - 1.
+            start: position of x's first frame (may be traced).
+            cache: keys and values of frames before ``start``, frame f in slot f mod N of N; what it holds from
+                ``start`` on is not read. Where positions pass N, slots are taken over, and a frame must still find
+                all that it attends to: N ≥ config.frames + T - 1.
+
+        Returns:
+            The output, and x's own keys and values, for :func:`put_frames` (None where no cache was given). Writing
+            them here would copy the cache in every block of every pass.
+
+        Raises:
+            ValueError: x has more frames than the cache.
+        """
+        cfg = self.config
+        q, k, v = self._project(x)
+        positions = start + jnp.arange(x.shape[1])
+        if cfg.positions == "rotary":
+            q, k = (rotate(self._heads(y), positions).reshape(y.shape) for y in (q, k))
+        if cache is None:
+            q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))
+            out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
+            return self.proj(out.reshape(x.shape)), None
+        frames, slots = x.shape[1], cache.k.shape[-2]
+        if frames > slots:
+            raise ValueError(f"{frames} frames do not fit a cache of {slots}")
+        q, new = self._head_major(q), KeyValues(self._head_major(k), self._head_major(v))
+        sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
+        # XLA's CPU backend is three times as fast at products of one row with each matrix as of two.
+        at_once = 1 if frames <= FEW else frames
+        outs = [
+            attend_parts(
+                q[..., i : i + at_once, :], [(cache, sees[0][i : i + at_once]), (new, sees[1][i : i + at_once])]
+            )
+            for i in range(0, frames, at_once)
+        ]
+        out = jnp.concatenate(outs, axis=-2).transpose(0, 3, 1, 2, 4)
+        return self.proj(out.reshape(x.shape)), new
+
+    def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:
+        return self._heads(x).transpose(0, 2, 3, 1, 4)
+
+    def _sees(self, positions: Int[Array, " q"], held: Int[Array, " k"]) -> Bool[Array, "q k"]:
+        age = positions[:, None] - held[None, :]
+        return (age >= 0) & (age < self.config.frames) & (held >= 0)
+
+    def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
+        q, k, v = jnp.split(self.qkv(x), 3, axis=-1)
+        if self.config.qk_norm:
+            q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
+        if self.config.mup:
+            # 8/e in all: attend divides by √e. The public code's plain attention scales before the norm, which undoes
+            # it; its default, fused one after, as here.
+            q = q * (8 * self.config.head_width**-0.5)
+        return q, k, v
+
+    def _heads(self, x: Float[Array, "*N C"]) -> Float[Array, "*N h e"]:
+        return x.reshape(*x.shape[:-1], self.config.heads, self.config.head_width)

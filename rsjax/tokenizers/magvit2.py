@@ -1,0 +1,156 @@
+"""The MAGVIT-2 image tokenizer (paper §2.3 "Video Tokenization"; architecture of the public Open-MAGVIT2).
+
+One module for all sizes: the full preset maps 256² pixels to 16×16 tokens of 18 bits. Convolutions of the residual
+blocks have no bias, downsampling pads symmetrically, there is no attention. Submodule names follow the public
+checkpoints' keys.
+
+Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from rsjax.config import TokenizerConfig
+from rsjax.tokenizers import lfq
+
+
+def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:
+    """Moves factor×factor blocks of pixels into channels; the inverse of :func:`depth_to_space`."""
+    b, height, width, c = x.shape
+    x = x.reshape(b, height // factor, factor, width // factor, factor, c)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height // factor, width // factor, factor * factor * c)
+
+
+def depth_to_space(x: Float[Array, "B h w C2"], factor: int) -> Float[Array, "B H W C"]:
+    """Channels (factor, factor, C) to factor×factor blocks of pixels."""
+    b, height, width, c = x.shape
+    x = x.reshape(b, height, width, factor, factor, c // factor**2)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height * factor, width * factor, c // factor**2)
+
+
+def _conv3(features: int, name: str, bias: bool = False, stride: int = 1) -> nn.Conv:
+    # Symmetric padding also where the stride is 2: 'SAME' would pad one side only.
+    return nn.Conv(features, (3, 3), (stride, stride), padding=((1, 1), (1, 1)), use_bias=bias, name=name)
+
+
+class ResBlock(nn.Module):
+    """GroupNorm → swish → conv3, twice, plus the input (through a 1×1 convolution where the width changes)."""
+
+    features: int
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
+        h = _norm(self.groups, "norm1")(x)
+        h = _conv3(self.features, "conv1")(nn.swish(h))
+        h = _norm(self.groups, "norm2")(h)
+        h = _conv3(self.features, "conv2")(nn.swish(h))
+        if x.shape[-1] != self.features:
+            x = nn.Conv(self.features, (1, 1), use_bias=False, name="nin_shortcut")(x)
+        return x + h
+
+
+def _norm(groups: int, name: str, affine: bool = True) -> nn.GroupNorm:
+    # E[x²] - E[x]² loses digits that parity with the public weights needs.
+    return nn.GroupNorm(groups, epsilon=1e-6, use_bias=affine, use_scale=affine, use_fast_variance=False, name=name)
+
+
+class AdaptiveGroupNorm(nn.Module):
+    """GroupNorm whose scale and shift of each channel are linear in the codes' deviations and means over the cells."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B h w C"], codes: Float[Array, "B i j D"]) -> Float[Array, "B h w C"]:
+        # The unbiased variance: the public code leaves torch's default.
+        deviation = jnp.sqrt(jnp.var(codes, axis=(1, 2), ddof=1) + 1e-6)
+        scale = nn.Dense(x.shape[-1], name="gamma")(deviation)
+        shift = nn.Dense(x.shape[-1], name="beta")(jnp.mean(codes, axis=(1, 2)))
+        return scale[:, None, None] * _norm(self.groups, "norm", affine=False)(x) + shift[:, None, None]
+
+
+class Encoder(nn.Module):
+    """Images in [-1, 1] to latents whose signs are the code."""
+
+    config: TokenizerConfig
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w D"]:
+        cfg = self.config
+        x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
+        x = _conv3(cfg.channels, "conv_in")(x)
+        levels = len(cfg.channel_multipliers)
+        for level, multiplier in enumerate(cfg.channel_multipliers):
+            for i in range(cfg.res_blocks):
+                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, name=f"down_{level}_block_{i}")(x)
+            if level < levels - 1:
+                x = _conv3(x.shape[-1], f"down_{level}_downsample", bias=True, stride=2)(x)
+        for i in range(cfg.res_blocks):
+            x = ResBlock(x.shape[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
+        x = nn.swish(_norm(cfg.norm_groups, "norm_out")(x))
+        return nn.Conv(cfg.code_bits, (1, 1), name="conv_out")(x)
+
+
+class Decoder(nn.Module):
+    """Codes in {-1, +1} to images in about [-1, 1] (not clipped)."""
+
+    config: TokenizerConfig
+
+    @nn.compact
+    def __call__(self, codes: Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
+        cfg = self.config
+        x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", bias=True)(codes)
+        for i in range(cfg.res_blocks):
+            x = ResBlock(x.shape[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
+        for level in reversed(range(len(cfg.channel_multipliers))):
+            if cfg.adaptive_norm:
+                x = AdaptiveGroupNorm(cfg.norm_groups, name=f"adaptive_{level}")(x, codes)
+            for i in range(cfg.res_blocks):
+                features = cfg.channels * cfg.channel_multipliers[level]
+                x = ResBlock(features, cfg.norm_groups, name=f"up_{level}_block_{i}")(x)
+            if level > 0:
+                x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", bias=True)(x), 2)
+        x = nn.swish(_norm(cfg.norm_groups, "norm_out")(x))
+        x = _conv3(3 * cfg.patch_size**2, "conv_out", bias=True)(x)
+        return depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x
+
+
+class Tokenizer(nn.Module):
+    """Encoder, lookup-free quantiser and decoder. ``apply`` with ``method=`` "encode", "decode" or neither."""
+
+    config: TokenizerConfig
+
+    def setup(self) -> None:
+        self.encoder = Encoder(self.config)
+        self.decoder = Decoder(self.config)
+
+    def __call__(self, images: Float[Array, "B H W 3"]) -> tuple[Float[Array, "B H W 3"], Float[Array, "B h w D"]]:
+        """Images in [-1, 1] to (reconstruction, latents), differentiable through the quantiser."""
+        latents = self.encoder(images)
+        return self.decoder(lfq.quantize(latents)), latents
+
+    def encode(self, images: Float[Array, "B H W 3"]) -> Int[Array, "B h w"]:
+        """Images in 0–255 to tokens, 0 … 2^D - 1."""
+        return lfq.codes_to_tokens(self.encoder(to_unit(images)))
+
+    def decode(self, tokens: Int[Array, "B h w"]) -> Float[Array, "B H W 3"]:
+        """Tokens to images in 0–255 (float32, clipped, not rounded)."""
+        return to_pixels(self.decoder(lfq.tokens_to_codes(tokens, self.config.code_bits)))
+
+    def init_params(self, key: Array) -> Any:
+        """Fresh parameters."""
+        size = self.config.image_size
+        return self.init(key, jnp.zeros((1, size, size, 3)))["params"]
+
+
+def to_unit(pixels: Any) -> Float[Array, "*batch"]:
+    """Pixels 0–255 to [-1, 1]: x/127.5 - 1."""
+    return jnp.asarray(pixels, jnp.float32) / 127.5 - 1.0
+
+
+def to_pixels(images: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """[-1, 1] to pixels 0–255, clipped."""
+    return jnp.clip((images + 1.0) * 127.5, 0.0, 255.0)

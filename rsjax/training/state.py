@@ -1,0 +1,103 @@
+"""The training state and its optimizer."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Int32
+
+from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.training.objectives import Objective
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that a step reads and writes; what a checkpoint holds, with the place in the data."""
+
+    step: Int32[Array, ""]
+    params: Any
+    opt_state: Any
+    ema: Any  # averaged parameters, or None
+    extra: Any  # what else the objective carries from step to step, or None
+    skipped: Int32[Array, ""]  # steps that were left out, for their loss or gradient was not finite
+
+    @property
+    def weights(self) -> Any:
+        """The parameters that later stages use: the averaged ones where they are kept."""
+        return self.params if self.ema is None else self.ema
+
+
+def learning_rate(loop: LoopConfig) -> optax.Schedule:
+    """Warm-up and schedule over the whole run, or over each stretch between ``loop.restarts``."""
+    begins = [0, *loop.restarts]
+    ends = [*loop.restarts, loop.steps]
+    stretches = [_schedule(loop.optimizer, max(end - begin, 1)) for begin, end in zip(begins, ends, strict=True)]
+    return optax.join_schedules(stretches, list(loop.restarts))
+
+
+def _schedule(opt: OptimizerConfig, steps: int) -> optax.Schedule:
+    peak, low = opt.learning_rate, opt.learning_rate * opt.final_share
+    warmup = min(opt.warmup_steps, steps - 1)
+    if opt.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(0.0, peak, warmup, max(steps, warmup + 1), low)
+    if opt.schedule == "steps":
+        drops = optax.piecewise_constant_schedule(peak, {round(share * steps): 0.1 for share in opt.drop_at})
+        return lambda step: drops(step) * jnp.minimum(1.0, step / warmup if warmup else 1.0)
+    rise = optax.linear_schedule(0.0, peak, warmup)
+    fall = max(1, steps - warmup if opt.schedule == "linear" else round(opt.decay_share * steps))
+    begin = max(warmup, steps - fall)
+    fall = max(1, steps - begin)
+    parts = [rise, optax.constant_schedule(peak), optax.linear_schedule(peak, low, fall)]
+    return optax.join_schedules(parts, [warmup, begin])
+
+
+def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
+    """Clipping by the global norm (where it is on), then AdamW or Muon."""
+    opt = loop.optimizer
+    if opt.kind == "muon":
+        inner = optax.contrib.muon(
+            learning_rate(loop),
+            weight_decay=opt.weight_decay,
+            adam_b1=opt.beta1,
+            adam_b2=opt.beta2,
+            adam_weight_decay=opt.weight_decay,
+            muon_weight_dimension_numbers=_block_matrices,
+            consistent_rms=0.2,
+        )
+    else:
+        inner = optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay)
+    return optax.chain(optax.clip_by_global_norm(opt.grad_clip) if opt.grad_clip else optax.identity(), inner)
+
+
+def _block_matrices(params: Any) -> Any:
+    """Which parameters are matrices inside blocks, (blocks, in, out); None for embeddings, heads, biases and norms."""
+
+    def axes(path: Any, value: Any) -> optax.contrib.MuonDimensionNumbers | None:
+        names = [key.key for key in path]
+        matrix = "blocks" in names and names[-1] == "kernel"
+        return optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2) if matrix else None
+
+    return jax.tree.map_with_path(axes, params)
+
+
+def create_state(objective: Objective, loop: LoopConfig, start: Callable[[Any], Any] | None = None) -> TrainState:
+    """The state before the first step; a function of the configuration alone.
+
+    Args:
+        start: fresh parameters to those that training begins with; the fresh ones if not given.
+    """
+    params = objective.init(jax.random.key(loop.seed))
+    if start is not None:
+        params = start(params)
+    ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
+    return TrainState(
+        step=jnp.int32(0),
+        params=params,
+        opt_state=make_optimizer(loop).init(params),
+        ema=ema,
+        extra=objective.init_extra(),
+        skipped=jnp.int32(0),
+    )

@@ -1,0 +1,123 @@
+"""Whether the code still does bit for bit what it did when ``tests/behaviour.json`` was recorded.
+
+``python -m tests.behaviour record`` writes the file, ``python -m tests.behaviour check`` compares with it (six minutes
+on 2 cores). Recorded are the losses of ``tiny`` over 100 steps of both training stages, the metrics of ``debug``, the
+tokens of a greedy rollout, and the bytes of a store that BridgeData was ingested into. Floating-point results differ
+between processors, so a record of another one is refused rather than compared.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RECORD = Path(__file__).with_suffix(".json")
+BRIDGE = Path(__file__).parents[2] / "shared" / "data" / "bridge"
+SECTIONS = ("tokenizer-train", "train")
+MEASURED = ("second", "share", "gib")  # parts of the names of scalars that measure the machine
+
+
+def main() -> None:
+    """Records or checks."""
+    action = sys.argv[1] if len(sys.argv) > 1 else "check"
+    with tempfile.TemporaryDirectory() as scratch:
+        place = Path(os.environ.get("BEHAVIOUR_DIR") or scratch)
+        now: dict[str, Any] = {
+            "machine": machine(),
+            "tiny": tiny(place),
+            "debug": debug(place),
+            "tokens": tokens(place),
+        }
+        now |= {"bridge": bridge(place)}
+    if action == "record":
+        RECORD.write_text(json.dumps(now, indent=1, sort_keys=True) + "\n")
+        return
+    then = json.loads(RECORD.read_text())
+    if then["machine"] != now["machine"]:
+        raise SystemExit(f"recorded on {then['machine']}, this is {now['machine']}: bits cannot be compared")
+    differing = [line for part in then for line in compare(part, then[part], now[part])]
+    print("\n".join(differing) or "bit-identical")
+    raise SystemExit(bool(differing))
+
+
+def machine() -> str:
+    """The processor's name and jax's version."""
+    import jax
+
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    name = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.processor())
+    return f"{name}, {os.cpu_count()} cores, jax {jax.__version__}"
+
+
+def compare(name: str, then: Any, now: Any) -> list[str]:
+    """A line for every value that differs."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        return [line for key in sorted({*then, *now}) for line in compare(f"{name}/{key}", then.get(key), now.get(key))]
+    return [] if then == now else [f"{name}: {then} then, {now} now"]
+
+
+def run(module: str, *arguments: str) -> None:
+    """One of the commands."""
+    subprocess.run([sys.executable, "-m", f"experiments.{module}", *arguments], check=True)
+
+
+def curve(directory: Path) -> dict[str, dict[str, float]]:
+    """The logged scalars by step."""
+    rows = [json.loads(line) for line in (directory / "log.jsonl").read_text().splitlines()]
+    return {
+        str(row["step"]): {name: value for name, value in row.items() if not any(word in name for word in MEASURED)}
+        for row in rows
+    }
+
+
+def tiny(place: Path) -> dict[str, Any]:
+    """Both training curves of ``tiny`` over 100 steps."""
+    short = [f"--{section}.{field}" for section in SECTIONS for field in ("steps=100", "log-every=1")]
+    off = ["--tokenizer-train.eval-every=0", "--train.eval-every=0", "--eval.clips=2", "--eval.action-draws=1"]
+    run("train", "tiny", "--run-dir", f"{place}/tiny", "--data-dir", f"{place}/data", *short, *off)
+    return {stage: curve(place / "tiny" / stage) for stage in ("tokenizer", "world_model")}
+
+
+def debug(place: Path) -> dict[str, Any]:
+    """The metrics of ``debug``."""
+    run("train", "debug", "--run-dir", f"{place}/debug", "--data-dir", f"{place}/data")
+    metrics = json.loads((place / "debug" / "metrics.json").read_text())
+    return {name: value for name, value in metrics.items() if "second" not in name}
+
+
+def tokens(place: Path) -> dict[str, str]:
+    """Digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
+    import dataclasses
+
+    from rsjax.pipeline.clips import Clips
+    from rsjax.pipeline.generator import Generator
+    from rsjax.pipeline.run import Run
+
+    generator = Generator.load(place / "tiny")
+    source = Run(generator.config, place / "tiny", place / "data").open_clips().source("test")
+    clips = Clips.stacked([source[number] for number in range(4)], range(4))
+    sample = dataclasses.replace(generator.config.sample, temperature=0.0, unmask="greedy", steps=3)
+    made = generator.generate(clips.tokens(generator.codec, 1), clips.actions, sample)
+    digest = lambda grid: hashlib.sha256(np.asarray(grid).astype("<i4").tobytes()).hexdigest()  # noqa: E731
+    return {branch: digest(grid) for branch, grid in made.tokens.items()}
+
+
+def bridge(place: Path) -> dict[str, str] | None:
+    """Digests of the files of clips that BridgeData is ingested into; None where it is not there."""
+    if not BRIDGE.exists():
+        return None
+    out = place / "bridge"
+    run("ingest", "rlds", str(BRIDGE), "--out", str(out), "--windows.rate", "0", "--windows.frames", "8")
+    files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.suffix == ".array_record"]
+    return {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+if __name__ == "__main__":
+    main()

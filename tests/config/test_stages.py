@@ -1,0 +1,109 @@
+"""A curriculum's stages: on the command line, in a stored configuration, and in content keys."""
+
+import dataclasses
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.cli import parse
+from rsjax.config import (
+    Config,
+    ConfigError,
+    LoopConfig,
+    PartConfig,
+    StageConfig,
+    content_key,
+    from_dict,
+    presets,
+    to_dict,
+)
+from rsjax.config.stages import format_stage, parse_stage
+
+WORDS = st.text("abz *[]?_ -", min_size=1).filter(lambda word: word != "all")
+POSITIVE = st.floats(1e-6, 1e6)
+PARTS = st.builds(
+    PartConfig,
+    tasks=st.lists(WORDS, min_size=1).map(tuple),
+    difficulties=st.lists(WORDS, min_size=1).map(tuple),
+    store=st.sampled_from(["", "runs/b/tokens/store", "/data/a=b"]),
+    weight=POSITIVE,
+)
+STAGES = st.builds(StageConfig, st.lists(PARTS, min_size=1).map(tuple), POSITIVE, st.booleans())
+
+
+@dataclasses.dataclass(frozen=True)
+class NoOptions:
+    pass
+
+
+def read(*argv: str) -> Config:
+    return parse(argv, "train", "", NoOptions())[0]
+
+
+@given(STAGES)
+def test_a_stage_survives_its_word(stage: StageConfig) -> None:
+    assert parse_stage(format_stage(stage)) == stage
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(STAGES, max_size=3).map(tuple))
+def test_stages_survive_json_and_differ_in_their_keys(stages: tuple[StageConfig, ...]) -> None:
+    loop = LoopConfig(stages=stages)
+    assert from_dict(LoopConfig, json.loads(json.dumps(to_dict(loop)))) == loop
+    assert hash(loop) == hash(dataclasses.replace(loop))
+    more = dataclasses.replace(loop, stages=(*stages, StageConfig()))
+    assert content_key(more) != content_key(loop)
+    if stages:
+        part = dataclasses.replace(stages[0].parts[0], weight=stages[0].parts[0].weight + 1)
+        heavier = dataclasses.replace(stages[0], parts=(part, *stages[0].parts[1:]))
+        changed = dataclasses.replace(loop, stages=(heavier, *stages[1:]))
+        assert content_key(changed) != content_key(loop)
+
+
+def test_the_papers_curriculum_on_the_command_line() -> None:
+    config = read("tiny", "--train.stages", "simple:2", "difficult:3:restart", "--train.seed", "3")
+    assert config.train == dataclasses.replace(
+        presets.get("tiny").train,
+        seed=3,
+        stages=(
+            StageConfig((PartConfig(difficulties=("simple",)),), 2.0),
+            StageConfig((PartConfig(difficulties=("difficult",)),), 3.0, restart=True),
+        ),
+    )
+
+
+def test_a_word_can_say_all_that_a_stage_has() -> None:
+    assert parse_stage("simple,hard/pick*,place=2.5@runs/b+all:0.5") == StageConfig(
+        (PartConfig(("pick*", "place"), ("simple", "hard"), "runs/b", 2.5), PartConfig()), 0.5
+    )
+
+
+@pytest.mark.parametrize(
+    ("word", "reason"),
+    [
+        ("simple", "its epochs are missing"),
+        ("simple:two", "epochs 'two' is no number above 0"),
+        ("simple:0", "epochs '0' is no number above 0"),
+        ("simple:nan", "epochs 'nan' is no number above 0"),
+        ("simple:2:restrt", "epochs 'restrt' is no number above 0"),
+        ("simple=x:2", "weight 'x' is no number above 0"),
+        ("simple=-1:2", "weight '-1' is no number above 0"),
+        ("simple@:2", "nothing follows its @"),
+        (":2", "a difficulty is empty; all stands for every one"),
+        ("simple/:2", "a task is empty"),
+        ("simple+:2", "a difficulty is empty"),
+    ],
+)
+def test_a_mistake_is_named_with_how_it_is_written(word: str, reason: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read("tiny", "--train.stages", word)
+    assert f"stage '{word}': {reason}" in str(caught.value)
+    assert "write DIFFICULTIES[/TASKS]" in str(caught.value) and "such as simple:2" in str(caught.value)
+
+
+@pytest.mark.parametrize("stages", [3, "simple:2", [3], [{"parts": 3}], [{"epoch": 3}]])
+def test_damaged_stages_are_refused(stages: object) -> None:
+    with pytest.raises(ConfigError):
+        from_dict(LoopConfig, {"stages": stages})

@@ -1,0 +1,115 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsjax.config import EvalConfig
+from rsjax.data.store import Store, StoreError
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.control import other_clips
+from rsjax.evaluation.evaluate import Evaluation, evaluate
+from rsjax.pipeline.generator import Generated, Generator
+from tests.pipeline import toy
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("toy") / "clips")
+
+
+@pytest.fixture(scope="module")
+def generator(clips: Store) -> Generator:
+    return toy.generator(clips)
+
+
+@pytest.fixture(scope="module")
+def result(generator: Generator, clips: Store) -> Evaluation:
+    return evaluate(generator, clips)
+
+
+def held_out() -> list[dict[str, np.ndarray]]:
+    return [vars(toy.clip(toy.TRAIN + i, toy.SUCCESS[i])) for i in range(toy.TEST)]
+
+
+TRUTH = {name: np.stack([clip[name] for clip in held_out()]) for name in ("rgb", "depth", "actions")}
+
+
+def psnr(truth: np.ndarray, frames: np.ndarray) -> float:
+    """Mean over clips and predicted frames, from the definition."""
+    error = np.square(truth.astype(np.float64) - frames.astype(np.float64)).mean((2, 3, 4))[:, 1:]
+    return float(np.mean(10 * np.log10(255**2 / error)))
+
+
+def abs_rel(truth: np.ndarray, depth: np.ndarray) -> float:
+    return float((np.abs(truth - depth) / truth)[:, 1:].mean())
+
+
+def generated(generator: Generator, actions: np.ndarray) -> Generated:
+    """All clips in one batch."""
+    prompt = {
+        "rgb": generator.codec.encode_rgb(TRUTH["rgb"][:, :1]),
+        "depth": generator.codec.encode_depth(TRUTH["depth"][:, :1]),
+    }
+    return generator.generate(prompt, actions, generator.config.sample)
+
+
+def test_the_baselines_are_plain_numpys(generator: Generator, result: Evaluation) -> None:
+    codec = generator.codec
+    first = np.broadcast_to(TRUTH["rgb"][:, :1], TRUTH["rgb"].shape)
+    reconstruction = codec.decode_rgb(codec.encode_rgb(TRUTH["rgb"]))
+    assert result.metrics["psnr_repeat_first"] == pytest.approx(psnr(TRUTH["rgb"], first), rel=1e-4)
+    assert result.metrics["psnr_tokenizer"] == pytest.approx(psnr(TRUTH["rgb"], reconstruction), rel=1e-4)
+    first_depth = np.broadcast_to(TRUTH["depth"][:, :1], TRUTH["depth"].shape)
+    depth = codec.decode_depth(codec.encode_depth(TRUTH["depth"]))
+    assert result.metrics["depth_absrel_repeat_first"] == pytest.approx(abs_rel(TRUTH["depth"], first_depth), rel=1e-4)
+    assert result.metrics["depth_absrel_tokenizer"] == pytest.approx(abs_rel(TRUTH["depth"], depth), rel=1e-4)
+
+
+def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(generator: Generator, result: Evaluation) -> None:
+    """5 clips in batches of 2 against one batch of 5; ΔPSNR with the same key under other clips' actions."""
+    own = generated(generator, TRUTH["actions"])
+    assert own.depth is not None
+    assert result.metrics["psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb), rel=1e-4)
+    assert result.metrics["depth_absrel"] == pytest.approx(abs_rel(TRUTH["depth"], own.depth), rel=1e-4)
+    others = other_clips(toy.TEST, draws=2, seed=0)
+    worse = [psnr(TRUTH["rgb"], generated(generator, TRUTH["actions"][order]).rgb) for order in others]
+    assert result.metrics["delta_psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb) - np.mean(worse), abs=1e-4)
+    assert result.metrics["delta_psnr"] != 0
+
+
+def test_own_actions_in_place_of_random_ones_make_no_difference(
+    generator: Generator, clips: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sampling key is the same: with the same actions every ΔPSNR is 0, at random draws too."""
+    config = replace(
+        generator.config,
+        sample=replace(generator.config.sample, temperature=1.0, unmask="random"),
+        eval=EvalConfig(clips=4, batch_size=4, action_draws=1, report_clips=1),
+    )
+    monkeypatch.setattr(evaluation.control, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
+    monkeypatch.setattr(evaluation.control, "uniform_actions", lambda own, *_, seed: own[None])
+    metrics = evaluate(replace(generator, config=config), clips).metrics
+    deltas = {name: value for name, value in metrics.items() if name.startswith("delta_psnr")}
+    assert len(deltas) == 14
+    assert set(deltas.values()) == {0.0}
+
+
+def test_shown_clips_are_successes_and_failures_by_turns(result: Evaluation) -> None:
+    assert result.shown["clip"].tolist() == [2, 0, 4]
+    assert result.shown["success"].tolist() == [True, False, True]
+    np.testing.assert_array_equal(result.shown["truth"], TRUTH["rgb"][[2, 0, 4]])
+    np.testing.assert_array_equal(result.shown["true_depth"], TRUTH["depth"][[2, 0, 4]])
+    assert len({array.shape[0] for array in result.shown.values()}) == 1
+
+
+def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, tmp_path: Path) -> None:
+    path = tmp_path / "result.msgpack"
+    evaluation.save(path, result)
+    again = evaluation.load(path)
+    assert again.metrics == result.metrics
+    for name, array in result.shown.items():
+        np.testing.assert_array_equal(again.shown[name], array)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(StoreError, match=r"result.msgpack: damaged \(its checksum is wrong\); delete it"):
+        evaluation.load(path)

@@ -1,0 +1,113 @@
+import json
+import pickle
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax.config import ConfigError
+from rsjax.ingest.annotators.depth import RecordedDepth
+from rsjax.ingest.annotators.motion import DISFlow
+from rsjax.ingest.annotators.networks.depth import DepthAnything, VideoDepthAnything
+from rsjax.ingest.annotators.networks.motion import RaftFlow
+from rsjax.ingest.annotators.networks.semantics import InternVL
+from rsjax.ingest.annotators.networks.shots import TransNetShots
+from rsjax.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
+from rsjax.ingest.annotators.protocols import ArrayFrames, in_chunks, parameters
+from rsjax.ingest.annotators.semantics import OwnSemantics
+from rsjax.ingest.annotators.shots import HistogramShots
+from rsjax.ingest.annotators.tracks import LucasKanade
+
+HERE = Path(__file__)
+ALL = [
+    LucasKanade(),
+    HistogramShots(),
+    DISFlow(),
+    RecordedDepth(),
+    OwnSemantics(),
+    SpatialTracker(HERE.parent, HERE),
+    BootsTapir(HERE.parent, HERE),
+    TransNetShots(),
+    RaftFlow(HERE),
+    VideoDepthAnything(HERE.parent, HERE),
+    DepthAnything(HERE.parent),
+    InternVL(HERE.parent),
+]
+
+
+@dataclass(frozen=True)
+class Weighted:
+    name: ClassVar[str] = "weighted"
+    version: ClassVar[int] = 1
+    weights: Path
+    strength: float = 1.0
+    device: str = "cpu"
+
+
+@pytest.mark.parametrize("annotator", ALL, ids=lambda annotator: annotator.name)
+def test_every_annotator_travels_and_has_parameters_that_json_holds(annotator):
+    assert pickle.loads(pickle.dumps(annotator)) == annotator
+    told = parameters(annotator)
+    assert json.loads(json.dumps(told)) == told
+    assert told["name"] == annotator.name and told["version"] == annotator.version
+
+
+def test_names_differ():
+    assert len({annotator.name for annotator in ALL}) == len(ALL)
+
+
+def test_weights_count_by_content_and_the_device_not_at_all(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    for folder in "ab":
+        (tmp_path / folder / "w.pt").write_bytes(b"weights")
+    one = Weighted(tmp_path / "a" / "w.pt")
+    assert parameters(one) == parameters(Weighted(tmp_path / "b" / "w.pt", device="cuda"))
+    assert parameters(one) != parameters(replace(one, strength=2.0))
+    before = parameters(one)
+    (tmp_path / "a" / "w.pt").write_bytes(b"other weights")
+    assert parameters(one) != before
+
+
+def test_a_folder_counts_by_all_its_files(tmp_path):
+    folder = Weighted(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    before = parameters(folder)
+    (tmp_path / "model.safetensors").write_bytes(b"x")
+    assert parameters(folder) != before
+
+
+@given(st.integers(0, 40), st.integers(2, 9), st.integers(0, 1))
+def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap):
+    pictures = np.arange(count, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 1, 1, 3), np.uint8)
+    chunks = [(start, part[:, 0, 0, 0].tolist()) for start, part in in_chunks(ArrayFrames(pictures), overlap, size)]
+    assert all(part == list(range(start, start + len(part))) and len(part) <= size for start, part in chunks)
+    held = [t for i, (_, part) in enumerate(chunks) for t in part[overlap if i else 0 :]]
+    assert held == list(range(count))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: LucasKanade(grid=0), "lucas-kanade: grid is 0"),
+        (lambda: LucasKanade(window=2), "at least 3"),
+        (lambda: LucasKanade(levels=-1), "levels is -1"),
+        (lambda: HistogramShots(shortest=0), "hsv-histogram: shortest is 0"),
+        (lambda: DISFlow(preset=3), "choose 0, 1 or 2"),
+        (lambda: OwnSemantics(smooth=0), "own: smooth is 0"),
+        (lambda: SpatialTracker(HERE, HERE, span=0), "spatial-tracker: span is 0"),
+        (lambda: BootsTapir(HERE, HERE, side=100), "multiple of 8"),
+        (lambda: TransNetShots(shortest=-1), "transnetv2: shortest is -1"),
+        (lambda: RaftFlow(HERE, batch=0), "raft: batch is 0"),
+        (lambda: VideoDepthAnything(HERE, HERE, input_size=0), "input_size is 0"),
+        (lambda: DepthAnything(HERE, batch=0), "depth-anything: batch is 0"),
+        (lambda: InternVL(HERE, tries=0), "internvl: tries is 0"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_named_at_once(wrong, message):
+    with pytest.raises(ConfigError, match=message):
+        wrong()

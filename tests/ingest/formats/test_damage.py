@@ -1,0 +1,130 @@
+"""Whatever happens to one file of a data set, each episode is read or told of in one line, and all are counted."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.errors import UserError
+from rsjax.ingest import video
+from rsjax.ingest.formats import open_source
+from tests.ingest.formats import test_agibot, test_bair, test_folder, test_lerobot, test_libero, test_sim
+from tests.ingest.formats.toy_demos import demo, write_demos
+from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
+
+
+def write_sim(root: Path) -> None:
+    root.rmdir()
+    test_sim.write(root, *(test_sim.clip(number) for number in range(3)))
+
+
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "lerobot v2": test_lerobot.write_v2,
+    "lerobot v3": test_lerobot.write_v3,
+    "agibot": test_agibot.write_agibot,
+    "folder": test_folder.write_episode,
+    "robomimic": lambda root: write_demos(root / "a.hdf5", {f"demo_{number}": demo() for number in range(3)}),
+    "libero": lambda root: write_demos(root / "a_demo.hdf5", {"demo_0": test_libero.libero_demo()}),
+    "rlds": lambda root: write_bridge(root, [bridge_episode(3), bridge_episode(4)]),
+    "bair": lambda root: test_bair.write(root, *[test_bair.episode_bytes()] * 2),
+    "sim": write_sim,
+}
+
+
+def read_everything(name: str, root: Path) -> tuple[int, list[str]]:
+    """How many episodes are listed, and what is told."""
+    listed, told = 0, []
+    try:
+        source = open_source(name.partition(" ")[0], root)
+        for ref in source.episodes():
+            listed += 1
+            try:
+                episode = source.read(ref)
+                for pictures in (*episode.cameras.values(), *episode.depth.values()):
+                    pictures.read([0, len(pictures) - 1])
+            except UserError as error:
+                told.append(str(error))
+    except UserError as error:
+        told.append(str(error))
+    return listed, told
+
+
+@pytest.fixture(scope="module", params=WRITERS)
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    root = tmp_path_factory.mktemp("whole") / "set"
+    root.mkdir()
+    WRITERS[request.param](root)
+    return request.param, root
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_damage_to_one_file(whole: tuple[str, Path], data: st.DataObject) -> None:
+    name, root = whole
+    count, told = read_everything(name, root)
+    assert not told
+    files = [path.relative_to(root) for path in sorted(root.rglob("*")) if path.is_file()]
+    path = root / data.draw(st.sampled_from(files))
+    payload = path.read_bytes()
+    share = data.draw(st.floats(0, 0.99))
+    place = int(share * len(payload))
+    made = {
+        "truncated": payload[:place],
+        "overwritten": payload[:place] + data.draw(st.binary(min_size=1, max_size=40)) + payload[place + 40 :],
+        "something else": data.draw(st.binary(max_size=100)),
+    }
+    try:
+        path.write_bytes(made[data.draw(st.sampled_from(sorted(made)))])
+        listed, told = read_everything(name, root)
+    finally:
+        path.write_bytes(payload)
+    assert all("\n" not in message for message in told)
+    assert listed == count or told
+
+
+@contextlib.contextmanager
+def forbidden(path: Path) -> Iterator[None]:
+    """Nobody may read it, not even root, who reads as somebody else."""
+    mode, user = path.stat().st_mode, os.geteuid()
+    path.chmod(0)
+    try:
+        if user == 0:
+            os.seteuid(65534)
+        yield
+    finally:
+        os.seteuid(user)
+        path.chmod(mode)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_may_not_be_read(name: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own folders are closed to others
+        root = Path(folder) / "set"
+        root.mkdir()
+        Path(folder).chmod(0o755)
+        WRITERS[name](root)
+        read_everything(name, root)  # libraries import parts of themselves at first use
+        for path in [root, *sorted(root.rglob("*"))]:
+            video.close_all()
+            with forbidden(path):
+                _, told = read_everything(name, root)
+            assert told or "depth" in path.parts, path
+            assert all("\n" not in message for message in told)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_folder_in_place_of_a_file(name: str, tmp_path: Path) -> None:
+    (root := tmp_path / "set").mkdir()
+    WRITERS[name](root)
+    for path in [path for path in root.rglob("*") if path.is_file() and path.suffix != ".json"]:
+        path.unlink()
+        path.mkdir()
+    _, told = read_everything(name, root)
+    assert told
+    assert all("\n" not in message for message in told)

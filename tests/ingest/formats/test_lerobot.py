@@ -1,0 +1,171 @@
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rsjax.ingest.episode import Episode
+from rsjax.ingest.formats import open_source
+from tests.ingest.formats.videos import numbers_of, picture, write_video
+
+LENGTHS = (6, 9, 5)
+FPS = 10
+KEY = "observation.images.top"
+TASKS = ("pick", "place")
+V2_PATHS = {
+    "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+}
+V3_PATHS = {
+    "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+}
+
+
+def write_info(root: Path, version: str, paths: dict[str, str], **more: Any) -> None:
+    features = {
+        "action": {"dtype": "float32", "shape": [2], "names": ["x", "grip"]},
+        "observation.state": {"dtype": "float32", "shape": [3], "names": None},
+        KEY: {"dtype": "video", "shape": [32, 32, 3], "names": ["height", "width", "channels"]},
+        "observation.images.top_depth": {"dtype": "video", "info": {"video.is_depth_map": True}},
+    }
+    info = {"codebase_version": version, "fps": FPS, "chunks_size": 2, "features": features}
+    info |= {"total_episodes": len(LENGTHS)} | paths | more
+    (root / "meta").mkdir(parents=True, exist_ok=True)
+    (root / "meta/info.json").write_text(json.dumps(info))
+
+
+def rows(episode: int, first: int) -> dict[str, Any]:
+    """Row t of an episode: action (t, episode), state t + 0.5, picture first + t. The last episode changes its task."""
+    count = LENGTHS[episode]
+    steps = np.arange(count, dtype=np.float32)
+    return {
+        "action": np.stack([steps, np.full(count, episode, np.float32)], 1).tolist(),
+        "observation.state": np.repeat(steps[:, None] + 0.5, 3, 1).tolist(),
+        "timestamp": pa.array(steps / FPS, pa.float32()),
+        "frame_index": list(range(count)),
+        "episode_index": [episode] * count,
+        "index": list(range(first, first + count)),
+        "task_index": [0] * count if episode < 2 else [0, 0, 1, 1, 1],
+    }
+
+
+def write_v2(root: Path, codec: str = "libx264") -> Path:
+    write_info(root, "v2.1", V2_PATHS)
+    (root / "meta/tasks.jsonl").write_text(
+        "".join(json.dumps({"task_index": i, "task": task}) + "\n" for i, task in enumerate(TASKS))
+    )
+    lines = []
+    for episode, first in enumerate((0, 6, 15)):
+        folder = f"chunk-{episode // 2:03d}"
+        table = root / "data" / folder / f"episode_{episode:06d}.parquet"
+        table.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(rows(episode, first)), table)
+        numbers = range(first, first + LENGTHS[episode])
+        write_video(root / "videos" / folder / KEY / f"episode_{episode:06d}.mp4", numbers, FPS, codec)
+        tasks = list(TASKS[: 1 if episode < 2 else 2])
+        lines.append(json.dumps({"episode_index": episode, "tasks": tasks, "length": LENGTHS[episode]}))
+    (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
+    return root
+
+
+def write_v3(root: Path, codec: str = "libx264") -> Path:
+    """Episodes 0 and 1 share a table and a video, episode 2 has its own."""
+    write_info(root, "v3.0", V3_PATHS)
+    tables = [pa.table(rows(episode, first)) for episode, first in enumerate((0, 6, 15))]
+    (root / "data/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.concat_tables(tables[:2]), root / "data/chunk-000/file-000.parquet")
+    pq.write_table(tables[2], root / "data/chunk-000/file-001.parquet")
+    for file, numbers in enumerate((range(15), range(15, 20))):
+        write_video(root / f"videos/{KEY}/chunk-000/file-{file:03d}.mp4", numbers, FPS, codec)
+    meta = {
+        "episode_index": [0, 1, 2],
+        "tasks": [["pick"], ["pick"], ["pick", "place"]],
+        "length": list(LENGTHS),
+        "dataset_from_index": [0, 6, 15],
+        "dataset_to_index": [6, 15, 20],
+        "data/chunk_index": [0, 0, 0],
+        "data/file_index": [0, 0, 1],
+        f"videos/{KEY}/chunk_index": [0, 0, 0],
+        f"videos/{KEY}/file_index": [0, 0, 1],
+        f"videos/{KEY}/from_timestamp": [0.0, 0.6, 0.0],
+        f"videos/{KEY}/to_timestamp": [0.6, 1.5, 0.5],
+        "stats/action/mean": [[0.0]] * 3,
+    }
+    (root / "meta/episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.table(meta), root / "meta/episodes/chunk-000/file-000.parquet")
+    tasks = pa.table({"task_index": [0, 1], "__index_level_0__": list(TASKS)})
+    pq.write_table(tasks, root / "meta/tasks.parquet")
+    return root
+
+
+WRITERS = {"v2.1": write_v2, "v3.0": write_v3}
+
+
+def read_all(root: Path, **options: Any) -> list[Episode]:
+    source = pickle.loads(pickle.dumps(open_source("lerobot", root, **options)))
+    return [source.read(pickle.loads(pickle.dumps(ref))) for ref in source.episodes()]
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_every_picture_action_and_state_is_where_it_belongs(tmp_path: Path, version: str) -> None:
+    for episode, (number, first) in zip(read_all(WRITERS[version](tmp_path)), enumerate((0, 6, 15)), strict=True):
+        count = LENGTHS[number]
+        assert episode.id == f"episode_{number:06d}"
+        assert list(episode.cameras) == ["top"]
+        assert numbers_of(episode.cameras["top"].read(range(count))) == list(range(first, first + count))
+        np.testing.assert_allclose(episode.timestamps, np.arange(count) / FPS, atol=1e-6)
+        # the action of row t - 1 led into frame t
+        np.testing.assert_array_equal(episode.actions[1:, 0], np.arange(count - 1))
+        np.testing.assert_array_equal(episode.actions[1:, 1], number)
+        assert not episode.actions[0].any()
+        assert episode.states is not None
+        np.testing.assert_array_equal(episode.states[:, 0], np.arange(count) + 0.5)
+        assert (episode.fps, episode.task) == (FPS, "pick" if number < 2 else "pick; place")
+        assert [(s.start, s.end, s.text) for s in episode.segments] == (
+            [] if number < 2 else [(0, 2, "pick"), (2, 5, "place")]
+        )
+        json.dumps(episode.meta)
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_av1(tmp_path: Path, version: str) -> None:
+    episode = read_all(WRITERS[version](tmp_path, "libsvtav1"))[1]
+    assert numbers_of(episode.cameras["top"].read([8, 0, 3])) == [14, 6, 9]
+
+
+def test_both_versions_give_the_same(tmp_path: Path) -> None:
+    for old, new in zip(read_all(write_v2(tmp_path / "2")), read_all(write_v3(tmp_path / "3")), strict=True):
+        np.testing.assert_array_equal(old.actions, new.actions)
+        assert (old.task, old.segments, old.meta) == (new.task, new.segments, new.meta)
+
+
+def test_fingerprints_follow_the_content_not_the_place(tmp_path: Path) -> None:
+    def prints(root: Path) -> list[str]:
+        return [ref.fingerprint for ref in open_source("lerobot", root).episodes()]
+
+    before = prints(write_v2(tmp_path / "a"))
+    assert len(set(before)) == 3
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert prints(tmp_path / "b") == before
+    write_video(tmp_path / "b/videos/chunk-000" / KEY / "episode_000001.mp4", range(9), FPS)
+    assert [old == new for old, new in zip(before, prints(tmp_path / "b"), strict=True)] == [True, False, True]
+
+
+def test_pictures_in_the_table(tmp_path: Path) -> None:
+    root = write_v2(tmp_path)
+    features = {"action": {"dtype": "float32"}, "observation.image": {"dtype": "image"}}
+    write_info(root, "v2.0", V2_PATHS, features=features)
+    for episode, first in enumerate((0, 6, 15)):
+        encoded = [
+            {"bytes": cv2.imencode(".png", picture(first + row))[1].tobytes(), "path": None}
+            for row in range(LENGTHS[episode])
+        ]
+        path = root / f"data/chunk-{episode // 2:03d}/episode_{episode:06d}.parquet"
+        pq.write_table(pa.table(rows(episode, first) | {"observation.image": encoded}), path)
+    assert numbers_of(read_all(root)[1].cameras["image"].read([8, 1])) == [14, 7]

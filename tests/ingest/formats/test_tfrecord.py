@@ -1,0 +1,108 @@
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.ingest.episode import EpisodeError
+from rsjax.ingest.formats.tfrecord import Example, crc32c, read_payload, spans
+from tests.ingest.formats.toy_tfrecord import example, write_records
+
+PAYLOADS = [b"first", b"", bytes(range(256)) * 5]
+
+
+def plain_crc32c(data: bytes) -> int:
+    """Bit by bit, as the polynomial has it."""
+    register = 0xFFFFFFFF
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = (register >> 1) ^ (0x82F63B78 if register & 1 else 0)
+    return register ^ 0xFFFFFFFF
+
+
+@pytest.mark.parametrize(
+    ("data", "crc"),
+    [(b"123456789", 0xE3069283), (bytes(32), 0x8A9136AA), (b"\xff" * 32, 0x62A8AB43), (b"a", 0xC1D04330), (b"", 0)],
+)
+def test_published_checksums(data: bytes, crc: int) -> None:
+    assert crc32c(data) == crc
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.binary(max_size=3), st.integers(0, 1500), st.integers(0, 255))
+def test_checksum_equals_the_bitwise_one(start: bytes, length: int, step: int) -> None:
+    data = start + bytes(step * i % 251 for i in range(length))
+    assert crc32c(data) == plain_crc32c(data)
+
+
+def test_records_come_back_by_their_spans(tmp_path: Path) -> None:
+    path = write_records(tmp_path / "a.tfrecord", PAYLOADS)
+    found = list(spans(path))
+    assert [span.damage for span in found] == [""] * 3
+    assert [read_payload(path, span.offset, span.length) for span in found] == PAYLOADS
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.data())
+def test_a_truncated_file_keeps_what_is_before_the_cut(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = write_records(tmp_path_factory.mktemp("cut") / "a.tfrecord", PAYLOADS)
+    whole, kept = path.read_bytes(), list(spans(path))
+    cut = data.draw(st.integers(1, len(whole) - 1))
+    path.write_bytes(whole[:cut])
+    complete = [span for span in kept if span.offset + 16 + span.length <= cut]
+    found = list(spans(path))
+    assert found[: len(complete)] == complete
+    at_an_end = cut in [span.offset for span in kept]
+    assert len(found) == len(complete) + (not at_an_end)
+    assert at_an_end or "truncated" in found[-1].damage
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.data())
+def test_no_changed_byte_goes_unnoticed(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    path = write_records(tmp_path_factory.mktemp("flip") / "a.tfrecord", PAYLOADS)
+    whole = bytearray(path.read_bytes())
+    whole[data.draw(st.integers(0, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(whole)
+    noticed = 0
+    for span in spans(path):
+        try:
+            noticed += bool(span.damage)
+            if not span.damage:
+                read_payload(path, span.offset, span.length)
+        except EpisodeError:
+            noticed += 1
+    assert noticed
+
+
+def test_an_example_has_its_features() -> None:
+    parsed = Example(example({"x": np.arange(6.0), "n": [1, 2], "text": [b"a", b"b"]}), "here")
+    np.testing.assert_array_equal(parsed.numbers("x", 3), [[0, 1], [2, 3], [4, 5]])
+    np.testing.assert_array_equal(parsed.numbers("n", 2), [[1], [2]])
+    assert parsed.blobs("text") == [b"a", b"b"]
+    assert parsed.plain("text") == ["a", "b"] and parsed.names() == ["n", "text", "x"]
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "said"), [("y", 3, "has no y"), ("x", 4, "6 values for 4"), ("text", 1, "bytes")]
+)
+def test_a_feature_that_does_not_fit_is_named(name: str, rows: int, said: str) -> None:
+    parsed = Example(example({"x": np.arange(6.0), "text": [b"a"]}), "here")
+    with pytest.raises(EpisodeError, match=f"^here: .*{said}"):
+        parsed.numbers(name, rows)
+
+
+def test_other_bytes_are_no_example() -> None:
+    with pytest.raises(EpisodeError, match=r"^here: no tf.train.Example"):
+        Example(b"\xff\xff\xff", "here")
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_an_example_or_one_clear_error(payload: bytes) -> None:
+    with contextlib.suppress(EpisodeError):
+        assert all(isinstance(name, str) for name in Example(payload, "here").names())

@@ -1,0 +1,322 @@
+import json
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import doctor as command
+from rsjax.config import ConfigError
+from rsjax.ingest.checks import KINDS, Thresholds, quaternions
+from rsjax.ingest.doctor import examine, open_any
+from rsjax.ingest.episode import Episode, EpisodeError, Segment, SourceError
+from rsjax.ingest.formats import open_source
+from rsjax.ingest.selection import select, write_selection
+from tests.ingest.formats.test_folder import write_episode
+from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
+from tests.ingest.toy_source import COUNT, Pictures, ToySource, episode, pictures, source
+
+Change = Callable[[Episode], dict[str, Any]]
+ODD = 6  # the number of the changed episode
+
+
+def changed(array: np.ndarray | None, place: Any, value: float) -> np.ndarray:
+    assert array is not None
+    copy = array.copy()
+    copy[place] = value
+    return copy
+
+
+def flipped(rows: np.ndarray | None) -> np.ndarray:
+    assert rows is not None
+    return np.concatenate([rows[:, :3], rows[:, 3:] * np.where(np.arange(COUNT) < 7, 1, -1)[:, None]], 1)
+
+
+CASES: list[tuple[str, str, Change]] = [
+    ("camera", "has no hand", lambda e: {"cameras": {"front": e.cameras["front"]}}),
+    ("camera", "front: frame 0 is of one colour", lambda e: {"cameras": {**e.cameras, "front": Pictures(_zeros())}}),
+    ("camera", "hand: 5 pictures are all the same", lambda e: {"cameras": {**e.cameras, "hand": Pictures(_still())}}),
+    (
+        "undecodable",
+        "front: a.mp4: frame 11",
+        lambda e: {"cameras": {**e.cameras, "front": Pictures(pictures(9), [11])}},
+    ),
+    ("length", "camera front: 9 rows, timestamps 12", lambda e: {"cameras": {**e.cameras, "front": _short()}}),
+    ("length", "states: 9 rows", lambda e: {"states": np.zeros((9, 7), np.float32)}),
+    (
+        "not-finite",
+        "actions: 1 values, the first in frame 4",
+        lambda e: {"actions": changed(e.actions, (4, 2), np.nan)},
+    ),
+    ("not-finite", "states: 7 values", lambda e: {"states": changed(e.states, 3, np.inf)}),
+    ("time", "does not increase at frame 4", lambda e: {"timestamps": changed(e.timestamps, 4, 0.1)}),
+    ("time", "1.2 s before frame 6", lambda e: {"timestamps": e.timestamps + np.where(np.arange(COUNT) > 5, 1, 0)}),
+    ("time", "frames are 0.2 s apart .median., fps is 30", lambda e: {"fps": 30.0}),
+    ("action", "all are zero", lambda e: {"actions": np.zeros_like(e.actions)}),
+    ("action", "dimension 2 reaches 300", lambda e: {"actions": changed(e.actions, (5, 2), 300)}),
+    ("action", "has 7 dimensions, most episodes have 8", lambda e: {"actions": e.actions[:, :7]}),
+    ("action", "should be a unit quaternion", lambda e: {"meta": {"actions": {"quaternions": [2]}}}),
+    ("state", "dimension 1 jumps by", lambda e: {"states": changed(e.states, (5, 1), 400)}),
+    ("quaternion-flip", "dimensions 3 to 6 at frame 7", lambda e: {"states": flipped(e.states)}),
+    ("depth", "frame 11 has values that are negative", lambda e: {"depth": {"front": Pictures(_depth(-1.0))}}),
+    ("depth", "frame 11 has no value above 0", lambda e: {"depth": {"front": Pictures(_depth(0.0))}}),
+    ("segment", "'grasp' goes from 10 to 13", lambda e: {"segments": (Segment(10, 13, "grasp"),)}),
+    ("no-task", "empty", lambda e: {"task": " "}),
+    ("duplicate", "are those of episode-2", lambda e: replace(episode(2), id=e.id).__dict__),
+    ("duplicate", "another episode has the same id", lambda e: {"id": "episode-2"}),
+]
+
+
+def _zeros() -> np.ndarray:
+    return np.zeros((COUNT, 4, 4, 3), np.uint8)
+
+
+def _still() -> np.ndarray:
+    return np.repeat(pictures(9)[:1], COUNT, 0)
+
+
+def _short() -> Pictures:
+    return Pictures(pictures(9)[:9])
+
+
+def _depth(last: float) -> np.ndarray:
+    return changed(np.ones((COUNT, 4, 4), np.float32), -1, last)
+
+
+def test_a_sound_data_set_has_no_findings() -> None:
+    report = examine(source(), Thresholds())
+    assert not report.findings and len(report.refs) == 6
+
+
+@pytest.mark.parametrize(("kind", "detail", "change"), CASES, ids=[detail[:30] for _, detail, _ in CASES])
+def test_what_is_wrong_is_found_where_it_is(kind: str, detail: str, change: Change) -> None:
+    odd = episode(ODD)
+    report = examine(source(replace(odd, **change(odd))), Thresholds())
+    found = [finding for finding in report.findings if finding.kind == kind]
+    assert any(re.search(detail, finding.detail) for finding in found)
+    assert {finding.episode for finding in report.findings} <= {f"episode-{ODD}", "episode-2"}
+    assert "episode-2" not in report.reasons() or detail.startswith("another")
+
+
+def test_every_kind_is_tried() -> None:
+    assert {kind for kind, _, _ in CASES} | {"unreadable"} == set(KINDS)
+
+
+@pytest.mark.parametrize("error", [EpisodeError("a.h5: truncated"), ZeroDivisionError("a surprise")])
+def test_an_episode_that_cannot_be_read_does_not_hide_the_others(error: Exception) -> None:
+    report = examine(source(error, replace(episode(7), task="")), Thresholds())
+    assert [(finding.episode, finding.kind) for finding in report.findings] == [
+        ("episode-6", "unreadable"),
+        ("episode-7", "no-task"),
+    ]
+    assert str(error) in report.findings[0].detail
+
+
+def test_all_pictures_are_decoded_when_asked() -> None:
+    odd = replace(episode(ODD), cameras={"front": Pictures(pictures(9), [5]), "hand": Pictures(pictures(8))})
+    assert not examine(source(odd), Thresholds(frames=2)).findings
+    assert examine(source(odd), Thresholds(frames=0)).counts() == {"undecodable": 1}
+
+
+def test_several_processes_find_the_same() -> None:
+    data_set = source(EpisodeError("a.h5: truncated"), replace(episode(7), task=""), episode(2), fine=4)
+    assert examine(data_set, Thresholds(), workers=2) == examine(data_set, Thresholds())
+
+
+@pytest.mark.parametrize("limits", [{"frames": -1}, {"gap": 0.5}, {"unusual": 1}])
+def test_impossible_limits_are_refused(limits: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"{next(iter(limits))} is "):
+        Thresholds(**limits)
+
+
+def test_ignored_kinds_are_not_told() -> None:
+    odd = replace(episode(ODD), task="")
+    assert not examine(source(odd), Thresholds(), ["no-task"]).findings
+    with pytest.raises(SourceError, match="no kind 'no-tsk' to ignore; did you mean 'no-task'"):
+        examine(source(odd), Thresholds(), ["no-tsk"])
+
+
+def test_a_data_set_without_episodes_is_told() -> None:
+    with pytest.raises(SourceError, match="toy: the data set has no episodes"):
+        examine(ToySource(()), Thresholds())
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 3), st.integers(0, 3))
+def test_quaternions_are_recognised_among_other_numbers(seed: int, before: int, after: int) -> None:
+    rng = np.random.default_rng(seed)
+    turns = rng.normal(size=(6, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    rows = np.concatenate([rng.uniform(1, 2, (6, before)), turns, rng.uniform(1, 2, (6, after))], axis=1)
+    assert quaternions(rows) == [before]
+
+
+def test_a_gripper_after_zeros_is_no_quaternion() -> None:
+    rows = np.zeros((6, 7))
+    rows[:, 6] = [-1, -1, 1, 1, -1, 1]
+    assert quaternions(rows) == []
+    odd = episode(ODD)
+    held = replace(odd, actions=changed(odd.actions, (slice(None), slice(4, 8)), 0.5), meta={"actions": {"held": [7]}})
+    held.actions[6:, 4:] *= -1
+    assert "quaternion-flip" not in examine(source(held), Thresholds()).counts()
+    assert "quaternion-flip" in examine(source(replace(held, meta={})), Thresholds()).counts()
+
+
+@pytest.mark.parametrize("kind", ["length", "time", "not-finite", "undecodable", "camera"])
+def test_what_a_reader_refuses_is_told_by_its_kind(kind: str) -> None:
+    report = examine(source(EpisodeError("a.h5:\n\nwrong", kind)), Thresholds())
+    assert [(finding.kind, finding.detail) for finding in report.findings] == [(kind, "a.h5: wrong")]
+
+
+def test_what_a_reader_mended_is_told_and_no_finding() -> None:
+    notes = {"empty": ["state/waist"], "scattered": {"end": 3}, "depth_left_out": "7 maps for 8 frames"}
+    report = examine(source(replace(episode(ODD), meta={"notes": notes})), Thresholds())
+    assert not report.findings
+    assert report.mended == (
+        ("episode-6", "empty: state/waist; scattered: end 3; depth left out: 7 maps for 8 frames"),
+    )
+
+
+def test_episodes_of_one_name_are_all_counted_and_left_out(tmp_path: Path) -> None:
+    report = examine(source(replace(episode(7), id="episode-2")), Thresholds())
+    assert report.counts() == {"duplicate": 2} and report.bad() == 2
+    assert write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons()) == (5, 2)
+
+
+def test_damaged_files_are_told_by_kind_and_left_out(tmp_path: Path) -> None:
+    data_set = tmp_path / "set"
+    for name in ("one", "cut", "nan", "other", "short", "still", "twin"):
+        write_episode(data_set, name)
+        (data_set / name / "actions.csv").write_text(
+            "timestamp,x\n" + "".join(f"{row / 10},{row + (name == 'other')}\n" for row in range(8))
+        )
+    payload = (data_set / "cut" / "front.mp4").read_bytes()
+    (data_set / "cut" / "front.mp4").write_bytes(payload[: len(payload) // 2])
+    (data_set / "nan" / "actions.csv").write_text("x\n" + "1\n" * 3 + "nan\n" + "1\n" * 4)
+    (data_set / "short" / "actions.csv").write_text("x\n" + "1\n" * 5)
+    (data_set / "still" / "actions.csv").write_text("timestamp,x\n" + "0,1\n" * 8)
+    (data_set / "dataset.json").write_text('{"task": "go"}')
+    read = open_source("folder", data_set)
+    report = examine(read, Thresholds())
+    assert {finding.episode: finding.kind for finding in report.findings} == {
+        "cut": "undecodable",
+        "nan": "not-finite",
+        "short": "length",
+        "still": "time",
+        "twin": "duplicate",
+    }
+    assert write_selection(tmp_path / "m.json", "set", report.refs, report.reasons()) == (2, 5)
+    chosen = select(read, tmp_path / "m.json")
+    good = [ref.id for ref in chosen.episodes() if "left_out" not in ref.location]
+    assert good == ["one", "other"] and len(list(chosen.episodes())) == len(report.refs) == 7
+
+
+def test_a_manifest_made_with_other_options_is_told(tmp_path: Path) -> None:
+    report = examine(source(), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons())
+    others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
+    with pytest.raises(SourceError, match=r"m.json: the data set was read with other options then"):
+        select(others, tmp_path / "m.json")
+
+
+def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: Path) -> None:
+    data_set = source(replace(episode(6), task=""), episode(7))
+    report = examine(data_set, Thresholds())
+    assert write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons()) == (7, 1)
+    chosen = select(data_set, tmp_path / "m.json")
+    refs = list(chosen.episodes())
+    assert [ref.id for ref in refs] == [f"episode-{number}" for number in range(8)]
+    assert [chosen.read(ref).id for ref in refs if ref.id != "episode-6"] == [r.id for r in refs if r.id != "episode-6"]
+    with pytest.raises(EpisodeError, match="episode-6: left out by the manifest: no-task: its task is empty"):
+        chosen.read(refs[6])
+    plain = {ref.id: ref.fingerprint for ref in data_set.episodes()}
+    assert [ref.id for ref in refs if ref.fingerprint != plain[ref.id]] == ["episode-6"]
+
+
+def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
+    bad = replace(episode(6), task="")
+    report = examine(source(bad), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons())
+    mended = select(source(replace(bad, task="lift", fingerprint="0" * 16)), tmp_path / "m.json")
+    assert [mended.read(ref).task for ref in mended.episodes()][6] == "lift"
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"format": 2}', '{"format": 1, "kept": 3, "left_out": []}'])
+def test_another_file_is_no_manifest(tmp_path: Path, content: str) -> None:
+    for text in (content, "[" * 100_000 + content):
+        (tmp_path / "m.json").write_text(text)
+        with pytest.raises(SourceError, match="m.json: not a manifest"):
+            select(source(), tmp_path / "m.json")
+
+
+def test_the_manifest_of_another_data_set_is_told(tmp_path: Path) -> None:
+    write_selection(tmp_path / "m.json", "toy", (("other", "0" * 16),), {})
+    with pytest.raises(SourceError, match="m.json: names no episode of this data set"):
+        select(source(), tmp_path / "m.json")
+
+
+@pytest.mark.parametrize(
+    ("what", "path", "said"),
+    [
+        ("rlsd", None, "rlsd: no store .*did you mean 'rlds'"),
+        ("rlds", None, "rlds is a format; say where"),
+        ("rlsd", Path("."), "unknown format 'rlsd'; did you mean 'rlds'"),
+    ],
+)
+def test_what_is_neither_store_nor_format_is_told(what: str, path: Path | None, said: str) -> None:
+    with pytest.raises(SourceError, match=said):
+        open_any(what, path)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["doctor", *map(str, words)])
+    try:
+        command.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_the_command_tells_by_its_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task=""), b"\xff"])
+    fix = tmp_path / "m.json"
+    assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split=train", "--fix", fix) == 1
+    told = capsys.readouterr().out
+    assert "train-00000-00001: no-task" in told and "train-00000-00002: unreadable" in told
+    assert "3 episodes: 1 without a finding, 2 with" in told
+    assert [entry["id"] for entry in json.loads(fix.read_text())["left_out"]] == [
+        "train-00000-00001",
+        "train-00000-00002",
+    ]
+    write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task="")])
+    assert run(monkeypatch, "rlds", tmp_path / "data", "--ignore", "no-task") == 0
+    write_bridge(tmp_path / "data", [bridge_episode(4, task="")])
+    assert run(monkeypatch, "rlds", tmp_path / "data") == 1
+    assert "all are 'no-task': if that is as it should be, --ignore no-task" in capsys.readouterr().out
+    assert run(monkeypatch, "rlds", tmp_path / "nowhere") == 2
+    assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split") == 2
+
+
+def test_a_fix_that_keeps_nothing_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode(4, task=""), bridge_episode(5, task="")])
+    line = ("rlds", tmp_path / "data", "--fix", tmp_path / "m.json")
+    assert run(monkeypatch, *line) == 1
+    (told,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith(str(tmp_path / "m.json"))]
+    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in told
+    assert run(monkeypatch, *line, "--ignore", "no-task") == 0
+    assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
+
+
+def test_a_list_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="m.json: not there"):
+        select(source(), tmp_path / "m.json")

@@ -1,0 +1,210 @@
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax.data.store import Store, StoreError, decode_clip, open_store
+from rsjax.ingest.annotators.protocols import AnnotationError
+from rsjax.ingest.clips import ClipConfig
+from rsjax.ingest.episode import Episode, EpisodeRef
+from rsjax.ingest.jobs.work_items import Unit
+from rsjax.ingest.packing import split_episodes
+from rsjax.ingest.report import lines
+from rsjax.ingest.stages import Annotators
+from rsjax.ingest.windows import WindowConfig
+from tests.ingest.ingesting import made, plan
+from tests.ingest.toy import ByDepth, Relative, Source, episode
+
+
+def episodes(store: Store, split: str) -> list[str]:
+    source = store.source(split)
+    return [source[i]["provenance"]["episode"] for i in range(len(source))]
+
+
+def test_every_episode_is_a_clip_a_reason_or_a_row(tmp_path: Path) -> None:
+    counts = made(plan(tmp_path, Source(8, broken=(1, 5), short=(2,), depth=True)))
+    assert counts is not None
+    assert (counts.found, counts.done) == (8, 5)
+    short = "shorter than a window (4 frames at 2 Hz take 16 of 10 fps; the longest has 5): "
+    assert counts.filtered == {"episode_002": f"{short}raise --windows.rate or lower --windows.frames"}
+    assert [row["episode"] for row in counts.quarantined] == ["episode_001", "episode_005"]
+    assert counts.windows == {"kept": 25}
+    store = open_store(tmp_path / "store")
+    assert sum(len(store.source(split)) for split in store.splits) == 25
+    assert store.manifest["quarantine"]["episode_001"].startswith("clips: video_1.mp4")
+    told = lines(counts)
+    assert told[0] == "episodes  8 found = 5 with clips + 1 without + 2 quarantined"
+    assert "quarantined episode_001 at clips: video_1.mp4: truncated; copy it again" in told
+    assert "EpisodeError" in counts.quarantined[0]["traceback"]
+
+
+def test_which_windows_are_left_out_is_kept(tmp_path: Path) -> None:
+    config = ClipConfig(WindowConfig(frames=4, rate=2, least_motion=1e6), image_size=8, tracks=6)
+    with pytest.raises(StoreError, match=r"first one for: windows left out: 5 still"):
+        made(plan(tmp_path, Source(2), Annotators(shots=None), config=config))
+    rows = [json.loads(row) for row in (tmp_path / "work" / "windows.jsonl").read_text().splitlines()]
+    assert rows == [{"episode": f"episode_{n:03d}", "left_out": {"still": [0, 5, 10, 15, 20]}} for n in range(2)]
+
+
+def test_a_store_has_units_and_labels_that_training_reads(tmp_path: Path) -> None:
+    made(plan(tmp_path, Source(6, depth=True)))
+    store = open_store(tmp_path / "store")
+    source = store.source("train")
+    clips = [decode_clip(source[i]) for i in range(len(source))]
+    rows = np.concatenate([clip.actions[1:] for clip in clips])
+    np.testing.assert_allclose(store.manifest["action_mean"], rows.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(store.manifest["action_std"], rows.std(0), rtol=1e-5)
+    low, high = store.manifest["depth_range"]
+    depths = [clip.depth for clip in clips if clip.depth is not None]
+    assert len(depths) == len(clips) and store.manifest["depth_unit"] == "metres"
+    assert low == min(depth.min() for depth in depths) and high == max(depth.max() for depth in depths)
+    assert all(clip.provenance["depth_range"] == [low, high] for clip in clips)
+    labels = store.labels("train").counts()
+    assert labels["difficulty"] == {"simple": len(clips)}
+    assert set(labels["segment"]) == {"reach", "grasp"} and set(labels["skill"]) == {"unknown", "Grasp"}
+    assert labels["skill"]["Grasp"] == sum(clip.provenance["skill"] == "Grasp" for clip in clips)
+
+
+def test_no_episode_is_in_both_splits(tmp_path: Path) -> None:
+    made(plan(tmp_path, Source(8)))
+    store = open_store(tmp_path / "store")
+    train, test = set(episodes(store, "train")), set(episodes(store, "test"))
+    assert len(train) == 6 and len(test) == 2 and not train & test
+    assert store.manifest["episodes"] == {"train": sorted(train), "test": sorted(test)}
+
+
+@given(st.sets(st.text(), max_size=30), st.floats(0, 0.99))
+def test_each_episode_is_in_one_split_and_both_have_some(names: set[str], share: float) -> None:
+    refs = [EpisodeRef(name, "", {}) for name in sorted(names)]
+    splits = split_episodes(refs, share)
+    assert sorted(ref.id for part in splits.values() for ref in part) == sorted(names)
+    if len(refs) >= 2 and share > 0:
+        assert all(splits.values())
+
+
+def test_the_same_again_does_nothing_and_more_episodes_reuse_annotations(tmp_path: Path) -> None:
+    methods = Annotators()
+    made(plan(tmp_path, Source(3), methods))
+    assert made(plan(tmp_path, Source(3), methods)) is None
+    work = plan(tmp_path, Source(4), methods)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/tracks/*/*")}
+    counts = made(work)
+    assert counts is not None and counts.done == 4 and len(before) == 6
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert not list((tmp_path / "work" / "units" / "clips").rglob("*.*"))
+
+
+@pytest.mark.parametrize("keep_clips", [False, True])
+def test_the_quarantined_are_tried_again_only_when_asked(tmp_path: Path, keep_clips: bool) -> None:
+    made(plan(tmp_path, Source(3, broken=(1,))), keep_clips=keep_clips)
+    work = plan(tmp_path, Source(3))
+    assert made(work) is None
+    more = made(plan(tmp_path, Source(4)), keep_clips=keep_clips)
+    assert more is not None and [row["episode"] for row in more.quarantined] == ["episode_001"]
+    counts = made(work, retry=True)
+    assert counts is not None and counts.done == 3 and not counts.quarantined
+    assert made(work, retry=True) is None
+
+
+def test_all_stages_leave_what_clips_read(tmp_path: Path) -> None:
+    work = plan(tmp_path, Source(2, depth=True), Annotators())
+    counts = made(work, keep_clips=True)
+    assert counts is not None and counts.done == 2
+    assert list(counts.stages) == ["shots", "motion", "tracks", "semantics", "clips"]
+    ref = next(work.job.source.episodes())
+    unit = Unit(ref, "clips")
+    clip = decode_clip(work.job.records(unit, work.job.mark(unit) or {})[0])
+    assert clip.visible[:, 0].all() and clip.tracks.shape == (6, 4, 2)
+    assert clip.provenance["segment"] == "reach" and "motion" in clip.provenance
+
+
+@pytest.mark.parametrize(("deep", "unit"), [(1, "relative"), (5, "metres"), (6, "metres"), (0, "relative")])
+def test_metres_and_relative_depth_are_not_mixed(tmp_path: Path, deep: int, unit: str) -> None:
+    network = Annotators(None, None, Relative(), None, None)
+    counts = made(plan(tmp_path, Source(6, deep=deep), network))
+    store = open_store(tmp_path / "store")
+    records = [store.source(split)[i] for split in store.splits for i in range(len(store.source(split)))]
+    assert counts is not None and counts.done == 6 and len(records) == 30
+    by_episode = {record["provenance"]["episode"] for record in records if record["depth"] is not None}
+    assert by_episode == {f"episode_{n:03d}" for n in range(6) if (n < deep) == (unit == "metres")}
+    for record in records:
+        assert record["provenance"]["depth_unit"] == (unit if record["depth"] is not None else "")
+        assert record["provenance"]["depth_range"] == store.manifest["depth_range"]
+    assert store.manifest["depth_unit"] == unit
+    assert store.manifest["depth_range"] == ([3.0, 3.0] if unit == "relative" else pytest.approx([1.0, 4.5]))
+    assert counts.depth_left_out == store.manifest["counts"]["depth_left_out"] == 5 * (6 - len(by_episode))
+    told = f"depth     left out of {counts.depth_left_out} clips"
+    assert any(line.startswith(told) for line in lines(counts)) == (deep in (1, 5))
+
+
+def test_where_only_the_test_split_has_depth_none_is_kept(tmp_path: Path) -> None:
+    source = Source(4)
+    held = split_episodes(list(source.episodes()), 0.25)["test"][0]
+    counts = made(plan(tmp_path, Source(4, only=held.location["number"])))
+    store = open_store(tmp_path / "store")
+    assert store.manifest["depth_range"] is None and store.manifest["depth_unit"] is None
+    assert counts is not None and counts.depth_left_out == 5 and store.source("test")[0]["depth"] is None
+
+
+def test_a_network_that_cannot_be_loaded_ends_the_job_and_quarantines_nothing(tmp_path: Path) -> None:
+    work = plan(tmp_path, Source(2), Annotators(None, None, Relative(there=False), None, None))
+    with pytest.raises(AnnotationError, match=r"relative.pt: no such file"):
+        made(work)
+    assert not list(tmp_path.rglob("units/**/*.json"))
+
+
+def test_a_network_that_tracks_sees_recorded_depth_or_else_that_of_the_stage(tmp_path: Path) -> None:
+    methods = Annotators(None, None, Relative(), ByDepth(), None)  # type: ignore[arg-type]
+    made(plan(tmp_path, Source(2, deep=1), methods, share=0.0))
+    source = open_store(tmp_path / "store").source("train")
+    for number in range(len(source)):
+        record = source[number]
+        frames = np.array(record["provenance"]["frames"])
+        deep = record["provenance"]["episode"] == "episode_000"
+        np.testing.assert_allclose(record["tracks"][0, :, 0], 0.1 + frames / 100 if deep else 0.3, atol=1e-3)
+
+
+@dataclass
+class Odd(Source):
+    """Its last episode has another action, and one is listed twice."""
+
+    def episodes(self) -> list[EpisodeRef]:  # type: ignore[override]
+        refs = list(super().episodes())
+        return [*refs, EpisodeRef(refs[0].id, "f" * 16, refs[0].location)]
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        if ref.location["number"] == self.count - 1:
+            return episode(ref.id, actions=np.zeros((40, 5), np.float32), fingerprint=ref.fingerprint)
+        return super().read(ref)
+
+
+def test_episodes_that_do_not_fit_the_others_are_rows(tmp_path: Path) -> None:
+    counts = made(plan(tmp_path, Odd(4)))
+    assert counts is not None and (counts.found, counts.done) == (5, 3)
+    errors = {row["episode"]: row["error"] for row in counts.quarantined}
+    assert errors["episode_003"] == "actions: 5 dimensions, those of most others have 2; ingest it alone"
+    assert "another episode is called episode_000" in errors["episode_000"]
+
+
+def test_a_manifest_tells_of_all_that_is_quarantined_under_one_name(tmp_path: Path) -> None:
+    made(plan(tmp_path, Odd(5, broken=(0,))))
+    manifest = open_store(tmp_path / "store").manifest
+    assert "video_0.mp4: truncated" in manifest["quarantine"]["episode_000"]
+    assert "another episode is called episode_000" in manifest["quarantine"]["episode_000"]
+    counts = manifest["counts"]
+    assert counts["found"] == counts["done"] + counts["without"] + counts["quarantined"] == 6
+    assert counts["quarantined"] == 3
+
+
+def test_the_first_episode_does_not_say_how_long_actions_are(tmp_path: Path) -> None:
+    class First(Source):
+        def read(self, ref: EpisodeRef) -> Episode:
+            width = 5 if ref.location["number"] == 0 else 2
+            return episode(ref.id, actions=np.zeros((40, width), np.float32), fingerprint=ref.fingerprint)
+
+    counts = made(plan(tmp_path, First(4)))
+    assert counts is not None and [row["episode"] for row in counts.quarantined] == ["episode_000"]

@@ -1,0 +1,59 @@
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import ModelConfig
+from rsjax.models.roboscape import attention, frame_attention
+from rsjax.models.roboscape.attention import attend
+from rsjax.models.roboscape.frame_attention import attend_in_frames
+from rsjax.models.roboscape.world_model import WorldModel
+
+
+def test_output_and_gradients_are_plain_attention_s_to_bf16_rounding() -> None:
+    keys = jax.random.split(jax.random.key(0), 4)
+    q, k, v, cotangent = (jax.random.normal(key, (3, 10, 2, 8)) for key in keys)  # N S h e
+    found, pull = jax.vjp(jax.jit(attend_in_frames), q, k, v)
+    plain, pull_plain = jax.vjp(lambda q, k, v: attend(q, k, v, None), q, k, v)
+    for x, y in zip((found, *pull(cotangent)), (plain, *pull_plain(cotangent)), strict=True):
+        assert x.dtype == jnp.float32 and x.shape == y.shape
+        np.testing.assert_allclose(x, y, atol=0.02 * float(jnp.max(jnp.abs(y))))
+
+
+def test_a_frame_attends_to_itself_alone() -> None:
+    x = jax.random.normal(jax.random.key(1), (2, 5, 2, 4))
+    together = attend_in_frames(x, x, x)
+    alone = attend_in_frames(x[1:], x[1:], x[1:])
+    np.testing.assert_array_equal(together[1:], alone)
+
+
+@pytest.mark.parametrize("frames_at_once", [1, 2])  # all of them in turn; two, and one is left over
+def test_taking_few_frames_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch, frames_at_once: int) -> None:
+    q, k, v, cotangent = (jax.random.normal(key, (3, 6, 2, 4)) for key in jax.random.split(jax.random.key(2), 4))
+    together = jax.vjp(attend_in_frames, q, k, v)[1](cotangent)
+    monkeypatch.setattr(frame_attention, "SCORES_AT_ONCE", frames_at_once * 2 * 6 * 6)
+    for x, y in zip(jax.vjp(attend_in_frames, q, k, v)[1](cotangent), together, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("remat", ["none", "blocks"])
+def test_a_model_of_large_frames_learns_as_with_plain_attention(
+    monkeypatch: pytest.MonkeyPatch, remat: Literal["none", "blocks"]
+) -> None:
+    cfg = ModelConfig(
+        frames=2, grid=3, code_bits=4, action_dim=3, width=16, blocks=2, heads=2, compute_dtype="bfloat16", remat=remat
+    )
+    tokens = {name: jax.random.randint(jax.random.key(3), (1, 2, 3, 3), 0, 16) for name in ("rgb", "depth")}
+    mask, actions = jnp.zeros((1, 2, 3, 3), bool), jnp.ones((1, 2, 3))
+    params = WorldModel(cfg).init_params(jax.random.key(4))
+
+    def loss(params: Any) -> jax.Array:
+        logits, _ = WorldModel(cfg).apply({"params": params}, tokens, mask, actions)  # type: ignore[misc]
+        return sum((jnp.mean(jnp.sin(x)) for x in logits.values()), start=jnp.float32(0))
+
+    plain = jax.grad(loss)(params)
+    monkeypatch.setattr(attention, "LARGE_FRAME", 1)
+    for x, y in zip(jax.tree.leaves(jax.grad(loss)(params)), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(x, y, atol=0.03 * float(jnp.max(jnp.abs(y))) + 1e-6)

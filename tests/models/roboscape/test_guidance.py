@@ -1,0 +1,93 @@
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import ConfigError, SampleConfig, presets
+from rsjax.models.roboscape.guidance import apply_guided, guided_cache
+from rsjax.models.roboscape.rollout import encode_prompt, rollout
+from rsjax.models.roboscape.world_model import WorldModel
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
+
+GUIDED = replace(DUAL, action_dropout=0.2)
+
+
+def flat(tokens: dict[str, Any]) -> dict[str, Any]:
+    return {name: grid.reshape(*grid.shape[:2], -1) for name, grid in tokens.items()}
+
+
+@pytest.mark.parametrize("guidance", [0.0, 3.0])
+def test_guided_logits_lie_on_the_line_through_those_without_and_with_actions(guidance: float) -> None:
+    """In two pieces through the cache, against two whole passes without."""
+    params, (tokens, actions) = random_params(GUIDED), given(GUIDED, 4, 4)
+    apply, mask = jax.jit(WorldModel(GUIDED).apply), np.zeros((BATCH, 4, 3, 3), bool)
+    with_, without = (
+        apply({"params": params}, tokens, mask, actions, drop_actions=jnp.full(BATCH, drop))[0]
+        for drop in (False, True)
+    )
+    sample = SampleConfig(guidance=guidance)
+    guided = jax.jit(partial(apply_guided, GUIDED, sample))
+    cache: Any = guided_cache(GUIDED, sample, BATCH, 6)
+    for start in (0, 2):
+        here = slice(start, start + 2)
+        piece = {name: grid[:, here] for name, grid in flat(tokens).items()}
+        hidden = mask[:, here].reshape(BATCH, 2, 9)
+        logits, cache = guided(params, piece, hidden, actions[:, here], start, cache)
+        for name, x in logits.items():
+            expected = without[name] + guidance * (with_[name] - without[name])
+            np.testing.assert_allclose(x, expected[:, here], rtol=1e-4, atol=1e-4)
+
+
+def test_where_the_null_action_is_the_action_guidance_changes_nothing() -> None:
+    params, (tokens, actions) = random_params(GUIDED), given(GUIDED, 1)
+    actions[:] = actions[0, 1]
+    encoder = params["action_encoder"]
+    params["null_action"] = actions[0, 1] @ encoder["kernel"] + encoder["bias"]
+    make = lambda guidance: rollout(GUIDED, SampleConfig(guidance=guidance), params, tokens, actions, KEY)  # noqa: E731
+    plain = make(1.0)
+    jax.tree.map(np.testing.assert_array_equal, make(4.0), plain)
+    params["null_action"] = params["null_action"] + 1
+    assert not np.array_equal(make(4.0)["rgb"], plain["rgb"])
+
+
+def test_without_guidance_by_the_actions_they_do_not_matter() -> None:
+    params, (tokens, actions) = random_params(GUIDED), given(GUIDED, 1)
+    make = lambda actions: rollout(GUIDED, SampleConfig(guidance=0.0), params, tokens, actions, KEY)  # noqa: E731
+    jax.tree.map(np.testing.assert_array_equal, make(actions), make(actions + 1))
+
+
+def test_guided_rollouts_are_the_same_without_the_cache() -> None:
+    sample, params, (tokens, actions) = SampleConfig(guidance=2.0), random_params(GUIDED), given(GUIDED, 2, 8)
+    cached, plain = (rollout(GUIDED, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
+    jax.tree.map(np.testing.assert_array_equal, cached, plain)
+
+
+def test_guidance_of_a_model_that_never_dropped_actions_is_refused() -> None:
+    tokens, actions = given(DUAL, 1)
+    with pytest.raises(ConfigError, match=r"sample.guidance is 2.0 .* model.action_dropout above 0"):
+        rollout(DUAL, SampleConfig(guidance=2.0), random_params(DUAL), tokens, actions, KEY)
+    debug = presets.debug()
+    with pytest.raises(ConfigError, match=r"sample.guidance is 2.0"):
+        replace(debug, sample=SampleConfig(guidance=2.0))
+    with pytest.raises(ConfigError, match=r"sample.window_stride is 6 of model.frames = 6"):
+        replace(debug, sample=SampleConfig(window_stride=6))
+
+
+def test_a_bfloat16_cache_is_half_as_large_and_nearly_as_good() -> None:
+    params, (tokens, actions) = random_params(DUAL), given(DUAL, 5, 5)
+    sizes, logits = [], []
+    for sample in (SampleConfig(), SampleConfig(cache_dtype="bfloat16")):
+        cache = encode_prompt(DUAL, sample, params, tokens, actions).cache
+        sizes.append(sum(x.nbytes for x in jax.tree.leaves(cache)))
+        last = {name: grid[:, -1:] for name, grid in flat(tokens).items()}
+        mask = jnp.zeros((BATCH, 1, 9), bool)
+        logits.append(apply_guided(DUAL, sample, params, last, mask, actions[:, -1:], 4, cache)[0]["rgb"])
+    assert sizes[0] == 2 * sizes[1]
+    spread = np.abs(logits[0]).max()
+    assert 0 < np.abs(logits[1] - logits[0]).max() < 0.02 * spread
+    whole = rollout(DUAL, SampleConfig(cache_dtype="bfloat16"), params, tokens, given(DUAL, 5, 8)[1], KEY)
+    assert whole["rgb"].shape[1] == 8

@@ -1,0 +1,117 @@
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import ModelConfig, SampleConfig
+from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.world_model import WorldModel
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
+
+
+@pytest.mark.parametrize(
+    ("model", "prompt", "sample"),
+    [
+        (DUAL, 1, SampleConfig(steps=2)),
+        (DUAL, 3, SampleConfig(steps=4, unmask="greedy")),
+        (DUAL, 3, SampleConfig(steps=1)),
+        (RGB, 1, SampleConfig(steps=3, unmask="greedy")),
+        (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
+    ],
+    ids=["dual-2-random", "dual-3-prompt-4-greedy", "dual-3-prompt-1", "rgb-3-greedy", "rgb-3-prompt-2-warm"],
+)
+def test_cached_is_uncached(model: ModelConfig, prompt: int, sample: SampleConfig) -> None:
+    params, (tokens, actions) = random_params(model), given(model, prompt)
+    cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
+    assert cached.keys() == tokens.keys()
+    for name, grid in cached.items():
+        np.testing.assert_array_equal(grid, plain[name], err_msg=name)
+        np.testing.assert_array_equal(grid[:, :prompt], tokens[name])
+        assert grid.shape == (BATCH, 6, 3, 3)
+        assert np.ptp(grid[:, prompt:]) > 0
+
+
+def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
+    """One decoding step from the definition: mask frame t, keep the frames before, take the argmax."""
+    model, params, (tokens, actions) = DUAL, random_params(DUAL), given(DUAL, 1)
+    out = rollout(model, SampleConfig(steps=1), params, tokens, actions, KEY)
+    apply = jax.jit(WorldModel(model).apply)
+    for t in range(1, 6):
+        mask = np.zeros((BATCH, 6, 3, 3), bool)  # a new one: jax may still be reading the one before
+        mask[:, t:] = True
+        logits, _ = apply({"params": params}, out, mask, actions)
+        for name in out:
+            codes = np.asarray(logits[name][:, t]).argmax(-1)
+            np.testing.assert_array_equal(out[name][:, t].reshape(BATCH, -1), codes[..., 0] + 8 * codes[..., 1])
+
+
+def test_the_key_decides_the_draws_and_actions_the_video() -> None:
+    model, sample, params, (tokens, actions) = (
+        RGB,
+        SampleConfig(steps=2, temperature=1.0),
+        random_params(RGB),
+        given(RGB, 3),
+    )
+    make = lambda actions, key: np.asarray(rollout(model, sample, params, tokens, actions, key)["rgb"])  # noqa: E731
+    first = make(actions, KEY)
+    np.testing.assert_array_equal(first, make(actions, KEY))
+    assert not np.array_equal(first, make(actions, jax.random.key(6)))
+
+    later = actions.copy()
+    later[:, 5:] += 3
+    np.testing.assert_array_equal(first[:, :5], make(later, KEY)[:, :5])
+    assert not np.array_equal(first, make(later, KEY))
+
+
+@pytest.mark.parametrize(("prompt", "frames"), [(3, 3), (4, 3)])
+def test_a_rollout_without_a_frame_to_make_is_refused(prompt: int, frames: int) -> None:
+    tokens, actions = given(RGB, prompt, frames)
+    with pytest.raises(ValueError, match=f"{frames} frames asked for with {prompt} given"):
+        rollout(RGB, SampleConfig(), random_params(RGB), tokens, actions, KEY)
+    with pytest.raises(ValueError, match="2 prompts and 3 action sequences; encode_prompt"):
+        rollout(RGB, SampleConfig(), random_params(RGB), tokens, np.zeros((3, 6, 3)), KEY)
+
+
+def test_a_clips_draws_follow_its_number_and_not_its_place() -> None:
+    sample, params, (tokens, actions) = SampleConfig(steps=2, temperature=1.0), random_params(RGB), given(RGB, 1)
+    both = rollout(RGB, sample, params, tokens, actions, KEY, index=np.array([4, 7]))["rgb"]
+    turned = rollout(RGB, sample, params, {"rgb": tokens["rgb"][::-1]}, actions[::-1], KEY, index=np.array([7, 4]))
+    np.testing.assert_array_equal(both[::-1], turned["rgb"])
+    alone = rollout(RGB, sample, params, {"rgb": tokens["rgb"][1:]}, actions[1:], KEY, index=np.array([7]))["rgb"]
+    np.testing.assert_array_equal(both[1:], alone)
+    other = rollout(RGB, sample, params, tokens, actions, KEY, index=np.array([4, 8]))["rgb"]
+    np.testing.assert_array_equal(both[0], other[0])
+    assert not np.array_equal(both[1], other[1])
+
+
+def test_all_lengths_within_the_window_are_one_program() -> None:
+    model, params = replace(RGB, width=20), random_params(replace(RGB, width=20))  # a model of this test alone
+    tokens, actions = given(model, 1, 6)
+    compiled: Any = module._rollout
+    before = compiled._cache_size()
+    whole = rollout(model, SampleConfig(), params, tokens, actions, KEY)["rgb"]
+    for frames in (2, 4, 5):
+        short = rollout(model, SampleConfig(seed=frames), params, tokens, actions[:, :frames], KEY)["rgb"]
+        np.testing.assert_array_equal(short, whole[:, :frames])
+    assert compiled._cache_size() == before + 1
+
+
+# Frame passes of one rollout: a pass over f frames counts f.
+PUBLISHED = [(1, 16, 30), (2, 16, 45), (8, 16, 135), (2, 48, 141)]
+
+
+@pytest.mark.parametrize(("steps", "frames", "cached_passes"), PUBLISHED)
+def test_a_rollout_costs_the_frame_passes_that_it_should(
+    steps: int, frames: int, cached_passes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, seen = replace(RGB, frames=frames, grid=1), count_model(monkeypatch)
+    tokens, costs = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}, []
+    with jax.disable_jit():
+        for cached in (True, False):
+            seen.clear()
+            rollout(model, SampleConfig(steps=steps), {}, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
+            costs.append(seen["frames"])
+    assert costs == [cached_passes, steps * (frames - 1) * frames]

@@ -1,0 +1,132 @@
+"""Rollouts longer than the window."""
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given as drawn
+from hypothesis import strategies as st
+
+from rsjax.config import ModelConfig, SampleConfig
+from rsjax.data.normalization import Units
+from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.window import room, window_actions, window_start
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
+
+Positions = Literal["learned", "rotary"]
+ROTARY = replace(RGB, positions="rotary")
+SUMS = replace(RGB, action_dim=4, integrate_actions=True)
+
+
+@drawn(window=st.integers(2, 20), by=st.integers(0, 19), frames=st.integers(2, 90))
+def test_a_full_window_jumps_by_its_stride_and_all_windows_find_room(window: int, by: int, frames: int) -> None:
+    model, sample = ModelConfig(frames=window), SampleConfig(window_stride=by % window)
+    base, by = 0, by % window or window // 2
+    for t in range(frames):
+        if t - base == window:
+            base += by
+        assert window_start(model, sample, t) == base
+        assert base + window <= room(model, sample, frames)
+    assert frames <= room(model, sample, frames)
+
+
+@pytest.mark.parametrize("integrate", [False, True])
+@pytest.mark.parametrize("base", [0, 2])
+def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, integrate: bool) -> None:
+    model = SUMS if integrate else RGB
+    raw = np.random.default_rng(0).normal(size=(BATCH, 7, 2)).astype(np.float32)
+    units = Units((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
+    seen = window_actions(model, units.action_inputs(raw, integrate), base, base, 4)
+    expected = units.action_inputs(raw[:, base : base + 4].copy(), integrate)
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+    later = window_actions(model, units.action_inputs(raw, integrate), base, base + 2, 2)
+    np.testing.assert_allclose(later, expected[:, 2:], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "prompt", "stride"),
+    [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0)],
+    ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt"],
+)
+def test_cached_is_uncached_beyond_the_window(model: ModelConfig, prompt: int, stride: int) -> None:
+    sample = SampleConfig(steps=2, temperature=1.0, window_stride=stride)
+    params, (tokens, actions) = random_params(model), given(model, prompt, 16)
+    cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
+    for name, grid in cached.items():
+        assert grid.shape == (BATCH, 16, 3, 3)
+        np.testing.assert_array_equal(grid, plain[name], err_msg=name)
+        np.testing.assert_array_equal(grid[:, :prompt], tokens[name])
+
+
+def test_each_frame_is_that_of_a_short_rollout_from_its_window() -> None:
+    sample, params = SampleConfig(steps=2, unmask="greedy", window_stride=2), random_params(SUMS)
+    tokens, actions = given(SUMS, 1, 12)
+    out = rollout(SUMS, sample, params, tokens, actions, KEY)["rgb"]
+    for t in (5, 6, 7, 8, 11):
+        base = int(window_start(SUMS, sample, t))
+        seen = window_actions(SUMS, actions, base, base, t + 1 - base)
+        short = rollout(SUMS, sample, params, {"rgb": out[:, base:t]}, seen, KEY)["rgb"]
+        np.testing.assert_array_equal(out[:, t], short[:, -1])
+
+
+def test_a_rolling_window_forgets_what_has_left_it() -> None:
+    """In a model of one block, which has no memory but its window."""
+    model = replace(ROTARY, blocks=1)
+    params, (tokens, actions) = random_params(model), given(model, 9, 10)
+    make = lambda prompt: np.asarray(rollout(model, SampleConfig(steps=1), params, prompt, actions, KEY)["rgb"][:, 9])  # noqa: E731
+    before, gone, seen = make(tokens), tokens["rgb"].copy(), tokens["rgb"].copy()
+    gone[:, :4] ^= 9
+    np.testing.assert_array_equal(make({"rgb": gone}), before)
+    seen[:, 4:] ^= 9
+    assert not np.array_equal(make({"rgb": seen}), before)
+
+
+@pytest.mark.parametrize("positions", ["learned", "rotary"])
+def test_forty_eight_frames(positions: Positions) -> None:
+    model = replace(DUAL, frames=16, grid=2, blocks=1, positions=positions)
+    params, (tokens, actions) = random_params(model), given(model, 1, 48)
+    out, plain = (rollout(model, SampleConfig(), params, tokens, actions, KEY, cached=c) for c in (True, False))
+    for name, grid in out.items():
+        np.testing.assert_array_equal(grid, plain[name])
+        assert np.ptp(np.asarray(grid).reshape(BATCH, 48, -1), axis=1).all()
+
+
+@pytest.mark.parametrize(("positions", "beyond"), [("learned", 3), ("rotary", 2)])
+def test_a_longer_rollout_is_no_larger_a_program(
+    positions: Positions, beyond: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model stands in it twice, for two frames and for one, and where a window jumps once more."""
+    model, seen = replace(DUAL, frames=16, positions=positions), count_model(monkeypatch)
+    calls, sizes = {}, {}
+    for frames in (16, 48, 96):
+        seen.clear()
+        tokens, actions = given(model, 1, frames)
+        program = jax.make_jaxpr(lambda t, a: rollout(model, SampleConfig(), {}, t, a, KEY))(tokens, actions)
+        calls[frames], sizes[frames] = seen["calls"], str(program).count("\n")
+    assert calls == {16: 2, 48: beyond, 96: beyond}
+    assert sizes[48] == sizes[96]
+
+
+def test_lengths_up_to_one_multiple_of_the_window_are_one_program_and_the_next_is_another() -> None:
+    model = replace(RGB, frames=16, grid=1, blocks=1, width=12)  # a model of this test alone
+    params, (tokens, actions) = random_params(model), given(model, 1, 49)
+    compiled: Any = module._rollout
+    before, programs = compiled._cache_size(), {}
+    for frames in (*range(33, 49), 49):
+        rollout(model, SampleConfig(steps=1), params, tokens, actions[:, :frames], KEY)
+        programs[frames] = compiled._cache_size() - before
+    assert programs == dict.fromkeys(range(33, 49), 1) | {49: 2}
+
+
+@pytest.mark.parametrize(("positions", "passes"), [("learned", 141 + 4 * 7), ("rotary", 141)])
+def test_a_jump_costs_the_frames_that_are_encoded_anew(
+    positions: Positions, passes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, seen = replace(RGB, frames=16, grid=1, positions=positions), count_model(monkeypatch)
+    with jax.disable_jit():
+        tokens = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}
+        rollout(model, SampleConfig(), {}, tokens, np.zeros((1, 48, 3), np.float32), KEY)
+    assert seen["frames"] == passes

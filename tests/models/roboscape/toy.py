@@ -1,0 +1,145 @@
+"""A world model small enough to be computed once more in plain numpy, with random parameters and inputs."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import ModelConfig
+from rsjax.models.roboscape.world_model import WorldModel, branches
+
+DUAL = ModelConfig(frames=5, grid=2, code_bits=4, action_dim=3, width=8, blocks=2, heads=2)
+RGB = replace(DUAL, depth=False)
+NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
+QK_NORM = replace(DUAL, qk_norm=True, mup=True)
+GENIE = replace(RGB, action_dim=0)
+GUIDED = replace(DUAL, action_dropout=0.5)
+BATCH = 2
+
+
+def forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
+    logits, cache = apply(config, params, *inputs)
+    assert cache is None
+    return jax.tree.map(np.asarray, logits)
+
+
+def apply_plain(
+    config: ModelConfig,
+    params: Any,
+    tokens: Any,
+    mask: Any,
+    actions: Any,
+    start: Any = 0,
+    cache: Any = None,
+    drop_actions: Any = None,
+    no_depth: Any = None,
+) -> Any:
+    return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache, drop_actions, no_depth)
+
+
+apply = jax.jit(apply_plain, static_argnums=0)
+
+
+def random_params(config: ModelConfig) -> Any:
+    """Parameters without a zero among them, so that nothing hides behind an initial value."""
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
+
+
+def random_inputs(config: ModelConfig, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    shape = (BATCH, config.frames, config.grid, config.grid)
+    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in branches(config)}
+    return (
+        tokens,
+        rng.random(shape) < 0.4,
+        rng.normal(size=(BATCH, config.frames, config.action_dim)).astype(np.float32),
+    )
+
+
+def blind(params: Any) -> Any:
+    """Parameters to whose depth branch every token looks as a masked one does."""
+    tables = jax.tree.map(np.zeros_like, params["depth_embed"])
+    hidden = params["depth_embed"]["mask_token_embed"]
+    tables["factored_embed_0"]["embedding"] += hidden
+    return params | {"depth_embed": tables | {"mask_token_embed": hidden}}
+
+
+# The model once more, cell by cell, from the paper's §2.3 and the public Genie's layout.
+
+
+def softmax(x: np.ndarray) -> np.ndarray:
+    e = np.exp(x - x.max(-1, keepdims=True))
+    return e / e.sum(-1, keepdims=True)
+
+
+def gelu(x: np.ndarray) -> np.ndarray:
+    return x * 0.5 * (1 + np.vectorize(math.erf)(x / math.sqrt(2)))
+
+
+def layer_norm(x: np.ndarray, p: dict) -> np.ndarray:
+    centred = x - x.mean(-1, keepdims=True)
+    return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * p["scale"] + p["bias"]
+
+
+def sequence_attention(x: np.ndarray, p: dict, config: ModelConfig, causal: bool) -> np.ndarray:
+    """Attention over one sequence (L, C)."""
+    length, width = x.shape
+    heads = config.heads
+    qkv = (x @ p["qkv"]["kernel"]).reshape(length, 3, heads, width // heads)
+    if config.qk_norm:
+        qkv[:, :2] = layer_norm(qkv[:, :2], p["norm"])
+    scale = 8 / (width // heads) if config.mup else 1 / math.sqrt(width // heads)
+    out = np.zeros((length, heads, width // heads))
+    for head in range(heads):
+        for i in range(length):
+            last = i + 1 if causal else length
+            scores = qkv[:last, 1, head] @ qkv[i, 0, head] * scale
+            out[i, head] = softmax(scores) @ qkv[:last, 2, head]
+    return out.reshape(length, width) @ p["proj"]["kernel"] + p["proj"]["bias"]
+
+
+def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
+    x = x.copy()
+    b, t, s, _ = x.shape
+    normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
+    x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
+    before = layer_norm(x, p["norm_temporal"]) if config.temporal_norm else x.copy()
+    for i in range(b):
+        for cell in range(s):
+            x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
+    normed = x if config.qk_norm else layer_norm(x, p["norm2"])
+    hidden = gelu(normed @ p["fc1"]["kernel"] + p["fc1"]["bias"])
+    return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
+
+
+def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
+    tokens, mask, actions = inputs
+    p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
+    b, t = mask.shape[:2]
+    h = {}
+    for name, grid in tokens.items():
+        embed = p[f"{name}_embed"]
+        flat = grid.reshape(b, t, -1)
+        x = sum(
+            embed[f"factored_embed_{k}"]["embedding"][(flat // config.vocabulary_size**k) % config.vocabulary_size]
+            for k in range(config.vocabularies)
+        )
+        x[mask.reshape(b, t, -1)] = embed["mask_token_embed"]
+        h[name] = x + p["pos_embed"][:t]
+        if config.action_dim:
+            h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
+    for block in range(config.blocks):
+        own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
+        h = {name: st_block(x, own[name], config) for name, x in h.items()}
+        if config.depth:
+            h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
+    if config.final_norm:
+        h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
+    if config.mup:
+        h = {name: x * 256 / config.width for name, x in h.items()}
+    logits = {name: x @ p[f"{name}_head"]["kernel"] + p[f"{name}_head"]["bias"] for name, x in h.items()}
+    return {name: x.reshape(*x.shape[:3], config.vocabularies, config.vocabulary_size) for name, x in logits.items()}

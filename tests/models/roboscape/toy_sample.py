@@ -1,0 +1,47 @@
+"""A model small enough to roll out in no time, with parameters that make its actions and its memory count."""
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import ModelConfig
+from rsjax.models.roboscape import decode, guidance
+from rsjax.models.roboscape.world_model import WorldModel, branches
+
+DUAL = ModelConfig(frames=6, grid=3, code_bits=6, action_dim=3, width=16, blocks=2, heads=2)
+RGB = replace(DUAL, depth=False)
+BATCH, KEY = 2, jax.random.key(5)
+
+
+def random_params(model: ModelConfig) -> Any:
+    rng = np.random.default_rng(0)
+    shapes = jax.eval_shape(WorldModel(model).init_params, KEY)
+    return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
+
+
+def given(model: ModelConfig, prompt: int, frames: int = 6, batch: int = BATCH) -> tuple[dict[str, Any], np.ndarray]:
+    """Prompt tokens and actions."""
+    rng = np.random.default_rng(1)
+    shape = (batch, prompt, model.grid, model.grid)
+    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in branches(model)}
+    actions = rng.normal(size=(batch, frames, model.action_dim)).astype(np.float32)
+    actions[:, 0] = 0.0
+    return tokens, actions
+
+
+def count_model(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Takes model and decoding out; counts the calls, and the frames of all clips, that would go to the model."""
+    seen: Counter[str] = Counter()
+
+    def apply(_: Any, __: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any, *___: Any) -> Any:
+        seen.update(calls=1, frames=mask.shape[0] * mask.shape[1])
+        return {name: jnp.zeros((*mask.shape, 2, 8)) for name in tokens}, cache
+
+    monkeypatch.setattr(guidance, "_apply", apply)
+    monkeypatch.setattr(decode, "unmask_step", lambda config, code_bits, keys, step, frame, *_: frame)
+    return seen

@@ -1,0 +1,107 @@
+"""One of several processes that train together: ``python -m tests.training.hosts FOLDER [HOST:PORT PROCESSES ID]``.
+
+Without an address it trains alone, on one device. Each way takes a few steps on the real loader's batches and saves a
+checkpoint in FOLDER/WAY: pmap of a small network (quickly compiled), fsdp of the world model. Prints, as JSON, the
+losses of each way's steps with a batch's places, and what the processes tell each other; the lead writes each way's
+last parameters to FOLDER/WAY-PROCESSES.npz.
+"""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import LoopConfig
+from rsjax.data.loader import Arrays, batches
+from rsjax.errors import UserError
+from rsjax.pipeline.transforms import token_batch
+from rsjax.training import distributed
+from rsjax.training.checkpoint import Checkpoints
+from rsjax.training.objectives import Objective
+from rsjax.training.placement import Placement
+from tests.training.devices import LOOP, MODEL, STEPS, WITH_DEPTH, Small
+
+WAYS: dict[str, dict[str, Any]] = {"pmap": {"placement": "pmap"}, "fsdp": {"placement": "mesh", "fsdp": 2}}
+OBJECTIVES: dict[str, Objective] = {"pmap": Small(), "fsdp": WITH_DEPTH}
+
+
+def records(count: int = 11) -> list[Arrays]:
+    """Clips that are as uneven as they are many: of every third one nothing counts, keypoints are hidden at random."""
+    rng, shape = np.random.default_rng(0), (MODEL.frames, MODEL.grid, MODEL.grid)
+    return [
+        {
+            "rgb": rng.integers(0, 2**MODEL.code_bits, shape, np.int32),
+            "depth": rng.integers(0, 2**MODEL.code_bits, shape, np.int32),
+            "actions": rng.normal(size=(MODEL.frames, MODEL.action_dim)).astype(np.float32),
+            "tracks": rng.random((7, MODEL.frames, 2)).astype(np.float32),
+            "visible": rng.random((7, MODEL.frames)) < rng.random(),
+            "weight": np.asarray(number % 3 > 0, np.float32),
+            "has_depth": np.asarray(number % 4 > 0, np.float32),
+        }
+        for number in range(count)
+    ]
+
+
+def as_is(record: Arrays, rng: np.random.Generator) -> Arrays:
+    return record
+
+
+def train(objective: Objective, loop: LoopConfig, folder: Path) -> dict[str, Any]:
+    placement = Placement.create(loop)
+    state, step = placement.init(objective, loop), placement.compile(objective, loop)
+    losses = []
+    with batches(records(), as_is, loop.batch_size, seed=3) as loader:
+        for _ in range(STEPS):
+            batch = token_batch(next(loader))
+            state, metrics = step(state, placement.put_batch(batch))
+            losses.append(placement.scalars(metrics)["loss"])
+        checkpoints = Checkpoints(folder)
+        checkpoints.save(STEPS, placement.portable(state), loader.state())
+        checkpoints.close()
+    # What a resumed run does: it has to fit the step that was compiled.
+    checkpoints = Checkpoints(folder)
+    restored, _ = checkpoints.restore(placement.template(objective, loop))
+    checkpoints.close()
+    whole = placement.gather(state)
+    assert all(map(np.array_equal, *map(jax.tree.leaves, (whole, placement.gather(placement.adopt(restored))))))
+    if distributed.is_lead():
+        np.savez(f"{folder}-{jax.process_count()}.npz", *jax.tree.leaves(whole.params))
+    return {"losses": losses, "index": np.asarray(batch.index).tolist()}
+
+
+def failing() -> None:
+    if distributed.is_lead():
+        raise UserError("no room")
+
+
+def told() -> dict[str, Any]:
+    """What processes say to each other."""
+    me = jax.process_index()
+    try:
+        distributed.on_lead("a stage", failing)
+        failed = ""
+    except UserError as error:
+        failed = str(error)
+    distributed.barrier("end")
+    return {
+        "agree": distributed.agree({"from": me, "text": "λ" * 300}),
+        "anywhere": [distributed.anywhere(me == 1), distributed.anywhere(False)],
+        "failed": failed,
+        "devices": [jax.local_device_count(), jax.device_count()],
+    }
+
+
+def main(folder: Path, *address: str) -> dict[str, Any]:
+    if address:
+        distributed.initialize(address[0], int(address[1]), int(address[2]))
+    fields: dict[str, dict[str, Any]] = WAYS if address else {way: {"placement": "jit"} for way in WAYS}
+    trained = {way: train(OBJECTIVES[way], replace(LOOP, **fields[way]), folder / way) for way in WAYS}
+    return {"trained": trained, "told": told()}
+
+
+if __name__ == "__main__":
+    print(json.dumps(main(Path(sys.argv[1]), *sys.argv[2:])))

@@ -1,0 +1,108 @@
+import gc
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import LoopConfig
+from rsjax.data.store import StoreError
+from rsjax.training import checkpoint as module
+from rsjax.training.checkpoint import CheckpointError, Checkpoints, load_weights, save_weights
+from rsjax.training.state import create_state
+from tests.training.toy import Regression, train
+
+LOOP = LoopConfig(steps=2, batch_size=2, log_every=1, checkpoint_every=1, placement="jit")
+
+# Orbax leaves other reads under way when one fails; their errors come up when they are collected.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(autouse=True)
+def collected() -> Iterator[None]:
+    yield
+    gc.collect()
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    train(LOOP, tmp_path)
+    return tmp_path
+
+
+def truncate_largest(directory: Path) -> None:
+    largest = max((p for p in directory.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+
+
+def test_all_of_a_state_comes_back(tmp_path: Path) -> None:
+    state = create_state(Regression(), replace(LOOP, ema=0.5)).replace(step=jax.numpy.int32(7))  # type: ignore[attr-defined]
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest() is None
+    checkpoints.save(7, state, {"next": [1, 2]})
+    checkpoints.close()
+    again = Checkpoints(tmp_path)
+    restored, data = again.restore(create_state(Regression(), replace(LOOP, ema=0.5, seed=1)))
+    again.close()
+    jax.tree.map(np.testing.assert_array_equal, restored, state)
+    assert data == {"next": [1, 2]}
+
+
+@pytest.mark.parametrize("change", [{"objective": Regression(2)}, {"ema": 0.9}], ids=["shape", "structure"])
+def test_a_checkpoint_of_another_architecture_is_named(trained: Path, change: dict[str, Any]) -> None:
+    objective = change.pop("objective", Regression())
+    with pytest.raises(CheckpointError, match=rf"{trained}/checkpoints/2: does not fit.*run directory") as raised:
+        train(replace(LOOP, **change), trained, objective=objective)
+    assert "\n" not in str(raised.value)
+
+
+def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = train(LOOP, trained)
+    truncate_largest(trained / "checkpoints" / "2" / "state")
+    jax.tree.map(np.testing.assert_array_equal, train(LOOP, trained), whole)
+    assert "checkpoint 2 is damaged" in capsys.readouterr().out
+    assert {path.name for path in (trained / "checkpoints").iterdir()} == {"1", "2", "bad-2"}
+
+
+def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = create_state(Regression(), LOOP)
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    usage = module.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=10))
+    for name, save in (
+        ("checkpoints", lambda: checkpoints.save(1, state, {})),
+        ("weights", lambda: save_weights(tmp_path / "weights", state.params)),
+    ):
+        with pytest.raises(StoreError, match=f"{tmp_path / name}: the disk is full"):
+            save()
+    checkpoints.close()
+    assert [path for path in tmp_path.rglob("*") if path.name != "checkpoints"] == []
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage._replace(free=30))
+    save_weights(tmp_path / "weights", {"w": np.zeros(4, np.float32)})
+
+
+def test_weights_alone_come_back_and_may_be_written_again(tmp_path: Path) -> None:
+    path = tmp_path / "weights"
+    for seed in (1, 2):
+        weights = Regression().init(jax.random.key(seed))
+        save_weights(path, weights)
+        like = jax.eval_shape(Regression().init, jax.random.key(0))
+        jax.tree.map(np.testing.assert_array_equal, load_weights(path, like), weights)
+
+
+def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> None:
+    path, like = tmp_path / "weights", Regression().init(jax.random.key(0))
+    with pytest.raises(CheckpointError, match=rf"{path}: no such weights; train first"):
+        load_weights(path, like)
+    save_weights(path, like)
+    for other in (Regression(2).init(jax.random.key(0)), like | {"more": like["b"]}, {"w": like["w"]}):
+        with pytest.raises(CheckpointError, match=rf"{path}: does not fit"):
+            load_weights(path, other)
+    truncate_largest(path)
+    with pytest.raises(CheckpointError, match=rf"{path}: .*damaged"):
+        load_weights(path, like)

@@ -1,0 +1,191 @@
+import itertools
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.errors import Preempted
+from rsjax.training.checkpoint import Checkpoints
+from rsjax.training.log import read_curve, read_log
+from rsjax.training.loop import DivergedError, Watch
+from rsjax.training.skipped import read_skipped
+from rsjax.training.state import TrainState, create_state
+from rsjax.training.validation import HeldOut
+from tests.training.toy import Regression, loader, records, train
+
+LOOP = LoopConfig(
+    steps=9,
+    batch_size=2,
+    optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=2),
+    ema=0.9,
+    log_every=1,
+    checkpoint_every=4,
+    placement="jit",
+)
+
+
+def assert_same(one: TrainState, other: TrainState) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainState, list[dict[str, Any]]]:
+    """A run that nothing stopped."""
+    directory = tmp_path_factory.mktemp("whole")
+    return train(LOOP, directory), read_curve(directory)
+
+
+def test_a_run_learns_and_logs_every_step(whole: tuple[TrainState, list[dict[str, Any]]]) -> None:
+    state, rows = whole
+    assert int(state.step) == 9
+    assert [row["step"] for row in rows] == list(range(1, 10))
+    start = create_state(Regression(), LOOP).params["w"]
+    truth = np.array([1.0, -2.0, 0.5])
+    assert np.linalg.norm(state.params["w"] - truth) < np.linalg.norm(start - truth)
+
+
+@pytest.mark.parametrize("stop_at", [1, 4, 6])
+def test_resumed_is_never_stopped(whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path, stop_at: int) -> None:
+    stopped = train(LOOP, tmp_path, stop_at=stop_at)
+    assert int(stopped.step) == stop_at
+    assert_same(train(LOOP, tmp_path), whole[0])
+    assert read_curve(tmp_path) == whole[1]
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(
+    whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path
+) -> None:
+    taken = 0
+
+    def dies_at_step_7(arrays: dict[str, Any]) -> dict[str, Any]:
+        nonlocal taken
+        taken += 1
+        if taken == 7:
+            raise KeyboardInterrupt
+        return arrays
+
+    with pytest.raises(KeyboardInterrupt):
+        train(LOOP, tmp_path, to_batch=dies_at_step_7)
+    assert [row["step"] for row in read_log(tmp_path)] == [1, 2, 3, 4, 5, 6]  # two more than were saved
+    assert_same(train(LOOP, tmp_path), whole[0])
+    assert read_curve(tmp_path) == whole[1]
+
+
+def test_a_finished_run_is_left_as_it_is(whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path) -> None:
+    train(LOOP, tmp_path)
+    rows = read_log(tmp_path)
+    assert_same(train(LOOP, tmp_path), whole[0])
+    assert read_log(tmp_path) == rows
+
+
+def test_without_resume_a_run_starts_again(tmp_path: Path) -> None:
+    train(LOOP, tmp_path, stop_at=4)
+    again = train(LOOP, tmp_path, resume=False, stop_at=2)
+    assert int(again.step) == 2
+    assert [row["step"] for row in read_log(tmp_path)] == [1, 2]
+
+
+def poisoned(*steps: int) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """The batches of these steps have no finite loss; told by how many were made, so not to be resumed."""
+    taken = itertools.count(1)
+    bad = np.full(2, np.nan, np.float32)
+    return lambda arrays: arrays | {"y": bad} if next(taken) in steps else arrays
+
+
+@pytest.mark.parametrize("every", [1, 100])
+def test_steps_that_are_not_finite_are_left_out_and_written_down(tmp_path: Path, every: int) -> None:
+    loop = replace(LOOP, log_every=every, skip_budget=2)
+    state = train(loop, tmp_path, to_batch=poisoned(3, 7))
+    assert int(state.step) == 9 and int(state.skipped) == 2
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state))
+    rows = read_skipped(tmp_path)
+    assert [(row["step"], row["loss"]) for row in rows] == [(3, "nan"), (7, "nan")]
+    with loader(rows[1]["data"], records()) as again, loader(None, records()) as batches:
+        seventh = [next(batches) for _ in range(7)][-1]
+        np.testing.assert_array_equal(next(again)["x"], seventh["x"])
+        assert [row["record"] for row in rows[1]["records"]] == seventh["record"].tolist()
+
+
+def test_one_step_too_many_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
+    loop = replace(LOOP, skip_budget=1, log_every=100, checkpoint_every=2)
+    with pytest.raises(
+        DivergedError, match=rf"{tmp_path}: 2 steps were not finite, more than skip_budget = 1 .*step 5"
+    ):
+        train(loop, tmp_path, to_batch=poisoned(2, 5))
+    assert [row["step"] for row in read_skipped(tmp_path)] == [2, 5]
+    assert int(train(loop, tmp_path).step) == 9  # from step 4 on, where nothing is poisoned now
+    assert [row["step"] for row in read_skipped(tmp_path)] == [2]
+
+
+class Steep(Regression):
+    """The loss is finite, its gradient is not."""
+
+    def terms(self, params: Any, batch: Any, key: Any, around: Any) -> Any:
+        total, weight = super().terms(params, batch, key, around)["error"]
+        return {"error": (total + jax.numpy.sqrt(0 * params["b"]), weight)}  # 0, with a gradient of 0·∞
+
+
+def test_a_gradient_that_is_not_finite_changes_no_parameter(tmp_path: Path) -> None:
+    state = train(replace(LOOP, steps=2, ema=0.0), tmp_path, objective=Steep())
+    assert int(state.skipped) == 2
+    jax.tree.map(np.testing.assert_array_equal, state.params, create_state(Steep(), LOOP).params)
+
+
+def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
+    whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path
+) -> None:
+    looked = []
+
+    def look(step: int, weights: Any) -> HeldOut:
+        looked.append(step)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return HeldOut(0.0, {})
+
+    with pytest.raises(Preempted, match="saved after step 3; the same command resumes"):
+        train(replace(LOOP, eval_every=2), tmp_path, watch=Watch(held_out=look))
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert looked == [2] and checkpoints.latest() == 3
+    checkpoints.close()
+    assert_same(train(LOOP, tmp_path), whole[0])
+    assert [row for row in read_curve(tmp_path) if "loss" in row] == whole[1]
+
+
+def test_held_out_scores_are_logged_shown_and_decide_what_is_kept(
+    whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path
+) -> None:
+    def look(step: int, weights: Any) -> HeldOut:
+        return HeldOut(abs(step - 4.0), {"held_out/loss": abs(step - 4.0)}, {"seen": np.zeros((2, 2, 3), np.uint8)})
+
+    loop = replace(LOOP, eval_every=2, checkpoint_every=2, keep_last=1)
+    assert_same(train(loop, tmp_path, watch=Watch(("clips", 2), look)), whole[0])
+    rows = [row for row in read_log(tmp_path) if "held_out/loss" in row]
+    assert [(row["step"], row["held_out/loss"]) for row in rows] == [(2, 2), (4, 0), (6, 2), (8, 4), (9, 5)]
+    assert len(list((tmp_path / "pictures").glob("seen-*.png"))) == 5
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert checkpoints.steps() == [4, 9]
+    checkpoints.close()
+    assert all(row["clips_per_second"] > 0 for row in read_log(tmp_path) if "loss" in row)
+
+
+def test_batches_follow_from_the_loaders_state(tmp_path: Path) -> None:
+    """The place in the data is saved with the state: what a resumed run reads is what comes next."""
+    seen: list[np.ndarray] = []
+
+    def watch(arrays: dict[str, Any]) -> dict[str, Any]:
+        seen.append(arrays["x"])
+        return arrays
+
+    train(LOOP, tmp_path, to_batch=watch, stop_at=4)
+    first = len(seen)  # some were made ahead
+    train(LOOP, tmp_path, to_batch=watch)
+    with loader(None, records()) as batches:
+        expected = [next(batches)["x"] for _ in range(9)]
+    np.testing.assert_array_equal(seen[:4], expected[:4])
+    np.testing.assert_array_equal(seen[first : first + 5], expected[4:])

@@ -1,0 +1,136 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from jax.sharding import Mesh
+
+from rsjax.config import ConfigError, LoopConfig
+from rsjax.training.placement import AXIS, Placement, choose
+from tests.training.toy import Regression
+
+ROOT = Path(__file__).parents[2]
+
+
+def virtual(devices: int) -> dict[str, str]:
+    """The environment of a process with so many devices; unoptimised, as it mostly compiles."""
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
+    return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+
+
+@pytest.fixture(scope="module")
+def apart() -> dict[str, Any]:
+    """What tests/training/devices.py finds. The devices have to exist before jax starts, hence a process of its own."""
+    command = [sys.executable, "-m", "tests.training.devices"]
+    done = subprocess.run(command, cwd=ROOT, env=virtual(4), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("placement", ["pmap", "mesh", "fsdp", "muon"])
+def test_every_placement_gives_the_same_parameters_on_uneven_batches(placement: str, apart: dict[str, Any]) -> None:
+    assert apart[placement]["largest"] < 1e-4, apart
+    assert apart[placement]["share"] < 1e-4, apart
+    assert apart["mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
+
+
+@pytest.mark.parametrize("placement", ["pmap", "mesh"])
+def test_clips_without_depth_count_alike_wherever_they_lie(placement: str, apart: dict[str, Any]) -> None:
+    assert apart[f"depth {placement}"] < 1e-5, apart
+    assert apart["depth mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
+
+
+def test_the_tokenizers_gradients_and_averages_are_those_of_the_whole_batch(apart: dict[str, Any]) -> None:
+    assert apart["tokenizer pmap"].keys() == {"generator", "discriminator", "averages"}
+    for distance in (*apart["tokenizer pmap"].values(), *apart["tokenizer fsdp"].values()):
+        assert distance < 1e-5, apart
+    assert apart["tokenizer apart"] > 0.01, "the images are too even to tell the placements apart"
+
+
+def test_a_checkpoint_goes_on_under_any_other_placement(apart: dict[str, Any]) -> None:
+    assert len(apart["checkpoint"]) == 4
+    for distance in apart["checkpoint"]:
+        assert distance["share"] < 1e-4, apart
+
+
+def test_a_state_that_is_made_in_parts_is_the_same_to_the_bit(apart: dict[str, Any]) -> None:
+    assert apart["start"]
+
+
+def test_two_devices_that_share_a_state_hold_about_half_of_it_each(apart: dict[str, Any]) -> None:
+    assert 0.5 < apart["cut"] < 0.6
+
+
+@pytest.mark.parametrize(
+    ("fields", "local", "processes", "chosen"),
+    [
+        ({"placement": "jit"}, 4, 1, ("jit", 1)),
+        ({"placement": "pmap"}, 4, 1, ("pmap", 4)),
+        ({"placement": "pmap"}, 1, 1, ("pmap", 1)),
+        ({"placement": "pmap"}, 2, 4, ("pmap", 8)),
+        ({"placement": "mesh", "fsdp": 2}, 4, 2, ("mesh", 8)),
+        ({}, 4, 1, ("pmap", 4)),
+        ({"batch_size": 6}, 4, 1, ("pmap", 3)),
+        ({"batch_size": 5}, 4, 1, ("jit", 1)),
+        ({}, 1, 1, ("jit", 1)),
+        ({"accumulate": 4}, 4, 1, ("pmap", 2)),
+        ({}, 4, 2, ("mesh", 8)),
+    ],
+)
+def test_auto_takes_as_many_devices_as_divide_the_batch(
+    fields: dict[str, Any], local: int, processes: int, chosen: tuple[str, int]
+) -> None:
+    assert choose(LoopConfig(**({"batch_size": 8} | fields)), local, processes) == chosen
+
+
+@pytest.mark.parametrize(
+    ("fields", "local", "processes", "message"),
+    [
+        (
+            {"placement": "pmap"},
+            4,
+            1,
+            "batch_size 6 does not divide over 4 devices; make it a multiple, or set placement to auto",
+        ),
+        ({"placement": "mesh"}, 4, 1, "batch_size 6 does not divide over 4 devices"),
+        ({}, 2, 2, "batch_size 6 does not divide over 4 devices; make it a multiple$"),
+        ({"placement": "mesh", "accumulate": 2}, 2, 1, "over 2 devices in accumulate = 2 parts"),
+        ({"placement": "mesh", "fsdp": 2}, 3, 1, "fsdp 2 does not divide 3 devices"),
+        ({"placement": "jit"}, 1, 2, "placement jit is one device's, and 2 processes train"),
+    ],
+)
+def test_what_does_not_divide_is_refused(fields: dict[str, Any], local: int, processes: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        choose(LoopConfig(**({"batch_size": 6} | fields)), local, processes)
+
+
+def test_each_device_takes_its_own_consecutive_clips() -> None:
+    placement = Placement("pmap", Mesh(np.array(jax.devices()[:1]), (AXIS,)))
+    batch = {"x": np.arange(12).reshape(6, 2), "weight": np.ones(6)}
+    cut = placement.put_batch(batch)
+    np.testing.assert_array_equal(cut["x"], batch["x"].reshape(1, 6, 2))
+    assert cut["weight"].shape == (1, 6)
+
+
+def test_a_gathered_copy_outlives_the_step_that_takes_its_state() -> None:
+    loop = LoopConfig(batch_size=2, ema=0.5, placement="jit")
+    placement = Placement.create(loop)
+    state = placement.init(Regression(), loop)
+    copy = placement.gather(state.weights)
+    before = jax.device_get(copy)
+    batch = placement.put_batch({"x": np.ones((2, 3), np.float32), "y": np.zeros(2, np.float32)})
+    state, _ = placement.compile(Regression(), loop)(state, batch)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(copy), before)
+
+
+def test_training_begins_with_what_start_gives() -> None:
+    loop = LoopConfig(ema=0.5, placement="jit")
+    state = Placement.create(loop).init(Regression(), loop, lambda fresh: jax.tree.map(lambda x: x + 1, fresh))
+    fresh = Regression().init(jax.random.key(loop.seed))
+    for params in (state.params, state.ema):
+        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y + 1), params, fresh)
