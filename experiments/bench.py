@@ -51,7 +51,7 @@ def main() -> None:
 
 def write(path: Path, numbers: dict[str, Any]) -> None:
     """Puts the numbers into the file, in place of what it held."""
-    from rsjax.data.store import disk_guard, write_atomically
+    from rsjax.files import disk_guard, write_atomically
 
     with disk_guard(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -41,7 +41,8 @@ def main() -> None:
 
     from rsjax.data.inspect import contact_sheet, look, render
     from rsjax.data.rerun_view import rerun_view
-    from rsjax.data.store import disk_guard, open_store
+    from rsjax.data.store import open_store
+    from rsjax.files import disk_guard
 
     store = open_store(place)
     contents = look(store, options.records)

@@ -78,9 +78,9 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
 
     - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch with what it shares, which is the
       model without depth.
-    - ``flops_…``: matrix products and convolutions at 2 a multiply-add, formulas in
-      :mod:`rsjax.models.roboscape.flops` and :mod:`rsjax.tokenizers.flops`. Per frame: a forward pass over a clip by its frames, and about a pass of one frame
-      through the cache. Training: three forwards, without what remat repeats.
+    - ``flops_…``: matrix products and convolutions at 2 a multiply-add (``flops.py`` of the model and the tokenizer). Per
+      frame: a forward pass over a clip by its frames, and about a pass of one frame through the cache. Training: three
+      forwards, without what remat repeats.
     - ``bytes_train_state``: of the world model's parameters, optimizer, averages and gradients. Once a device.
     - ``bytes_activations_per_clip``: what the backward pass keeps of the forward pass, that and the loss as autodiff
       sees them; the compiler may keep less. ``…_remat``: each block's input, and all of the one block that is being

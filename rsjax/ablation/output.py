@@ -11,8 +11,7 @@ from rsjax.ablation.record import FILE, Record, extend, read_record
 from rsjax.ablation.results import read_result
 from rsjax.ablation.table import Row, as_csv, as_json, markdown, tabulate
 from rsjax.config import Config
-from rsjax.data.lock import lock
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, lock, write_atomically
 
 
 def write_tables(out: Path, data: Path) -> list[Row]:

@@ -10,8 +10,7 @@ from typing import Any
 from rsjax.ablation.fields import GridError, Value, leaves
 from rsjax.ablation.grid import SEED, Cell, make_cell
 from rsjax.config import Config, ConfigError, from_dict, to_dict
-from rsjax.data.lock import lock
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, lock, write_atomically
 from rsjax.progress import note
 
 FILE = "grid.json"

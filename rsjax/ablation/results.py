@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsjax.ablation.grid import Cell
-from rsjax.data.lock import is_held
+from rsjax.files import is_held
 from rsjax.pipeline.run import STAGES, Run
 from rsjax.training.log import read_log
 

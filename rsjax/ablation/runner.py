@@ -16,9 +16,8 @@ from rsjax.ablation.record import extend, keep_record, read_record
 from rsjax.ablation.results import ERROR, State, lock_of, read_metrics, run_of
 from rsjax.ablation.shared import share
 from rsjax.config import Config
-from rsjax.data.lock import lock
-from rsjax.data.store import write_atomically
 from rsjax.errors import Preempted, UserError
+from rsjax.files import lock, write_atomically
 from rsjax.pipeline.stages import run_all
 from rsjax.progress import note, stage
 

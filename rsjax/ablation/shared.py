@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from rsjax.data.lock import lock
-from rsjax.data.store import disk_guard
+from rsjax.files import disk_guard, lock
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
 from rsjax.progress import note

@@ -8,7 +8,7 @@ from rsjax.config import ConfigError, ModelConfig, TokenizerConfig, from_dict, t
 from rsjax.convert import genie, lpips, tokenizer
 from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_atomically
 from rsjax.training.pretrained import load_part, save_part
 
 METADATA = "rsjax.tokenizers"  # the configuration in the metadata of a tokenizer that was written here

@@ -8,8 +8,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from rsjax.data.store import disk_guard, write_atomically
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 
 Tensors = dict[str, np.ndarray]
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from rsjax.data.store import MANIFEST, Store, StoreError, write_atomically
+from rsjax.data.store import MANIFEST, Store, StoreError
 from rsjax.errors import UserError
+from rsjax.files import write_atomically
 
 _FILE = "units.json"
 

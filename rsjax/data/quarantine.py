@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from rsjax.data.store import StoreError, disk_guard
+from rsjax.data.store import StoreError
+from rsjax.files import disk_guard
 
 NAME = "quarantine.jsonl"
 MAX_DAMAGED = 0.01  # share of the records that training goes on without

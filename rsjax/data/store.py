@@ -4,12 +4,9 @@ A :class:`rsjax.clip.Clip` is one kind of record; :mod:`rsjax.data.codec` is how
 """
 
 import dataclasses
-import errno
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +18,7 @@ from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.data.manifest import ManifestError, check_manifest
-from rsjax.errors import UserError
+from rsjax.files import FileError, disk_guard, replace_directory
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -29,7 +26,7 @@ WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access read
 SHARD_BYTES = 256 * 2**20
 
 
-class StoreError(UserError):
+class StoreError(FileError):
     """A store that cannot be read or written. The message names the file and the cure."""
 
 
@@ -256,42 +253,3 @@ def _write_split(folder: Path, split: str, records: Iterable[Record]) -> list[di
         writer.close()
         files.append({"name": name, "count": count, "bytes": (folder / name).stat().st_size})
     return files
-
-
-def replace_directory(new: Path, path: Path) -> None:
-    """Move a finished directory to its place; an older one there is gone only after that."""
-    old = path.with_name(f"{path.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if path.exists():
-        os.replace(path, old)
-    os.replace(new, path)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def write_atomically(path: Path, payload: bytes) -> None:
-    """Write a file that a reader sees whole or not at all."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(payload)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def disk_guard(path: Path) -> Iterator[None]:
-    """Turn the operating system's full disk or refused write into a :class:`StoreError` that names the place."""
-    try:
-        yield
-    except OSError as error:
-        raise _explain(path, error) from error
-    except (RuntimeError, ValueError) as error:  # how ArrayRecord reports them
-        if "No space left" in str(error):
-            raise _explain(path, OSError(errno.ENOSPC, "")) from error
-        raise
-
-
-def _explain(path: Path, error: OSError) -> StoreError:
-    if error.errno == errno.ENOSPC:
-        return StoreError(f"{path}: the disk is full; free some space there and run again")
-    return StoreError(f"{path}: cannot write ({error}); check the place and its permissions")

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Num, UInt8
 
-from rsjax.data.store import Store, StoreError, decode, encode, write_atomically
+from rsjax.data.store import Store, StoreError, decode, encode
 from rsjax.evaluation import control, pixels
 from rsjax.evaluation.depth import depth_scores, result_key
 from rsjax.evaluation.statistics import bootstrap, over_predicted_frames
+from rsjax.files import write_atomically
 from rsjax.pipeline.clips import Clips, readable, spread
 from rsjax.pipeline.generator import Generated, Generator, Tokens
 from rsjax.progress import Progress

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import content_key
-from rsjax.data.lock import lock
-from rsjax.data.store import MANIFEST, StoreError, disk_guard, open_store
+from rsjax.data.store import MANIFEST, StoreError, open_store
+from rsjax.files import disk_guard, lock
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.jobs.runner import Executor, run
 from rsjax.ingest.jobs.work_items import Job, Unit, mark_path

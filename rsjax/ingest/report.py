@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rsjax.data.store import disk_guard, write_atomically
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.jobs.runner import Ran
 from rsjax.ingest.jobs.work_items import Job, Mark, Unit

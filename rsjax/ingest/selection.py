@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_atomically
 from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError, fingerprint
 
 FORMAT = 1

@@ -20,8 +20,9 @@ import jax
 
 import rsjax
 from rsjax.config import Config, to_dict
-from rsjax.data.store import MANIFEST, disk_guard, write_atomically
+from rsjax.data.store import MANIFEST
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 from rsjax.pipeline.run import Run
 from rsjax.progress import note
 

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import Config, ConfigError, content_key, from_dict, to_dict
-from rsjax.data.store import MANIFEST, Store, StoreError, disk_guard, open_store, write_atomically
+from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")

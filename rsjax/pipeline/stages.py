@@ -8,8 +8,8 @@ from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.curriculum import check_stages
 from rsjax.data.normalization import Units
 from rsjax.data.quarantine import NAME as QUARANTINE
-from rsjax.data.store import disk_guard
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.files import disk_guard
 from rsjax.pipeline.generator import Generator, load_tokenizer
 from rsjax.pipeline.jobs import tokenizer_job, world_model_job
 from rsjax.pipeline.provenance import record_data, record_start

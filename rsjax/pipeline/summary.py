@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from rsjax.config import LossConfig, to_dict
-from rsjax.data.store import disk_guard, write_atomically
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.files import disk_guard, write_atomically
 from rsjax.models.roboscape.keypoints import motion_magnitude
 from rsjax.pipeline.run import STAGES, Run
 from rsjax.report.figures import ClipFigure

@@ -12,12 +12,12 @@ from typing import Any
 
 from rsjax.config import Config
 from rsjax.data.codec import Record
-from rsjax.data.lock import lock
 from rsjax.data.normalization import Units
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
+from rsjax.files import lock
 from rsjax.pipeline.clips import readable
 from rsjax.pipeline.feeding import fingerprint
 from rsjax.pipeline.generator import Codec

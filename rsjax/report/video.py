@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from rsjax.data.store import write_atomically
+from rsjax.files import write_atomically
 
 Resample = Literal["nearest", "bicubic"]
 

@@ -21,17 +21,9 @@ import numpy as np
 
 from rsjax.clip import Clip
 from rsjax.config import SimConfig, content_key, to_dict
-from rsjax.data.store import (
-    Record,
-    complete_key,
-    decode,
-    disk_guard,
-    encode,
-    encode_clip,
-    write_atomically,
-    write_store,
-)
+from rsjax.data.store import Record, complete_key, decode, encode, encode_clip, write_store
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 from rsjax.sim.expert import MODES, Expert, difficulty, draw_manner
 from rsjax.sim.gl import GLError, choose_gl
 from rsjax.sim.labels import Snapshot, pick_pixels, track

@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_atomically
 from rsjax.progress import duration
 from rsjax.soak.bad_record import try_bad_record
 from rsjax.soak.disk import can_mount, unmount_below

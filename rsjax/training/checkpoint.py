@@ -14,8 +14,8 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from rsjax.data.store import StoreError, disk_guard
 from rsjax.errors import UserError
+from rsjax.files import FileError, disk_guard
 from rsjax.progress import note
 from rsjax.training.checkpoint_manifest import find_fault, read_metric, write_manifest
 from rsjax.training.distributed import agree, is_lead, on_lead
@@ -80,7 +80,7 @@ class Checkpoints:
             metric: what ``keep_best`` goes by, the lower the better; None (or not finite): this one is never the best.
 
         Raises:
-            StoreError: the disk is full or refuses, for this checkpoint or the one before.
+            FileError: the disk is full or refuses, for this checkpoint or the one before.
         """
         self.wait()
         if step in self.steps():
@@ -104,7 +104,7 @@ class Checkpoints:
 
         Raises:
             CheckpointError: there is no checkpoint, all are damaged, or it is of another architecture.
-            StoreError: a damaged one cannot be moved, or the last save failed.
+            FileError: a damaged one cannot be moved, or the last save failed.
         """
         self.wait()
         step, faults = self._newest_whole()
@@ -128,7 +128,7 @@ class Checkpoints:
         """Waits until what was saved is on disk.
 
         Raises:
-            StoreError: it could not be written; the checkpoints before it are as they were.
+            FileError: it could not be written; the checkpoints before it are as they were.
         """
         with self._written():
             self._manager.wait_until_finished()
@@ -170,13 +170,13 @@ class Checkpoints:
         try:
             with disk_guard(self.directory):
                 yield
-        except (StoreError, RuntimeError, ValueError) as error:
+        except (FileError, RuntimeError, ValueError) as error:
             if is_lead():
                 for path in self.directory.glob(f"*{UNFINISHED}*"):
                     shutil.rmtree(path, ignore_errors=True)
-            if isinstance(error, StoreError):
+            if isinstance(error, FileError):
                 raise
-            raise StoreError(f"{self.directory}: cannot write a checkpoint ({_first_line(error)})") from error
+            raise FileError(f"{self.directory}: cannot write a checkpoint ({_first_line(error)})") from error
 
     def _newest_whole(self) -> tuple[int | None, list[tuple[int, str]]]:
         """The newest step whose files are whole, and what is wrong with those of newer ones."""
@@ -209,7 +209,7 @@ def save_weights(path: Path, weights: Any) -> None:
     Called by one process, where there are several; what lies on a mesh of all of them has to be brought to it first.
 
     Raises:
-        StoreError: the disk is full.
+        FileError: the disk is full.
     """
     with disk_guard(path), _checkpointer() as checkpointer:
         _need_room(path.parent, weights)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_atomically
 from rsjax.training.tensorboard import Board
 from rsjax.training.wandb_run import WandbRun
 

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from rsjax.config import ConfigError, ModelConfig, TokenizerConfig, from_dict, to_dict
-from rsjax.data.store import disk_guard, write_atomically
 from rsjax.errors import UserError
+from rsjax.files import disk_guard, write_atomically
 from rsjax.models.roboscape.world_model import WorldModel
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.training.checkpoint import load_weights, save_weights

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import jax
 
-from rsjax.data.store import disk_guard
+from rsjax.files import disk_guard
 from rsjax.progress import note
 
 SKIPPED = 5  # steps before the trace: the first compiles, the next ones fill queues

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rsjax.data.store import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_atomically
 
 NAME = "skipped.jsonl"
 

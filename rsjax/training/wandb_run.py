@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from rsjax.data.store import write_atomically
 from rsjax.errors import UserError
+from rsjax.files import write_atomically
 from rsjax.progress import note
 
 ID_FILE = "wandb.json"

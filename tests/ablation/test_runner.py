@@ -15,8 +15,8 @@ from rsjax.ablation import runner
 from rsjax.ablation.grid import Cell, Choice
 from rsjax.ablation.output import write_tables
 from rsjax.ablation.results import lock_of, read_result, run_of
-from rsjax.data.lock import is_held, lock
 from rsjax.errors import Preempted, UserError
+from rsjax.files import is_held, lock
 from rsjax.pipeline.run import STAGES, Run
 from tests.ablation import process, toy
 
@@ -182,7 +182,7 @@ def test_a_lock_is_one_processs_and_a_place_without_locks_is_named(
     def without(*_: object) -> None:
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr("rsjax.data.lock.fcntl.flock", without)
+    monkeypatch.setattr("rsjax.files.fcntl.flock", without)
     with pytest.raises(UserError, match="this file system has no locks"), lock(path):
         pass
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from rsjax.data.codec import Record
-from rsjax.data.lock import lock
 from rsjax.data.store import StoreError, open_store
+from rsjax.files import lock
 from rsjax.ingest import packing
 from rsjax.ingest.clips import ClipConfig
 from rsjax.ingest.episode import EpisodeRef

@@ -18,7 +18,8 @@ from experiments.cli import main_errors
 from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.data.loader import batches
 from rsjax.data.quarantine import NAME as QUARANTINE
-from rsjax.data.store import open_store, write_atomically, write_store
+from rsjax.data.store import open_store, write_store
+from rsjax.files import write_atomically
 from rsjax.models.roboscape.losses import Term
 from rsjax.training.checkpoint import save_weights
 from tests.training import toy

@@ -21,7 +21,8 @@ from array_record.python.array_record_module import ArrayRecordWriter
 
 from rsjax.config import content_key
 from rsjax.data.codec import Record, encode
-from rsjax.data.store import WRITER_OPTIONS, Source, disk_guard, write_atomically
+from rsjax.data.store import WRITER_OPTIONS, Source
+from rsjax.files import disk_guard, write_atomically
 from rsjax.ingest.episode import Episode, EpisodeRef, EpisodeSource, safe_id
 
 RECENT = 256  # episodes whose keys are kept
