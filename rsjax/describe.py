@@ -78,7 +78,7 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
 
     - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch with what it shares, which is the
       model without depth.
-    - ``flops_…``: matrix products and convolutions at 2 a multiply-add (``flops.py`` of the model and the tokenizer). Per
+    - ``flops_…``: matrix products and convolutions at 2 a multiply-add (``flops.py`` of model and tokenizer). Per
       frame: a forward pass over a clip by its frames, and about a pass of one frame through the cache. Training: three
       forwards, without what remat repeats.
     - ``bytes_train_state``: of the world model's parameters, optimizer, averages and gradients. Once a device.
