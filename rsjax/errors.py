@@ -31,6 +31,11 @@ def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
     return f"; did you mean {' or '.join(repr(prefix + c) for c in near)}?" if near else ""
 
 
+def first_line(error: object) -> str:
+    """Returns the first line of an error's message, at most 200 characters, or its type's name where it has none."""
+    return str(error).strip().partition("\n")[0][:200] or type(error).__name__
+
+
 class Preempted(BaseException):
     """The process was told to stop (SIGTERM) and did, with its work saved. The message says what goes on with it.
 

@@ -8,7 +8,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
 from rsjax.files import disk_guard, write_atomically
 
 Tensors = dict[str, np.ndarray]
@@ -73,7 +73,7 @@ def _read_torch(path: Path) -> Tensors:
     except Exception as error:  # torch reports damage, and what it refuses to run, as many types
         raise ConvertError(
             f"{path}: refused, it is damaged or holds more than tensors, and loading that could run any code "
-            f"({_first_line(error)}); give the same weights as a {SAFE} file"
+            f"({first_line(error)}); give the same weights as a {SAFE} file"
         ) from error
     state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(x, torch.Tensor) for x in state.values()):
@@ -81,7 +81,3 @@ def _read_torch(path: Path) -> Tensors:
     # numpy has no bfloat16; float32 holds every one of its numbers.
     values = {name: x.detach() for name, x in state.items()}  # parameters that want a gradient refuse numpy()
     return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy() for name, x in values.items()}
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0][:200]

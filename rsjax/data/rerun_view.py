@@ -12,7 +12,7 @@ import numpy as np
 from rsjax.data.codec import Record
 from rsjax.data.inspect import sampled
 from rsjax.data.store import Store, StoreError
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
 
 TIMELINE = "frame"
 
@@ -62,7 +62,7 @@ def _reported(file: Path | None) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        told = str(error).strip().partition("\n")[0]
+        told = first_line(error)
         if file is None:
             cure = "it needs a screen; write a file for one elsewhere with --rerun-file"
             raise UserError(f"the Rerun viewer does not answer ({told}); {cure}") from error

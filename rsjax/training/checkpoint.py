@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
 from rsjax.files import FileError, disk_guard
 from rsjax.progress import note
 from rsjax.training.checkpoint_manifest import find_fault, read_metric, write_manifest
@@ -176,7 +176,7 @@ class Checkpoints:
                     shutil.rmtree(path, ignore_errors=True)
             if isinstance(error, FileError):
                 raise
-            raise FileError(f"{self.directory}: cannot write a checkpoint ({_first_line(error)})") from error
+            raise FileError(f"{self.directory}: cannot write a checkpoint ({first_line(error)})") from error
 
     def _newest_whole(self) -> tuple[int | None, list[tuple[int, str]]]:
         """The newest step whose files are whole, and what is wrong with those of newer ones."""
@@ -283,10 +283,6 @@ def _flat_shapes(tree: Any) -> dict[str, tuple[int, ...]]:
 
 def _misfit(path: Path, reason: object) -> CheckpointError:
     return CheckpointError(
-        f"{path}: does not fit this configuration or is damaged ({_first_line(reason)}); use the configuration it was "
+        f"{path}: does not fit this configuration or is damaged ({first_line(reason)}); use the configuration it was "
         f"made with, or another run directory, or delete it"
     )
-
-
-def _first_line(reason: object) -> str:
-    return str(reason).strip().partition("\n")[0][:200]

@@ -15,7 +15,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from orbax.checkpoint import multihost
 
-from rsjax.errors import Preempted, UserError
+from rsjax.errors import Preempted, UserError, first_line
 
 BARRIER_SECONDS = 7 * 24 * 3600  # the others wait while the lead simulates, tokenizes and evaluates
 JOIN_SECONDS = 1800  # a node that takes another's place may be long in coming
@@ -82,7 +82,7 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
     except (RuntimeError, ValueError) as error:
         if not coordinator and cluster(os.environ) == "tpu" and isinstance(error, ValueError):
             return  # libtpu is installed, but no TPU is here
-        reason = str(error).strip().partition("\n")[0][:200]
+        reason = first_line(error)
         raise LostHostError(
             f"process {process_id if coordinator else 'of a cluster'} cannot join the others ({reason}); start all "
             f"of them, with the same --coordinator and --processes, which all of them can reach"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from rsjax.errors import UserError
+from rsjax.errors import UserError, first_line
 from rsjax.files import write_atomically
 from rsjax.progress import note
 
@@ -70,7 +70,7 @@ class WandbRun:
             self._run.define_metric("*", step_metric="step")
         except Exception as error:  # W&B reports a missing key, a refused one and a missing network as many types
             raise WandbError(
-                f"Weights & Biases cannot start ({_first_line(error)}); log in (wandb login), set WANDB_MODE=offline, "
+                f"Weights & Biases cannot start ({first_line(error)}); log in (wandb login), set WANDB_MODE=offline, "
                 f"or leave --wandb out"
             ) from error
         note(f"Weights & Biases: {self._run.url or f'offline, {self._run.dir}'}")
@@ -98,7 +98,7 @@ class WandbRun:
             work(self._run)
         except Exception as error:  # as above
             self._run = None
-            note(f"Weights & Biases is off until the next start ({_first_line(error)}); training goes on")
+            note(f"Weights & Biases is off until the next start ({first_line(error)}); training goes on")
 
 
 def _run_id(path: Path, project: str, resume: bool) -> str:
@@ -116,7 +116,3 @@ def _run_id(path: Path, project: str, resume: bool) -> str:
 
 def _settings(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0][:200] or type(error).__name__

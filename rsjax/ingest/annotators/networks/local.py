@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rsjax.errors import first_line
 from rsjax.ingest.annotators.protocols import AnnotationError
 
 EXTRA = "pip install 'rsjax[annotate]'"
@@ -28,13 +29,9 @@ def library(name: str, what: str) -> Any:
         raise AnnotationError(f"{what} needs {name} ({error}); install it ({EXTRA}), or take the default") from error
     except (RuntimeError, OSError, AttributeError) as error:  # what a torchvision of another torch raises, by version
         raise AnnotationError(
-            f"{what} needs {name}, which does not import ({_first_line(error)}); torchvision has to be of the same "
+            f"{what} needs {name}, which does not import ({first_line(error)}); torchvision has to be of the same "
             f"release and build as torch: install both again together"
         ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0][:200]
 
 
 def checkout_module(checkout: Path, name: str, what: str) -> Any:
@@ -80,7 +77,7 @@ def load_weights(model: Any, path: Path, what: str) -> Any:
         state = content.get("state_dict", content.get("model", content))
         model.load_state_dict(state)
     except Exception as error:  # torch reports damage as many types
-        told = _first_line(error)
+        told = first_line(error)
         raise AnnotationError(
             f"{path}: not the weights of {what} ({told}); give the file that belongs to it"
         ) from error
@@ -102,7 +99,7 @@ def pretrained(kind: str, path: Path, what: str, **options: Any) -> Any:
     try:
         return getattr(transformers, kind).from_pretrained(path, **local, **options)
     except Exception as error:  # transformers reports what is missing or damaged as many types
-        told = _first_line(error)
+        told = first_line(error)
         raise AnnotationError(f"{path}: {kind} cannot be made from it ({told}); fetch the whole model again") from error
 
 
@@ -115,7 +112,7 @@ def on_device(model: Any, device: str, what: str) -> Any:
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:  # torch asserts that it was built with CUDA
-        told = _first_line(error)
+        told = first_line(error)
         raise AnnotationError(
             f"device {device!r} cannot be used for {what} ({told}); choose another, or cpu"
         ) from error
