@@ -61,7 +61,7 @@ def choose(stage: str, text: str) -> Any:
             f"{stage}: no method {name!r}{did_you_mean(name, methods)}; choose {', '.join(methods)} or none"
         )
     module, kind = methods[name]
-    made = getattr(importlib.import_module(f"rsjax.ingest.{module}"), kind)
+    made = getattr(importlib.import_module(f"rsjax.ingest.annotators.{module}"), kind)
     hints = typing.get_type_hints(made)
     known = [field.name for field in dataclasses.fields(made)]
     values: dict[str, Any] = {}

@@ -47,7 +47,7 @@ def test_the_default_words_are_the_default_methods() -> None:
 def test_every_method_is_there_under_its_own_name() -> None:
     for methods in METHODS.values():
         for name, (module, kind) in methods.items():
-            made = getattr(importlib.import_module(f"rsjax.ingest.{module}"), kind)
+            made = getattr(importlib.import_module(f"rsjax.ingest.annotators.{module}"), kind)
             assert made.name == name and dataclasses.is_dataclass(made)
 
 
