@@ -47,7 +47,8 @@ class Batch:
     Attributes:
         rgb: token of each cell, little-endian, 0 … 2^D - 1.
         depth: token of each cell of the colourised depth map, likewise.
-        actions: what the action encoder sees (see :class:`rsjax.data.normalization.Units`); row t led into frame t.
+        actions: inputs of the action encoder (:meth:`rsjax.data.normalization.Normalization.action_inputs`); row t led
+            into frame t.
         tracks: as in :class:`Clip`.
         visible: as in :class:`Clip`.
         weight: 1 for a clip that counts, 0 for padding.

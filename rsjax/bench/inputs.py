@@ -12,7 +12,7 @@ import numpy as np
 
 from rsjax.clip import Batch
 from rsjax.config import Config, ModelConfig
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.order import Transform
 from rsjax.data.store import Record
 from rsjax.models.roboscape.world_model import WorldModel, branches
@@ -44,7 +44,9 @@ def batch(config: Config, size: int) -> Batch:
 def transform(config: Config) -> Transform:
     """From token records to arrays, as training has it, with units that change nothing."""
     width = config.clips.action_dim
-    return partial(token_clip, Units((0.0,) * width, (1.0,) * width, (0.1, 1.0)), config.model.integrate_actions)
+    return partial(
+        token_clip, Normalization((0.0,) * width, (1.0,) * width, (0.1, 1.0)), config.model.integrate_actions
+    )
 
 
 def prompt(model: ModelConfig, size: int, frames: int) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rsjax.bench import inputs
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config
 from rsjax.data import loader
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.store import open_store, write_store
 from rsjax.models.roboscape.flops import train_flops
 from rsjax.models.roboscape.rollout import rollout
@@ -112,7 +112,7 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
 def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
     """Frames a second into tokens and back, images from and to the host, for as many frames as the clips have."""
     params = jax.jit(Tokenizer(config.tokenizer).init_params)(jax.random.key(0))
-    units = Units((0.0,), (1.0,), (0.1, 1.0))  # of depth and actions, which are not coded here
+    units = Normalization((0.0,), (1.0,), (0.1, 1.0))  # of depth and actions, which are not coded here
     codec = Codec(config, params, units)
     size, rng = config.tokenizer.image_size, np.random.default_rng(0)
     images = rng.integers(0, 256, (batch * config.clips.frames, size, size, 3), np.uint8)

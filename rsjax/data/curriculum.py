@@ -12,7 +12,7 @@ from rsjax.config import LoopConfig, PartConfig, StageConfig
 from rsjax.config.stages import format_stage
 from rsjax.data.labels import Labels
 from rsjax.data.loader import Loader, staged_batches
-from rsjax.data.order import Arrays, Part, Stage, Transform
+from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transform
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.records import Readable, place_of
 from rsjax.data.store import Store, StoreError, open_store
@@ -26,7 +26,7 @@ class CurriculumError(StoreError):
 
 
 @dataclass(frozen=True)
-class Feed:
+class LoaderFactory:
     """Makes a training loop's loaders: ``feed(state)`` goes on from an earlier one's state, None begins.
 
     Attributes:
@@ -36,7 +36,7 @@ class Feed:
     """
 
     loop: LoopConfig
-    stages: tuple[Stage, ...]
+    stages: tuple[CurriculumStage, ...]
     quarantine: Path
 
     def __call__(self, state: dict[str, Any] | None) -> Loader:
@@ -62,7 +62,7 @@ class Feed:
 
 def plan(
     loop: LoopConfig, own: Store, transform: Callable[[Store], Transform], directory: Path, split: str = "train"
-) -> tuple[LoopConfig, Feed]:
+) -> tuple[LoopConfig, LoaderFactory]:
     """Resolves a loop's stages: which records, how many steps.
 
     Args:
@@ -87,7 +87,7 @@ def plan(
             first for first, stage in zip(firsts, loop.stages, strict=False) if stage.restart and first > 0
         )
         loop = replace(loop, steps=firsts[-1], restarts=restarts)
-    return loop, Feed(loop, tuple(resolved), directory / NAME)
+    return loop, LoaderFactory(loop, tuple(resolved), directory / NAME)
 
 
 def check_stages(loop: LoopConfig, own: Store, split: str = "train") -> None:
@@ -123,23 +123,23 @@ def choose(part: PartConfig, store: Store, split: str) -> np.ndarray | None:
 
 def _resolve(
     stage: StageConfig, batch_size: int, own: Store, transform: Callable[[Store], Transform], split: str
-) -> Stage:
+) -> CurriculumStage:
     parts = []
     for config in stage.parts:
         store = open_store(config.store) if config.store else own
-        part = Part(store.source(split), transform(store), choose(config, store, split), config.weight)
+        part = MixtureComponent(store.source(split), transform(store), choose(config, store, split), config.weight)
         if not len(part):
             raise StoreError(f"{store.path}: its {split} split has no records; make it again")
         if config.store:
-            _check_kin(store, part, own, Part(own.source(split), transform(own)))
+            _check_kin(store, part, own, MixtureComponent(own.source(split), transform(own)))
         parts.append(part)
     drawn = stage.epochs * sum(map(len, parts))
     # Epochs such as 0.1 are not exact in binary: a hair above a whole number of batches is that number.
     batches = max(1, math.ceil(drawn / batch_size - 1e-6))
-    return Stage(tuple(parts), batches * batch_size)
+    return CurriculumStage(tuple(parts), batches * batch_size)
 
 
-def _check_kin(store: Store, part: Part, own: Store, own_part: Part) -> None:
+def _check_kin(store: Store, part: MixtureComponent, own: Store, own_part: MixtureComponent) -> None:
     """Raises :class:`CurriculumError` where batches cannot hold records of both stores."""
     for name in ("kind", "tokenizer"):
         there, here = store.manifest.get(name), own.manifest.get(name)
@@ -157,7 +157,7 @@ def _check_kin(store: Store, part: Part, own: Store, own_part: Part) -> None:
             )
 
 
-def _shapes(part: Part) -> dict[str, str]:
+def _shapes(part: MixtureComponent) -> dict[str, str]:
     _, record = Readable(part.source, Quarantine(None, len(part.source), 1.0), part.chosen)[0]
     arrays = part.transform(record, np.random.default_rng(0))
     return {name: f"{array.dtype} {array.shape}" for name, array in arrays.items()}
@@ -170,7 +170,7 @@ def _listed(labels: Labels) -> str:
     )
 
 
-def _distinct(stages: tuple[Stage, ...]) -> int:
+def _distinct(stages: tuple[CurriculumStage, ...]) -> int:
     """How many records there are in all, each counted once."""
     chosen: dict[str, list[np.ndarray]] = {}
     for part in (part for stage in stages for part in stage.parts):

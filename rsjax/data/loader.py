@@ -19,7 +19,7 @@ import grain
 import numpy as np
 
 from rsjax.config import ConfigError
-from rsjax.data.order import Arrays, Part, Stage, Transform, ordered
+from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transform, ordered
 from rsjax.data.quarantine import MAX_DAMAGED, Quarantine
 from rsjax.data.records import RecordSource, place_of
 from rsjax.data.store import StoreError
@@ -187,12 +187,12 @@ def batches(
         StoreError: if the source is empty.
     """
     listed = Quarantine(quarantine, len(source), max_damaged)
-    stages = [Stage((Part(source, transform),), 0)]
+    stages = [CurriculumStage((MixtureComponent(source, transform),), 0)]
     return staged_batches(stages, batch_size, seed, listed, workers=workers, state=state, shard=shard)
 
 
 def staged_batches(
-    stages: Sequence[Stage],
+    stages: Sequence[CurriculumStage],
     batch_size: int,
     seed: int,
     quarantine: Quarantine,

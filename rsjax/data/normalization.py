@@ -20,7 +20,7 @@ _FILE = "units.json"
 
 
 @dataclass(frozen=True)
-class Units:
+class Normalization:
     """Those of a data set.
 
     Attributes:
@@ -34,7 +34,7 @@ class Units:
     depth_range: tuple[float, float] | None
 
     @classmethod
-    def create(cls, store: Store) -> "Units":
+    def create(cls, store: Store) -> "Normalization":
         """The units in a store's manifest.
 
         Raises:
@@ -47,7 +47,7 @@ class Units:
             raise StoreError(f"{where}: no statistics of actions and depth ({error}); make the store again") from error
 
     @classmethod
-    def load(cls, run: Path) -> "Units":
+    def load(cls, run: Path) -> "Normalization":
         """Those that a run was trained in.
 
         Raises:
@@ -64,7 +64,7 @@ class Units:
         write_atomically(run / _FILE, json.dumps(asdict(self)).encode())
 
     @classmethod
-    def _of(cls, values: dict[str, Any]) -> "Units":
+    def _of(cls, values: dict[str, Any]) -> "Normalization":
         mean, std, near_far = (values[name] for name in ("action_mean", "action_std", "depth_range"))
         numbers = [*mean, *std, *(near_far or ())]
         if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):

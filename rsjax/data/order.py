@@ -21,7 +21,7 @@ Transform = Callable[[Record, np.random.Generator], Arrays]
 
 
 @dataclass(frozen=True)
-class Part:
+class MixtureComponent:
     """Records of one source that a stage draws from.
 
     Attributes:
@@ -41,14 +41,14 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Stage:
+class CurriculumStage:
     """Parts that are mixed, and for how many records. How many does not matter in the last stage: it is endless."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[MixtureComponent, ...]
     records: int
 
 
-def ordered(stages: Sequence[Stage], seed: int, quarantine: Quarantine) -> grain.MapDataset:
+def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine) -> grain.MapDataset:
     """The records of all stages, one after another; each part shuffled anew in every epoch of its own.
 
     ``part`` counts the parts of all stages, in order.
@@ -69,7 +69,7 @@ def ordered(stages: Sequence[Stage], seed: int, quarantine: Quarantine) -> grain
     return grain.MapDataset.concatenate(mixed) if before else mixed[0]
 
 
-def _dataset(part: Part, number: int, seed: int, quarantine: Quarantine) -> grain.MapDataset:
+def _dataset(part: MixtureComponent, number: int, seed: int, quarantine: Quarantine) -> grain.MapDataset:
     source = Readable(part.source, quarantine, part.chosen)
     dataset = grain.MapDataset.source(source).seed(seed).shuffle().repeat(None)
     return dataset.random_map(_Numbered(part.transform, number))

@@ -12,7 +12,7 @@ from rsjax.data.order import Arrays
 JOIN_SECONDS = 30.0  # for a batch that is being read when the end comes
 
 
-class Fed(NamedTuple):
+class DeviceBatch(NamedTuple):
     """One batch.
 
     Attributes:
@@ -44,7 +44,7 @@ class Prefetch:
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any], ahead: int = 2) -> None:
         self._loader, self._put = loader, put
-        self._queue: queue.Queue[Fed | BaseException] = queue.Queue(ahead)
+        self._queue: queue.Queue[DeviceBatch | BaseException] = queue.Queue(ahead)
         self._state = loader.state()
         self._stopped = threading.Event()
         self._failure: BaseException | None = None
@@ -55,7 +55,7 @@ class Prefetch:
     def __iter__(self) -> Self:
         return self
 
-    def __next__(self) -> Fed:
+    def __next__(self) -> DeviceBatch:
         began = time.monotonic()
         item = self._failure or self._queue.get()
         self.waited += time.monotonic() - began
@@ -69,7 +69,7 @@ class Prefetch:
         """The loader's state after the last batch that was handed out, whatever was made ahead."""
         return self._state
 
-    def identify(self, fed: Fed) -> list[dict[str, Any]]:
+    def identify(self, fed: DeviceBatch) -> list[dict[str, Any]]:
         """Where the clips of a batch lie and come from: :meth:`rsjax.data.loader.Loader.identify`.
 
         Of several processes', all rows of the batch, which is read once more for that.
@@ -98,7 +98,7 @@ class Prefetch:
         self._loader.close()
 
     def _work(self) -> None:
-        item: Fed | BaseException
+        item: DeviceBatch | BaseException
         while not self._stopped.is_set():
             try:
                 item = self._make()
@@ -108,8 +108,8 @@ class Prefetch:
             if isinstance(item, BaseException):
                 return
 
-    def _make(self) -> Fed:
+    def _make(self) -> DeviceBatch:
         before = self._loader.state()
         arrays = next(self._loader)
         clips = {name: arrays[name] for name in ("part", "record")}
-        return Fed(self._put(arrays), clips, before, self._loader.state())
+        return DeviceBatch(self._put(arrays), clips, before, self._loader.state())

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from rsjax.config import LoopConfig
-from rsjax.data.curriculum import Feed, plan
-from rsjax.data.normalization import Units
+from rsjax.data.curriculum import LoaderFactory, plan
+from rsjax.data.normalization import Normalization
 from rsjax.data.order import Transform
 from rsjax.data.store import Store
 from rsjax.pipeline import transforms
@@ -21,7 +21,7 @@ from rsjax.training.distributed import is_lead
 
 def planned(
     loop: LoopConfig, own: Store, transform: Callable[[Store], Transform], directory: Path
-) -> tuple[LoopConfig, Feed]:
+) -> tuple[LoopConfig, LoaderFactory]:
     """:func:`rsjax.data.curriculum.plan`, and what it made of the stages is told."""
     loop, feed = plan(loop, own, transform, directory)
     if is_lead():
@@ -35,10 +35,10 @@ def token_transform(own: Store, integrate: bool, store: Store) -> Transform:
 
     Args:
         own: the store of the model's own data.
-        integrate: whether the actions' sums follow them (see :meth:`rsjax.data.normalization.Units.action_inputs`).
+        integrate: whether to append the actions' sums (:meth:`rsjax.data.normalization.Normalization.action_inputs`).
         store: the one that is read.
     """
-    units = Units.create(own)
+    units = Normalization.create(own)
     here, there = _depth_told(own), _depth_told(store)
     if there and here != there and is_lead():
         note(f"{store.path}: its depth tokens stand for {there}, this run's for {here}; the model is not told")

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from rsjax.clip import Array
 from rsjax.config import Config, SampleConfig, from_dict
 from rsjax.data.depth_color import color_to_depth, depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
 from rsjax.models.roboscape.world_model import WorldModel, branches
@@ -32,7 +32,7 @@ class Codec:
 
     config: Config
     params: Any
-    units: Units
+    units: Normalization
 
     def encode_rgb(self, frames: UInt8[np.ndarray, "*B H W 3"]) -> Int[np.ndarray, "*B h w"]:
         """Frames 0–255 to tokens."""
@@ -117,7 +117,7 @@ class Generator:
         Raises:
             UserError: the run is missing, unfinished or damaged.
         """
-        config, units = load_config(run), Units.load(run / "tokens")
+        config, units = load_config(run), Normalization.load(run / "tokens")
         return cls(config, Codec(config, load_tokenizer(config, run), units), load_world_model(config, run))
 
     def generate(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rsjax.config import LoopConfig
-from rsjax.data.curriculum import Feed
+from rsjax.data.curriculum import LoaderFactory
 from rsjax.data.order import Arrays
 from rsjax.models.roboscape.world_model import branches
 from rsjax.pipeline import transforms
@@ -28,7 +28,7 @@ class Job(Generic[O]):
 
     objective: O
     loop: LoopConfig
-    feed: Feed
+    feed: LoaderFactory
     directory: Path
     name: str
     to_batch: Callable[[Arrays], Any]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.curriculum import check_stages
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard
@@ -136,7 +136,7 @@ def tokenize(run: Run) -> None:
     out = tokenize_store(clips, run.config, load_tokenizer(run.config, run.directory), folder)
     with disk_guard(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        Units.create(clips).save(folder)
+        Normalization.create(clips).save(folder)
         link(out, run.output("tokens"))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from rsjax.config import Config
 from rsjax.data.codec import Record
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Store, StoreError, open_store, write_store
@@ -53,7 +53,7 @@ def tokenize_store(clips: Store, config: Config, params: Any, place: Path) -> Pa
         out = place.resolve() / "own" / tokenizer
     with lock(_lock_of(out), wait=f"waiting for another process that makes {out}"):
         if not _is_made(out, key, clips):
-            _write(out, clips, Codec(config, params, Units.create(clips)), key)
+            _write(out, clips, Codec(config, params, Normalization.create(clips)), key)
     _list_left_out(out, clips, config, place)
     return out
 

@@ -7,7 +7,7 @@ import numpy as np
 from rsjax.clip import Batch
 from rsjax.data.codec import Record
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
 
 
@@ -52,12 +52,12 @@ def image_batch(arrays: Arrays) -> np.ndarray:
 TOKEN_ARRAYS = ("rgb", "depth", "actions", "tracks", "visible", "has_depth")
 
 
-def token_clip(units: Units, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
+def token_clip(units: Normalization, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
     """The arrays of a token record that a training step reads.
 
     Args:
         units: those of the model's own data, whichever store the record is from.
-        integrate: whether the actions' sums follow them (see ``Units.action_inputs``).
+        integrate: whether the actions' sums follow them (see ``Normalization.action_inputs``).
     """
     has_depth = record["depth"] is not None
     return {

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from rsjax.clip import Batch
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.records import RecordSource
 from rsjax.data.store import Store, StoreError
@@ -91,7 +91,9 @@ class WorldModelHeldOut:
 
     @cached_property
     def _codec(self) -> Codec:
-        return Codec(self.run.config, load_tokenizer(self.run.config, self.run.directory), Units.create(self._store))
+        return Codec(
+            self.run.config, load_tokenizer(self.run.config, self.run.directory), Normalization.create(self._store)
+        )
 
     @cached_property
     def _clips(self) -> Clips:
@@ -144,8 +146,8 @@ class TokenizerHeldOut:
         return self.run.open_clips()
 
     @cached_property
-    def _units(self) -> Units:
-        return Units.create(self._store)
+    def _units(self) -> Normalization:
+        return Normalization.create(self._store)
 
     @cached_property
     def _clips(self) -> Clips:

@@ -13,7 +13,7 @@ import jax
 
 from rsjax.config import LoopConfig
 from rsjax.data.loader import Loader
-from rsjax.data.prefetch import Fed, Prefetch
+from rsjax.data.prefetch import DeviceBatch, Prefetch
 from rsjax.errors import Preempted, UserError
 from rsjax.progress import Progress, note
 from rsjax.training.checkpoint import Checkpoints
@@ -110,7 +110,7 @@ class _Taken(NamedTuple):
     """A step that was dispatched, and may still be computed."""
 
     step: int
-    fed: Fed
+    fed: DeviceBatch
     metrics: dict[str, Any]
 
 

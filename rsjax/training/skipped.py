@@ -14,7 +14,7 @@ def read_skipped(directory: Path) -> list[dict[str, Any]]:
 
     Keys: ``step``; ``loss`` and ``grad_norm`` as text, for JSON has no NaN; ``records``, where the clips lie and come
     from; ``data``, the loader's state before the batch: given to
-    :meth:`rsjax.data.curriculum.Feed.replay`, the batch comes back.
+    :meth:`rsjax.data.curriculum.LoaderFactory.replay`, the batch comes back.
     """
     path = directory / NAME
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []

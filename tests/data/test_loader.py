@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
 from rsjax.data.loader import Loader, batches, epoch, staged_batches
-from rsjax.data.order import Part, Stage, ordered
+from rsjax.data.order import CurriculumStage, MixtureComponent, ordered
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Source, StoreError
 from tests.data import toy
@@ -51,7 +51,7 @@ def test_resumed_equals_never_stopped(source: Source) -> None:
 
 
 @st.composite
-def curricula(draw: st.DrawFn) -> tuple[list[Stage], int]:
+def curricula(draw: st.DrawFn) -> tuple[list[CurriculumStage], int]:
     """Stages of one to three parts, each part with records of its own, and a batch size that fits two processes."""
     batch_size, stages, first = 2 * draw(st.integers(1, 3)), [], 0
     for _ in range(draw(st.integers(1, 3))):
@@ -59,13 +59,13 @@ def curricula(draw: st.DrawFn) -> tuple[list[Stage], int]:
         for _ in range(draw(st.integers(1, 3))):
             size, weight = draw(st.integers(1, 7)), draw(st.sampled_from([0.5, 1.0, 2.5]))
             chosen = draw(st.none() | st.lists(st.integers(0, size - 1), min_size=1, unique=True).map(np.array))
-            parts.append(Part(Numbers(size, first), jitter, chosen, weight))
+            parts.append(MixtureComponent(Numbers(size, first), jitter, chosen, weight))
             first += size
-        stages.append(Stage(tuple(parts), batch_size * draw(st.integers(1, 4))))
+        stages.append(CurriculumStage(tuple(parts), batch_size * draw(st.integers(1, 4))))
     return stages, batch_size
 
 
-def loader(stages: list[Stage], size: int, place: int = 0, shard: tuple[int, int] = (0, 1)) -> Loader:
+def loader(stages: list[CurriculumStage], size: int, place: int = 0, shard: tuple[int, int] = (0, 1)) -> Loader:
     options = grain.sharding.ShardOptions(*shard)
     state = {"global_next_index": place * size}
     return staged_batches(stages, size, 3, UNLISTED, shard=options, state=state)
@@ -74,7 +74,7 @@ def loader(stages: list[Stage], size: int, place: int = 0, shard: tuple[int, int
 @settings(max_examples=15, deadline=None)
 @given(curricula(), st.data())
 def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
-    curriculum: tuple[list[Stage], int], data: st.DataObject
+    curriculum: tuple[list[CurriculumStage], int], data: st.DataObject
 ) -> None:
     stages, size = curriculum
     total = sum(stage.records for stage in stages) // size + 2  # the last stage goes on
@@ -94,7 +94,9 @@ def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
 
 @settings(max_examples=15, deadline=None)
 @given(curricula())
-def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(curriculum: tuple[list[Stage], int]) -> None:
+def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(
+    curriculum: tuple[list[CurriculumStage], int],
+) -> None:
     stages, size = curriculum
     with loader(stages, size) as whole:
         rows = take(whole, sum(stage.records for stage in stages) // size)
@@ -115,7 +117,7 @@ def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(curricul
 
 
 def test_one_stage_of_one_part_is_the_loader_without_stages_and_cut_as_grain_cuts() -> None:
-    stage = Stage((Part(Numbers(7), jitter),), 8)
+    stage = CurriculumStage((MixtureComponent(Numbers(7), jitter),), 8)
     with staged_batches([stage], 4, 5, UNLISTED) as staged, batches(Numbers(7), jitter, 4, seed=5) as plain:
         taken = take(staged, 6)
         assert_same(taken, take(plain, 6))
@@ -152,8 +154,11 @@ def test_processes_change_nothing_whether_told_to_stop_or_killed(tmp_path: Path)
     """Two worker processes over a stage's border, a mixture and a damaged record."""
     one, other = toy.store(tmp_path / "one", 5), toy.store(tmp_path / "other", 6, first=100)
     toy.damage(tmp_path / "one", 3)
-    whole, chosen = Part(one.source("train"), jitter), Part(other.source("train"), jitter, np.array([1, 4]))
-    stages = [Stage((whole, chosen), 16), Stage((chosen,), 8)]
+    whole, chosen = (
+        MixtureComponent(one.source("train"), jitter),
+        MixtureComponent(other.source("train"), jitter, np.array([1, 4])),
+    )
+    stages = [CurriculumStage((whole, chosen), 16), CurriculumStage((chosen,), 8)]
     listed = Quarantine(tmp_path / "quarantine.jsonl", 11)
     with staged_batches(stages, 4, 1, Quarantine(None, 11)) as alone:
         expected = take(alone, 9)

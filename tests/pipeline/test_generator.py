@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rsjax.config import presets, to_dict
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.world_model import WorldModel
@@ -21,7 +21,7 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 CONFIG = presets.debug()
 WIDTH = CONFIG.sim.action_dim
 NEAR_FAR = (0.4, 3.0)
-UNITS = Units(tuple(np.linspace(-1, 1, WIDTH)), (0.0, *np.linspace(0.1, 2, WIDTH - 1)), NEAR_FAR)
+UNITS = Normalization(tuple(np.linspace(-1, 1, WIDTH)), (0.0, *np.linspace(0.1, 2, WIDTH - 1)), NEAR_FAR)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 from experiments import train
 from experiments.cli import parse
 from rsjax.config import ConfigError, presets
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth import depth_scores
@@ -79,7 +79,7 @@ def test_units_that_are_none_are_told(clips: Path, changes: dict[str, Any]) -> N
     place = clips / "manifest.json"
     place.write_text(json.dumps(json.loads(place.read_text()) | changes))
     with pytest.raises(StoreError, match=r"manifest.json: no statistics of actions and depth \(.*\); make the store"):
-        Units.create(open_store(clips))
+        Normalization.create(open_store(clips))
 
 
 def test_tokens_of_other_clips_do_not_count_as_this_runs(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Pat
     tokens = open_store(tokenize_store(clips, config, codec.params, tmp_path / "run"))
     assert tokens.path.parent == (clips.path / "tokens")
     assert tokenize_store(clips, config, codec.params, tmp_path / "run") == tokens.path, "they are there already"
-    transform = partial(token_clip, Units.create(clips), config.model.integrate_actions)
+    transform = partial(token_clip, Normalization.create(clips), config.model.integrate_actions)
     for split, blind in BLIND.items():
         source = tokens.source(split)
         (batch,) = token_batches(source, transform, len(source))

@@ -5,7 +5,7 @@ import pytest
 
 from rsjax.clip import Batch
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.store import Record, encode_clip
 from rsjax.pipeline import transforms
 from tests.pipeline import toy
@@ -81,7 +81,7 @@ def test_images_of_several_clips_are_one_batch() -> None:
     np.testing.assert_array_equal(batch, np.concatenate([images[0], images[1]]))
 
 
-UNITS = Units((0.1, -0.2, 0.3), (0.5, 1.0, 2.0), (0.1, 1.0))
+UNITS = Normalization((0.1, -0.2, 0.3), (0.5, 1.0, 2.0), (0.1, 1.0))
 
 
 def token_record(record: Record) -> Record:

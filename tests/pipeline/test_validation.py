@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rsjax.clip import Batch
 from rsjax.config import Config, EvalConfig
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Record, StoreError, open_store, write_store
 from rsjax.evaluation import evaluate as evaluation
@@ -59,7 +59,7 @@ def batches(run: Run, size: int) -> list[Batch]:
 
 
 def transform(run: Run) -> Transform:
-    return partial(token_clip, Units.create(run.open_clips()), run.config.model.integrate_actions)
+    return partial(token_clip, Normalization.create(run.open_clips()), run.config.model.integrate_actions)
 
 
 def generator(run: Run) -> Generator:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rsjax.clip import Clip
 from rsjax.config import Config, EvalConfig, SampleConfig, presets
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.models.roboscape.world_model import WorldModel
 from rsjax.pipeline.generator import Codec, Generator
@@ -71,4 +71,4 @@ def generator(clips: Store) -> Generator:
     # Fresh heads are so even that actions hardly change what is most probable.
     params = jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
     tokenizer = jax.jit(Tokenizer(cfg.tokenizer).init_params)(jax.random.key(1))
-    return Generator(cfg, Codec(cfg, tokenizer, Units.create(clips)), params)
+    return Generator(cfg, Codec(cfg, tokenizer, Normalization.create(clips)), params)

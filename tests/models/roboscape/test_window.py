@@ -10,7 +10,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from rsjax.config import ModelConfig, SampleConfig
-from rsjax.data.normalization import Units
+from rsjax.data.normalization import Normalization
 from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.window import room, window_actions, window_start
@@ -38,7 +38,7 @@ def test_a_full_window_jumps_by_its_stride_and_all_windows_find_room(window: int
 def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, integrate: bool) -> None:
     model = SUMS if integrate else RGB
     raw = np.random.default_rng(0).normal(size=(BATCH, 7, 2)).astype(np.float32)
-    units = Units((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
+    units = Normalization((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
     seen = window_actions(model, units.action_inputs(raw, integrate), base, base, 4)
     expected = units.action_inputs(raw[:, base : base + 4].copy(), integrate)
     np.testing.assert_allclose(seen, expected, atol=1e-5)
