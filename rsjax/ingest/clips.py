@@ -219,7 +219,8 @@ def words(record: Record) -> dict[str, str]:
 
 def _camera(episode: Episode, name: str) -> str:
     if name and name not in episode.cameras:
-        raise EpisodeError(f"cameras: episode {episode.id} has no {name!r}; it has {', '.join(episode.cameras)}")
+        there = ", ".join(episode.cameras)
+        raise EpisodeError(f"cameras: episode {episode.id} has no {name!r}; it has {there}", option="--camera")
     return name or next(iter(episode.cameras))
 
 

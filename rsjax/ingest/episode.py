@@ -34,12 +34,14 @@ class EpisodeError(UserError):
     """One episode cannot be read: the message names the file, the field and the cure. A run quarantines it.
 
     Attributes:
-        kind: of :data:`rsjax.ingest.checks.KINDS`, as far as it is known what is wrong.
+        kind: one of :data:`rsjax.ingest.checks.KINDS`.
+        option: the command's option that rules the episode out, such as ``--camera``; "" where none does.
     """
 
-    def __init__(self, message: str, kind: str = "unreadable") -> None:
+    def __init__(self, message: str, kind: str = "unreadable", option: str = "") -> None:
         super().__init__(message)
         self.kind = kind
+        self.option = option
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ class Counts:
         found: episodes that the source lists.
         done: those that gave a clip.
         filtered: reason by episode, for those that were read and gave none.
-        quarantined: rows of the quarantine table: ``episode``, ``stage``, ``key``, ``error``, ``traceback``.
+        quarantined: rows of the quarantine table: ``episode``, ``stage``, ``key``, ``error``, ``option``
+            (the one that rules the episode out, or ""), ``traceback``.
         windows: how many were ``kept``, and how many each reason left out.
         stages: of each, how many units are done and failed, the seconds that they took on a worker and on its cores,
             and the clips per second of such a worker.
@@ -58,7 +59,7 @@ def count(job: Job, refs: Sequence[EpisodeRef], refused: Sequence[tuple[EpisodeR
     """
     filtered: dict[str, str] = {}
     short: dict[str, dict[str, Any]] = {}
-    quarantined = [dict(zip(_ROW, (ref.id, "list", ref.fingerprint, why, ""), strict=True)) for ref, why in refused]
+    quarantined = [dict(zip(_ROW, (ref.id, "list", ref.fingerprint, why, "", ""), strict=True)) for ref, why in refused]
     windows = Counter({"kept": 0})
     zeros = {"done": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0}
     stages: dict[str, dict[str, Any]] = {stage.name: dict(zeros) for stage in job.stages}
@@ -71,7 +72,7 @@ def count(job: Job, refs: Sequence[EpisodeRef], refused: Sequence[tuple[EpisodeR
                 stages[mark["stage"]][name] += mark[name]
         last = marks[-1]
         if last["status"] == "failed":
-            quarantined.append({name: last[name] for name in _ROW} | {"error": _plain(last["error"])})
+            quarantined.append({name: last.get(name, "") for name in _ROW} | {"error": _plain(last["error"])})
             continue
         windows.update(last["summary"]["windows"])
         clips += last["records"]
@@ -126,7 +127,7 @@ def _marks(job: Job, ref: EpisodeRef) -> list[Mark]:
     return marks
 
 
-_ROW = ("episode", "stage", "key", "error", "traceback")
+_ROW = ("episode", "stage", "key", "error", "option", "traceback")
 
 
 def _told(windows: dict[str, int]) -> str:
@@ -157,17 +158,10 @@ def _names(kind: type[UserError]) -> set[str]:
     return {kind.__name__}.union(*parts)
 
 
-_OPTIONS = {  # what the message of a quarantined episode says, where an option is the cause
-    "--camera": "cameras: ",
-    "--windows.rate": "lower windows.rate",
-    "--windows.within-segments": "turn within_segments off",
-}
-
-
 def blamed(counts: Counts) -> str:
-    """The one option for which all were quarantined; "" where there is none."""
-    errors = [row["error"] for row in counts.quarantined]
-    return next((option for option, mark in _OPTIONS.items() if errors and all(mark in told for told in errors)), "")
+    """The one option that ruled out every quarantined episode; "" where there is none."""
+    options = {row["option"] for row in counts.quarantined}
+    return options.pop() if len(options) == 1 else ""
 
 
 def tables(counts: Counts) -> str:

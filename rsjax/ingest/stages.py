@@ -76,7 +76,8 @@ class AnnotatorStage:
     def _work(self, episode: Episode, inputs: Inputs) -> Records:
         camera = self.camera or next(iter(episode.cameras))
         if camera not in episode.cameras:
-            raise EpisodeError(f"cameras: episode {episode.id} has no {camera!r}; it has {', '.join(episode.cameras)}")
+            there = ", ".join(episode.cameras)
+            raise EpisodeError(f"cameras: episode {episode.id} has no {camera!r}; it has {there}", option="--camera")
         return (yield from self.write(self.annotator, episode, camera, inputs))
 
 

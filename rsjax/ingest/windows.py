@@ -85,7 +85,8 @@ def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
     if not step < MAX_STEP:
         raise EpisodeError(f"fps: recorded at {fps:g} fps, which no camera does; mend the file's rate or times")
     if step < 1 - 1e-6:
-        raise EpisodeError(f"fps: recorded at {fps:g} fps, windows take {config.rate:g}; lower windows.rate")
+        message = f"fps: recorded at {fps:g} fps, windows take {config.rate:g}; lower windows.rate"
+        raise EpisodeError(message, option="--windows.rate")
     return np.floor(np.arange(config.frames) * step + 0.5 + 1e-9).astype(np.int64)
 
 
@@ -129,7 +130,8 @@ def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], co
         ordered = sorted(segments, key=lambda segment: segment.start)
         for before, after in pairwise(ordered):
             if after.start < before.end:
-                raise EpisodeError(f"segments: {before.text!r} and {after.text!r} overlap; turn within_segments off")
+                message = f"segments: {before.text!r} and {after.text!r} overlap; turn within_segments off"
+                raise EpisodeError(message, option="--windows.within-segments")
         spans = [(max(a, s.start), min(b, s.end)) for a, b in spans for s in ordered]
     return [(first, end) for first, end in spans if end > first]
 

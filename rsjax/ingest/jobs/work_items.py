@@ -181,9 +181,12 @@ class _Clock:
 
 def fail_unit(job: Job, unit: Unit, error: BaseException, seconds: dict[str, float]) -> Mark:
     """Leaves a failed mark: a row of the quarantine table."""
-    told = " ".join(f"{type(error).__name__}: {error}".split())
-    trace = "".join(traceback.format_exception(error))
-    return leave_mark(job, unit, {"status": "failed", **seconds, "error": told, "traceback": trace})
+    row = {
+        "error": " ".join(f"{type(error).__name__}: {error}".split()),
+        "option": getattr(error, "option", ""),
+        "traceback": "".join(traceback.format_exception(error)),
+    }
+    return leave_mark(job, unit, {"status": "failed", **seconds, **row})
 
 
 def leave_mark(job: Job, unit: Unit, mark: Mark) -> Mark:
