@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.soak.rounds import Stage, Target
-from rsjax.soak.runs import run_through
 from tests.pipeline.conftest import command, debug, shared
 from tests.reliability.program import make_store
+from tests.soak.rounds import Stage, Target, run_without_faults
 
 __all__ = ["command", "debug", "shared"]
 
@@ -39,8 +38,8 @@ def target(store: Path, tmp_path: Path) -> Targets:
 
 @pytest.fixture(scope="session")
 def whole(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The stage's folder of a run that nothing disturbed. Only for reading."""
+    """The stage's folder of a run without faults. Only for reading."""
     folder = tmp_path_factory.mktemp("whole") / "stage"
     command = (sys.executable, "-m", "tests.reliability.program", str(folder), str(store))
-    run_through(Target(command, (Stage(folder),), folder.parent / "output", 0.0, 0.0, to_the_end=True))
+    run_without_faults(Target(command, (Stage(folder),), folder.parent / "output", to_the_end=True))
     return folder

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.soak.rounds import Stage, Target
 from tests.soak import dummy
+from tests.soak.rounds import Stage, Target
 
 Dummies = Callable[..., Target]
 

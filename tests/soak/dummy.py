@@ -1,4 +1,4 @@
-"""What a training command leaves in its directory, without training: ``python dummy.py FOLDER [FAULT]``.
+"""Leaves what a training command leaves in its directory, without training: ``python dummy.py FOLDER [FAULT]``.
 
 FAULT is ``deaf`` (exits with 1 on SIGTERM) or ``broken`` (cannot be started twice).
 """

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rsjax.config import LoopConfig
-from rsjax.soak.compare import compare_arrays, compare_logs, compare_stages, listed, read_arrays, same_bits
 from rsjax.training.checkpoint import save_weights
+from tests.soak.compare import compare_arrays, compare_logs, compare_stages, json_lines, read_arrays, same_bits
 from tests.training.toy import train
 
 
@@ -63,13 +63,13 @@ def test_saved_arrays_are_compared_by_name(tmp_path: Path) -> None:
     assert compare_arrays(tmp_path / "one", tmp_path / "none") == [f"{tmp_path / 'none'}: missing"]
 
 
-def test_the_place_of_a_run_does_not_count_in_its_lists(tmp_path: Path) -> None:
+def test_a_runs_own_path_does_not_count_in_its_lists(tmp_path: Path) -> None:
     for name in ("one", "two"):
         stage = tmp_path / name / "stage"
         stage.mkdir(parents=True)
         row = json.dumps({"store": f"{tmp_path / name}/tokens", "record": 3})
         (stage / "quarantine.jsonl").write_text(f"{row}\n{row[:9]}\n{row}\n")
-    one, two = (listed(tmp_path / name / "stage", "quarantine.jsonl") for name in ("one", "two"))
+    one, two = (json_lines(tmp_path / name / "stage", "quarantine.jsonl") for name in ("one", "two"))
     assert one == two and len(one) == 1
 
 
@@ -83,6 +83,6 @@ def test_stages_differ_where_their_last_checkpoint_does(tmp_path: Path) -> None:
     shutil.rmtree(other / "checkpoints" / "4")
     assert compare_stages(tmp_path / "one", other) == ["the newest checkpoint is of step 4 here, of 2 there"]
     (other / "checkpoints" / "2").rename(other / "checkpoints" / "4")
-    found = compare_stages(tmp_path / "one", other)
-    assert any("'params'" in line for line in found)
-    assert any(line.startswith("the place in the data is") for line in found)
+    differences = compare_stages(tmp_path / "one", other)
+    assert any("'params'" in line for line in differences)
+    assert any(line.startswith("the data position is") for line in differences)

@@ -12,38 +12,38 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.soak.disturb import (
+from tests.soak.attempt import Attempt, finished
+from tests.soak.conftest import Dummies
+from tests.soak.dummy import STEPS
+from tests.soak.faults import (
     KILL_COMPILING,
     KILL_STARTING,
     KILL_TRAINING,
     KILL_WRITING,
     SHARES,
     TERMINATE,
-    Blow,
+    Fault,
     damage_file,
-    deck,
+    schedule,
 )
-from rsjax.soak.rounds import Event, run_round, settle
-from rsjax.soak.watch import Attempt, finished
-from tests.soak.conftest import Dummies
-from tests.soak.dummy import STEPS
+from tests.soak.rounds import Event, run_round, settle
 
 
-def test_a_round_goes_on_after_every_blow_until_the_run_is_finished(target: Dummies) -> None:
+def test_a_round_goes_on_after_every_fault_until_the_run_is_finished(target: Dummies) -> None:
     said: list[str] = []
-    disturbed = target()
+    hit = target()
     kinds = itertools.cycle([KILL_COMPILING, KILL_WRITING, TERMINATE, KILL_TRAINING])
-    done = run_round(disturbed, kinds, random.Random(0), time.monotonic() + 3, said.append)
+    done = run_round(hit, kinds, random.Random(0), time.monotonic() + 3, said.append)
     assert done.problem == ""
-    assert disturbed.current is None
+    assert hit.current is None
     assert len(done.events) >= 3
     assert all(event.survived for event in done.events)
     assert done.starts == len(done.events) + 1
-    assert {event.blow.kind for event in done.events} <= SHARES.keys()
+    assert {event.fault.kind for event in done.events} <= SHARES.keys()
     assert sum("went on from step" in line for line in said) >= 2
 
 
-def test_what_is_over_is_left_to_finish(target: Dummies) -> None:
+def test_a_run_is_left_to_finish_when_the_time_is_up(target: Dummies) -> None:
     done = run_round(target(), itertools.repeat(KILL_TRAINING), random.Random(0), time.monotonic(), print)
     assert (done.events, done.starts, done.problem) == ((), 1, "")
 
@@ -74,13 +74,13 @@ def test_the_phases_of_a_start_are_seen_from_outside(target: Dummies) -> None:
     assert attempt.first_step is not None and 0 < attempt.first_step < attempt.seconds
 
 
-def test_steps_done_again_are_charged_once_and_every_start_to_the_blow_before_it(tmp_path: Path) -> None:
+def test_steps_done_again_are_charged_once_and_every_start_to_the_fault_before_it(tmp_path: Path) -> None:
     events: list[Event] = []
     for step, attempt in ((17, None), (17, start(None, {}, 2.0)), (31, start(4.0, {tmp_path: 10}, 9.0))):
         if attempt is not None:
-            events = settle(events, attempt, done=False)
-        events.append(Event(Blow(KILL_TRAINING if step == 17 else KILL_STARTING), tmp_path, step))
-    events = settle(events, start(None, {tmp_path: 30}, 3.0), done=True)
+            settle(events, attempt, done=False)
+        events.append(Event(Fault(KILL_TRAINING if step == 17 else KILL_STARTING), tmp_path, step))
+    settle(events, start(None, {tmp_path: 30}, 3.0), done=True)
     assert [event.repeated for event in events] == [7, 0, 1]
     assert [event.seconds for event in events] == [2.0, 4.0, 3.0]
     assert [event.lost(0.5) for event in events] == [5.5, 4.0, 3.5]
@@ -92,10 +92,10 @@ def start(first_step: float | None, resumed: dict[Path, int], seconds: float) ->
 
 
 @given(st.integers(0, 1000), st.integers(1, 3))
-def test_a_deck_has_every_kind_as_often_as_its_share(seed: int, times: int) -> None:
+def test_the_schedule_has_every_kind_as_often_as_its_share(seed: int, times: int) -> None:
     size = sum(SHARES.values())
-    cards = list(itertools.islice(deck(random.Random(seed), SHARES), times * size))
-    assert {kind: cards.count(kind) for kind in SHARES} == {kind: times * share for kind, share in SHARES.items()}
+    kinds = list(itertools.islice(schedule(random.Random(seed), SHARES), times * size))
+    assert {kind: kinds.count(kind) for kind in SHARES} == {kind: times * share for kind, share in SHARES.items()}
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -104,11 +104,11 @@ def test_damage_hits_exactly_one_file(seed: int, tmp_path: Path) -> None:
     for name in ("one", "deep/two", "empty"):
         (tmp_path / name).write_bytes(b"" if name == "empty" else bytes(range(50)))
     before = contents(tmp_path)
-    told = damage_file(tmp_path, random.Random(seed))
+    message = damage_file(tmp_path, random.Random(seed))
     after = contents(tmp_path)
     changed = [name for name in before if after.get(name) != before[name]]
     assert len(changed) == 1
-    assert changed[0] in told
+    assert changed[0] in message
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -123,17 +123,17 @@ def test_a_finished_run_has_all_its_steps(target: Dummies) -> None:
 
 def test_what_a_killed_soak_had_started_dies_with_it(target: Dummies, tmp_path: Path) -> None:
     if shutil.which("setpriv") is None:
-        pytest.skip("setpriv, of util-linux, is not there")
+        pytest.skip("util-linux's setpriv is not installed")
     dummy = target()
     code = (
-        "import time; from pathlib import Path; from rsjax.soak.watch import Attempt; "
+        "import time; from pathlib import Path; from tests.soak.attempt import Attempt; "
         f"attempt = Attempt({dummy.command!r}, [Path({str(dummy.trained[0])!r})], Path({str(dummy.output)!r})); "
         "print(attempt.process.pid, flush=True); time.sleep(60)"
     )
     soak = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert soak.stdout is not None
     child = int(soak.stdout.readline())
-    while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():  # which asks for the signal, on its way
+    while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():  # until it has asked for the signal
         time.sleep(0.01)
     soak.kill()
     soak.wait()

@@ -1,4 +1,4 @@
-"""Full disks for real: a directory put on a small file system of its own. Needs root and Linux's tmpfs."""
+"""Really full disks: puts a directory on a small file system of its own. Needs root and Linux's tmpfs."""
 
 import os
 import shutil
@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-TOO_MUCH = 2**40  # bytes; memory is taken only as files fill it
+UNLIMITED = 2**40  # bytes; memory is taken only as files fill it
 
 
-def can_mount(place: Path) -> bool:
+def can_mount(directory: Path) -> bool:
     """Whether a file system can be mounted in this directory."""
-    probe = place / "probe"
+    probe = directory / "probe"
     probe.mkdir(parents=True, exist_ok=True)
     try:
         _mount(probe, 2**20)
-        _unmount(probe)
+        _run("umount", "-l", str(probe))
     except (OSError, subprocess.CalledProcessError):
         return False
     finally:
@@ -26,15 +26,15 @@ def can_mount(place: Path) -> bool:
 
 @contextmanager
 def small_disk(folder: Path, spare: int) -> Iterator[None]:
-    """The directory on a disk of its own with ``spare`` bytes left; afterwards where it was, with what was added.
+    """Puts the directory on a disk of its own with ``spare`` bytes left; at the end, moves it back with what was added.
 
-    Whoever reads or writes there must have ended before, on both sides.
+    Nobody may read or write in it when it moves, in either direction.
     """
     aside, back = (folder.with_name(f"{folder.name}.{word}") for word in ("aside", "back"))
     folder.rename(aside)
     folder.mkdir()
-    _mount(folder, TOO_MUCH)
-    stays = aside
+    _mount(folder, UNLIMITED)
+    kept = aside
     try:
         shutil.copytree(aside, folder, dirs_exist_ok=True)
         disk = os.statvfs(folder)
@@ -42,16 +42,16 @@ def small_disk(folder: Path, spare: int) -> Iterator[None]:
         _run("mount", "-o", f"remount,size={used + spare}", str(folder))
         yield
         shutil.copytree(folder, back)
-        stays = back
+        kept = back
     finally:
-        _unmount(folder)
+        _run("umount", "-l", str(folder))
         folder.rmdir()
-        stays.rename(folder)
+        kept.rename(folder)
         for other in (aside, back):
             shutil.rmtree(other, ignore_errors=True)
 
 
-def unmount_below(place: Path) -> None:
+def unmount_below(directory: Path) -> None:
     """Unmounts what a killed soak left mounted in this directory."""
     try:
         lines = Path("/proc/self/mountinfo").read_text().splitlines()
@@ -59,16 +59,12 @@ def unmount_below(place: Path) -> None:
         return  # not Linux, so nothing was ever mounted
     for line in reversed(lines):
         mounted = Path(line.split()[4].replace("\\040", " "))
-        if place.absolute() in mounted.parents:
-            _unmount(mounted)
+        if directory.absolute() in mounted.parents:
+            _run("umount", "-l", str(mounted))
 
 
 def _mount(folder: Path, size: int) -> None:
     _run("mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder))
-
-
-def _unmount(folder: Path) -> None:
-    _run("umount", "-l", str(folder))
 
 
 def _run(*command: str) -> None:

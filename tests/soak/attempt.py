@@ -1,6 +1,6 @@
-"""A command that trains, started in a process of its own and looked at from outside: its directory tells how far it is.
+"""Starts a training command in a process of its own and follows its progress from outside, by the run's directory.
 
-Nothing in the command knows that it is watched, so what is disturbed is what a user runs.
+The command does not know that it is watched, so faults hit exactly what a user runs.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ Phase = Literal["starting", "compiling", "training"]
 
 
 def checkpoints(folder: Path) -> list[int]:
-    """Steps of a stage's checkpoints that stand under their own names, so are whole."""
+    """Returns the steps of a stage's complete checkpoints."""
     return sorted(int(name) for name in _names(folder / "checkpoints") if name.isdigit())
 
 
@@ -32,7 +32,7 @@ def unfinished(folder: Path) -> bool:
 
 
 def finished(folder: Path) -> bool:
-    """Whether the stage's mark says so."""
+    """Whether the stage is marked as finished."""
     try:
         return bool(json.loads((folder / "stage.json").read_text())["finished"])
     except (OSError, ValueError, KeyError):
@@ -40,7 +40,7 @@ def finished(folder: Path) -> bool:
 
 
 def last_logged(folder: Path) -> int:
-    """The last step in the stage's log; 0 where there is none. A line that is still being written does not count."""
+    """Returns the last step in the stage's log, 0 without one; a line that is still being written does not count."""
     try:
         with (folder / "log.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - 16384))
@@ -53,43 +53,50 @@ def last_logged(folder: Path) -> int:
     return 0
 
 
-class Seen(NamedTuple):
-    """What lay in a stage's directory before a start."""
+def last_step(folder: Path) -> int:
+    """Returns the last step that is known to be done: logged or saved."""
+    return max(last_logged(folder), *checkpoints(folder), 0)
 
-    mark: int
-    log: int
+
+class Before(NamedTuple):
+    """State of a stage's directory before a start."""
+
+    mark: int  # modification time
+    log: int  # inode
     checkpoints: tuple[int, ...]
 
     @classmethod
-    def of(cls, folder: Path) -> "Seen":
-        return cls(_stat(folder / "stage.json").mtime, _stat(folder / "log.jsonl").inode, tuple(checkpoints(folder)))
+    def read(cls, folder: Path) -> "Before":
+        return cls(_mark_time(folder), _log_inode(folder), tuple(checkpoints(folder)))
 
 
 class Attempt:
     """One start of the command.
 
     Args:
-        command: as it is typed.
+        command: the command line.
         folders: of the training stages, in the order in which they run.
-        output: a file that all it prints is added to.
+        output: a file to which everything that the command prints is appended.
 
     Attributes:
         process: the command's.
-        began: when it was started, in seconds of the monotonic clock.
-        resumed: the step each stage went on from, once its loop has begun.
-        first_step: seconds from the start until the first new step was seen; None before.
+        resumed: the step from which each stage resumed, once its loop has begun.
+        first_step: seconds from the start to the first new step; None before it.
     """
 
     def __init__(self, command: Sequence[str], folders: Sequence[Path], output: Path) -> None:
         self._folders = tuple(folders)
-        self._before = {folder: Seen.of(folder) for folder in folders}
+        self._before = {folder: Before.read(folder) for folder in folders}
+        self._training: set[Path] = set()
+        self._began = time.monotonic()
         self.resumed: dict[Path, int] = {}
         self.first_step: float | None = None
-        self._training: set[Path] = set()
-        self.began = time.monotonic()
+        # A soak that is killed leaves no training behind, where util-linux is installed.
+        setpriv = shutil.which("setpriv")
+        dying_with_parent = (setpriv, "--pdeathsig", "KILL") if setpriv else ()
         with output.open("ab") as out:
             self.process = subprocess.Popen(
-                (*_dying_with_parent(), *command),
+                (*dying_with_parent, *command),
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=out,
@@ -98,7 +105,7 @@ class Attempt:
 
     @property
     def folder(self) -> Path:
-        """The stage that is trained now, or will be next; the last one when all are finished."""
+        """The stage that trains now or next; the last one when all are finished."""
         return next((folder for folder in self._folders if not finished(folder)), self._folders[-1])
 
     @property
@@ -107,23 +114,23 @@ class Attempt:
 
     @property
     def seconds(self) -> float:
-        return time.monotonic() - self.began
+        """Since the start."""
+        return time.monotonic() - self._began
 
     def phase(self) -> Phase:
-        """How far this start has come: nothing begun, on the way to the first step of the stage, or past it."""
+        """Returns how far this start is: stage not begun, before the stage's first new step, or past it."""
         folder = self.folder
         if folder in self._training:
             return "training"
         before = self._before[folder]
-        if _stat(folder / "stage.json").mtime == before.mark:
+        if _mark_time(folder) == before.mark:
             return "starting"
         if folder not in self.resumed:
-            if _stat(folder / "log.jsonl").inode in (0, before.log):
+            if _log_inode(folder) in (0, before.log):
                 return "compiling"
-            # The loop cuts its log first; by then a damaged checkpoint has been put aside.
-            left = set(before.checkpoints).intersection(checkpoints(folder))
-            self.resumed[folder] = max(left, default=0)
-        if max(last_logged(folder), *checkpoints(folder), 0) <= self.resumed[folder]:
+            # The loop truncates its log first; by then it has renamed a damaged checkpoint.
+            self.resumed[folder] = max({*before.checkpoints}.intersection(checkpoints(folder)), default=0)
+        if last_step(folder) <= self.resumed[folder]:
             return "compiling"
         if self.first_step is None:
             self.first_step = self.seconds
@@ -131,13 +138,10 @@ class Attempt:
         return "training"
 
     def wait(self, until: Callable[[], bool], seconds: float = float("inf")) -> bool:
-        """Waits for a condition, for at most so many seconds; whether it came before the command or the stages ended.
-
-        The phase is kept up to date on the way.
-        """
+        """Waits for a condition; returns whether it came true within the time and before command or stages ended."""
         end = time.monotonic() + seconds
         while self.alive and not all(finished(folder) for folder in self._folders):
-            self.phase()
+            self.phase()  # records ``resumed`` and ``first_step`` on the way
             if until():
                 return True
             if time.monotonic() >= end:
@@ -145,35 +149,34 @@ class Attempt:
             time.sleep(POLL_SECONDS)
         return False
 
-    def linger(self, seconds: float) -> bool:
-        """Waits so long; whether the command and the stages still went on at the end of it."""
+    def wait_for_training(self, seconds: float = float("inf")) -> bool:
+        """Waits for the first new step of the stage; returns as :meth:`wait`."""
+        return self.wait(lambda: self.phase() == "training", seconds)
+
+    def linger(self, seconds: float = float("inf")) -> bool:
+        """Waits so long; returns whether command and stages were still going on at the end of it."""
         end = time.monotonic() + seconds
         return self.wait(lambda: time.monotonic() >= end)
 
     def kill(self) -> None:
-        """SIGKILL to the command and all that it started."""
+        """Sends SIGKILL to the command and everything that it started."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
 
-def _dying_with_parent() -> tuple[str, ...]:
-    # A soak that is killed leaves no training behind, where util-linux is installed.
-    setpriv = shutil.which("setpriv")
-    return (setpriv, "--pdeathsig", "KILL") if setpriv else ()
-
-
-class _Stat(NamedTuple):
-    mtime: int
-    inode: int
-
-
-def _stat(path: Path) -> _Stat:
+def _mark_time(folder: Path) -> int:
     try:
-        found = path.stat()
+        return (folder / "stage.json").stat().st_mtime_ns
     except OSError:
-        return _Stat(0, 0)
-    return _Stat(found.st_mtime_ns, found.st_ino)
+        return 0
+
+
+def _log_inode(folder: Path) -> int:
+    try:
+        return (folder / "log.jsonl").stat().st_ino
+    except OSError:
+        return 0
 
 
 def _names(folder: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Processes that are really killed, stopped, damaged and starved of room, and end as if nothing had been."""
+"""Processes that are really killed, stopped, damaged and run out of disk space, and end as if nothing had happened."""
 
 import json
 import random
@@ -9,28 +9,27 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.soak.compare import compare_stages
-from rsjax.soak.disk import can_mount, small_disk
-from rsjax.soak.disturb import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, SHARES, TERMINATE, damage_file
-from rsjax.soak.rounds import Event, Target, run_round
-from rsjax.soak.runs import run_through
-from rsjax.soak.watch import Attempt, checkpoints, last_logged
 from rsjax.training.skipped import read_skipped
 from tests.reliability.conftest import EVERY, STEPS, Targets
+from tests.soak.attempt import Attempt, checkpoints, last_logged
+from tests.soak.compare import compare_stages
+from tests.soak.disk import can_mount, small_disk
+from tests.soak.faults import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, SHARES, TERMINATE, damage_file
+from tests.soak.rounds import Event, Target, run_round, run_without_faults
 
 SEED = 0
 
 
-def disturb(target: Target, kinds: Iterator[str], seed: int = SEED) -> tuple[Event, ...]:
-    """A round that has to be survived."""
-    done = run_round(target, kinds, random.Random(seed), float("inf"), print)
+def inject(target: Target, kinds: Iterator[str], seed: int = SEED) -> tuple[Event, ...]:
+    """Runs a round, which has to be survived."""
+    done = run_round(target, kinds, random.Random(seed))
     assert done.problem == ""
     assert all(event.survived for event in done.events)
     assert done.starts == len(done.events) + 1
     return done.events
 
 
-def test_disturbed_in_every_way_a_run_ends_bit_identical_to_one_that_was_not(
+def test_a_run_with_every_kind_of_fault_ends_bit_identical_to_one_without(
     whole: Path, target: Targets, tmp_path: Path
 ) -> None:
     kinds = [*SHARES, KILL_WRITING, TERMINATE]
@@ -38,10 +37,10 @@ def test_disturbed_in_every_way_a_run_ends_bit_identical_to_one_that_was_not(
         kinds.remove(FULL_DISK)
     random.Random(SEED).shuffle(kinds)
     print(f"seed {SEED}: {kinds}")
-    disturbed = target("disturbed")
-    events = disturb(disturbed, iter(kinds))
-    assert compare_stages(disturbed.trained[0], whole) == []
-    stopped = [event for event in events if event.blow.kind == TERMINATE]
+    hit = target("hit")
+    events = inject(hit, iter(kinds))
+    assert compare_stages(hit.trained[0], whole) == []
+    stopped = [event for event in events if event.fault.kind == TERMINATE]
     assert [event.repeated for event in stopped] == [0] * len(stopped)
 
 
@@ -50,8 +49,8 @@ def test_steps_that_are_not_finite_are_left_out_and_listed_the_same_when_killed_
 ) -> None:
     poisoned = ("--poisoned", 11, 12, 25)
     alone, killed = target("alone", *poisoned), target("killed", *poisoned)
-    run_through(alone)
-    disturb(killed, iter([KILL_TRAINING]))
+    run_without_faults(alone)
+    inject(killed, iter([KILL_TRAINING]))
     assert compare_stages(killed.trained[0], alone.trained[0]) == []
     assert compare_stages(alone.trained[0], whole) != []
     rows = read_skipped(alone.trained[0])
@@ -66,11 +65,11 @@ def test_too_many_steps_that_are_not_finite_stop_the_command_with_their_batches_
     assert [row["step"] for row in read_skipped(diverging.trained[0])] == [2, 4]
 
 
-def test_a_damaged_newest_checkpoint_is_told_and_the_one_before_is_used(whole: Path, target: Targets) -> None:
+def test_a_damaged_newest_checkpoint_is_reported_and_the_one_before_is_used(whole: Path, target: Targets) -> None:
     again = begun(target("again"), whole)
-    told = damage_file(again.trained[0] / "checkpoints" / str(STEPS) / "state", random.Random(SEED))
-    run_through(again)
-    assert f"checkpoint {STEPS} is damaged" in again.output.read_text(), told
+    message = damage_file(again.trained[0] / "checkpoints" / str(STEPS) / "state", random.Random(SEED))
+    run_without_faults(again)
+    assert f"checkpoint {STEPS} is damaged" in again.output.read_text(), message
     assert compare_stages(again.trained[0], whole) == []
 
 
@@ -88,12 +87,12 @@ def test_a_full_disk_stops_the_command_in_one_line_and_leaves_the_last_checkpoin
     assert "disk is full" in line
     assert checkpoints(full.trained[0]) == [STEPS - EVERY]
     assert checksums(last) == before
-    run_through(full)
+    run_without_faults(full)
     assert compare_stages(full.trained[0], whole) == []
 
 
 def begun(target: Target, whole: Path) -> Target:
-    """The target with all that the whole run has but the final weights."""
+    """Gives the target all that the whole run has except the final weights."""
     folder = target.trained[0]
     shutil.copytree(whole, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("weights"))
     (folder / "stage.json").write_text(json.dumps({"finished": False}))
@@ -101,7 +100,7 @@ def begun(target: Target, whole: Path) -> Target:
 
 
 def refusal(target: Target) -> str:
-    """The last line of a command that has to end with an error that its user can cure."""
+    """Returns the last line of a command that has to end with an error that the user can cure."""
     attempt = Attempt(target.command, target.trained, target.output)
     assert attempt.process.wait() == FAILED
     output = target.output.read_text()
@@ -113,6 +112,6 @@ def checksums(folder: Path) -> dict[Path, int]:
     return {path: zlib.crc32(path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_folder_tells_how_far_it_is(whole: Path) -> None:
+def test_progress_is_read_from_a_folder(whole: Path) -> None:
     assert last_logged(whole) == STEPS
     assert checkpoints(whole) == [STEPS - EVERY, STEPS]

@@ -1,1 +1,0 @@
-"""The soak: a training command disturbed at random, again and again, and held against a run that nothing disturbed."""

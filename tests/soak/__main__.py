@@ -1,0 +1,42 @@
+"""Injects faults into the training command and compares the results. ``python -m tests.soak tiny --minutes 30``"""
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Sequence
+from functools import partial
+
+from experiments.cli import main_errors, parse
+from tests.soak.runs import Options, Soak
+from tests.soak.soak import run_soak
+from tests.soak.table import markdown, passed
+
+PROG = "python -m tests.soak"
+
+
+@main_errors()
+def main() -> None:
+    """Soaks, prints the result, and exits with 1 if a fault was not survived or a run ended differently."""
+    argv = sys.argv[1:]
+    config, options = parse(argv, PROG, "Kills, stops and damages runs, and compares the results.", Options())
+    soak = Soak(config, training_arguments(argv), options)
+    result = run_soak(soak, shlex.join([*PROG.split(), *argv]), partial(print, flush=True))
+    print(f"{markdown(result)}\nsoak: {(soak.out / 'soak.md').absolute()}")
+    if not passed(result):
+        raise SystemExit(1)
+
+
+def training_arguments(argv: Sequence[str]) -> tuple[str, ...]:
+    """Returns the arguments for ``experiments.train``: those that are not options of this command alone."""
+    own = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options) if field.name != "store"}
+    kept, words = [], iter(argv)
+    for word in words:
+        if word.partition("=")[0].replace("_", "-") not in own:
+            kept.append(word)
+        elif "=" not in word:
+            next(words, None)  # its value
+    return tuple(kept)
+
+
+if __name__ == "__main__":
+    main()
