@@ -1,26 +1,52 @@
-"""Files that other processes and later runs read: whole or not at all, locked, and with clear errors on a full disk."""
+"""Files that other processes and later runs read: written atomically, locked, with clear errors on a full disk."""
 
 import errno
-import fcntl
+import json
 import os
 import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from filelock import lock_descriptor
 
 from rsjax.errors import UserError
 from rsjax.progress import note
 
-LOOKS, LOOK_SECONDS = 5, 0.05  # before a lock that is not waited for counts as another's
+LOCK_SECONDS = 0.25  # for which a free lock may look taken, while other processes look at it
 
 
 class FileError(UserError):
-    """A file that cannot be read or written. The message names it and the cure."""
+    """A file cannot be read or written. The message names it and the cure."""
+
+
+def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete it") -> Any:
+    """Reads a JSON file.
+
+    Args:
+        kind: the type of its top level, ``dict`` or ``list``.
+        cure: what to do about a file that is missing or damaged.
+
+    Raises:
+        FileError: the file is missing, cannot be read, is not JSON in UTF-8, or holds another type.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileError(f"{path}: missing; {cure}") from error
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{path}: not JSON ({error}); {cure}") from error
+    if not isinstance(content, kind):
+        raise FileError(f"{path}: a JSON {kind.__name__} is expected, not {content!r:.80}; {cure}")
+    return content
 
 
 def replace_directory(new: Path, path: Path) -> None:
-    """Move a finished directory to its place; an older one there is gone only after that."""
+    """Moves a finished directory to its place and deletes an older one there afterwards."""
     old = path.with_name(f"{path.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     if path.exists():
@@ -30,7 +56,7 @@ def replace_directory(new: Path, path: Path) -> None:
 
 
 def write_atomically(path: Path, payload: bytes) -> None:
-    """Write a file that a reader sees whole or not at all."""
+    """Writes a file that a reader sees whole or not at all."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         temporary.write_bytes(payload)
@@ -41,31 +67,32 @@ def write_atomically(path: Path, payload: bytes) -> None:
 
 @contextmanager
 def disk_guard(path: Path) -> Iterator[None]:
-    """Turn the operating system's full disk or refused write into a :class:`FileError` that names the place."""
+    """Turns a full disk or a refused write into a :class:`FileError` that names ``path``."""
     try:
         yield
     except OSError as error:
-        raise _explain(path, error) from error
-    except (RuntimeError, ValueError) as error:  # how ArrayRecord reports them
+        if error.errno == errno.ENOSPC:
+            raise _disk_full(path) from error
+        raise FileError(f"{path}: cannot write ({error}); check the place and its permissions") from error
+    except (RuntimeError, ValueError) as error:  # ArrayRecord reports a full disk by these
         if "No space left" in str(error):
-            raise _explain(path, OSError(errno.ENOSPC, "")) from error
+            raise _disk_full(path) from error
         raise
 
 
-def _explain(path: Path, error: OSError) -> FileError:
-    if error.errno == errno.ENOSPC:
-        return FileError(f"{path}: the disk is full; free some space there and run again")
-    return FileError(f"{path}: cannot write ({error}); check the place and its permissions")
+def _disk_full(path: Path) -> FileError:
+    return FileError(f"{path}: the disk is full; free some space there and run again")
 
 
 @contextmanager
 def lock(path: Path, wait: str = "") -> Iterator[bool]:
-    """Holds the lock of this name, or gives False where another process does.
+    """Takes the lock of this name and yields True, or yields False if another process keeps it.
 
-    The file stays: deleting it would let two processes hold locks of one name.
+    The operating system releases the lock of a process that dies. The file stays: deleting it would let two processes
+    take locks of one name.
 
     Args:
-        wait: wait for the lock, and say this where there is need to. Empty: do not wait.
+        wait: a message to print before waiting for another process. Empty: do not wait.
 
     Raises:
         FileError: the file system has no locks, or the file cannot be made.
@@ -74,38 +101,33 @@ def lock(path: Path, wait: str = "") -> Iterator[bool]:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        held = _take(handle, path, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        for _ in range(LOOKS):  # it may only be looked at
-            if held or wait:
-                break
-            time.sleep(LOOK_SECONDS)
-            held = _take(handle, path, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not held and wait:
+        taken = _take(handle, path)
+        if not taken and wait:
             note(wait)
-            held = _take(handle, path, fcntl.LOCK_EX)
-        yield held
+            taken = _take(handle, path, float("inf"))
+        yield taken
     finally:
         os.close(handle)
 
 
 def is_held(path: Path) -> bool:
-    """Whether another holds the lock of this name. Nothing is made where there is none."""
+    """Returns whether another process keeps the lock of this name; makes no file."""
     if not path.exists():
         return False
     handle = os.open(path, os.O_RDONLY)
     try:
-        return not _take(handle, path, fcntl.LOCK_SH | fcntl.LOCK_NB)  # so that lookers do not see each other
+        return not _take(handle, path)
     finally:
         os.close(handle)
 
 
-def _take(handle: int, path: Path, how: int) -> bool:
+def _take(handle: int, path: Path, seconds: float = LOCK_SECONDS) -> bool:
+    deadline = time.monotonic() + seconds
     try:
-        fcntl.flock(handle, how)
-    except BlockingIOError:
-        return False
+        while not (taken := lock_descriptor(handle, blocking=False)) and time.monotonic() < deadline:
+            time.sleep(0.05)
     except OSError as error:
         raise FileError(
             f"{path}: this file system has no locks ({error.strerror}); choose a place on another"
         ) from error
-    return True
+    return taken

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from rsjax.data.store import MANIFEST, Store, StoreError
 from rsjax.errors import UserError
-from rsjax.files import write_atomically
+from rsjax.files import FileError, read_json, write_atomically
 
 _FILE = "units.json"
 
@@ -55,8 +55,8 @@ class Normalization:
         """
         path = run / _FILE
         try:
-            return cls._of(json.loads(path.read_text()))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            return cls._of(read_json(path))
+        except (FileError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path}: missing or damaged ({error}); the train command of this run makes it") from error
 
     def save(self, run: Path) -> None:

@@ -1,25 +1,23 @@
-"""Batches put onto the device before they are asked for."""
+"""Batches read and put onto the device by a thread, while the training step computes."""
 
-import queue
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Self
+
+from grain.experimental import ThreadPrefetchDatasetIterator
 
 from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays
 
-JOIN_SECONDS = 30.0  # for a batch that is being read when the end comes
-
 
 class DeviceBatch(NamedTuple):
-    """One batch.
+    """One batch on the device.
 
     Attributes:
-        batch: what the training step takes, on the device.
-        clips: which clips these are, for :meth:`Prefetch.identify`: ``part`` and ``record``, of this process's rows.
-        before: the loader's state before this batch: given to a loader, it begins with this batch.
-        after: the same after it.
+        batch: the input of the training step.
+        clips: ``part`` and ``record`` of this process's rows, which :meth:`Prefetch.identify` reads.
+        before: state of a loader whose next batch is this one.
+        after: state of a loader whose next batch is the one after this.
     """
 
     batch: Any
@@ -29,58 +27,54 @@ class DeviceBatch(NamedTuple):
 
 
 class Prefetch:
-    """Hands out a loader's batches, of which the next ones are made and put onto the device by a thread meanwhile.
+    """An iterator over a loader's batches, which a thread of Grain's makes ahead and puts onto the device.
 
-    Close it, or use it as a context manager: that closes the loader too.
+    An error of the loader or of ``put`` is raised by the call for the batch, and again by each later call. Close the
+    iterator, or use it as a context manager: that closes the loader too.
 
     Args:
-        loader: what is read; its own from now on.
-        put: a loader's arrays to what the training step takes, on the device.
-        ahead: how many batches wait on the device at most, beside the one that is being made.
+        loader: source of the batches; nothing else may read it from now on.
+        put: turns a loader's arrays into the input of the training step, on the device.
+        ahead: most batches that wait on the device, beside the one that is being made.
 
     Attributes:
-        waited: seconds that calls for the next batch have taken in all.
+        waited: total seconds that calls for the next batch have taken.
     """
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any], ahead: int = 2) -> None:
-        self._loader, self._put = loader, put
-        self._queue: queue.Queue[DeviceBatch | BaseException] = queue.Queue(ahead)
-        self._state = loader.state()
-        self._stopped = threading.Event()
-        self._failure: BaseException | None = None
+        self._loader, self._state = loader, loader.state()
+        self._batches = ThreadPrefetchDatasetIterator(_Batches(loader, put), ahead)
+        self._batches.start_prefetch()
         self.waited = 0.0
-        self._thread = threading.Thread(target=self._work, name="prefetch", daemon=True)
-        self._thread.start()
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> DeviceBatch:
         began = time.monotonic()
-        item = self._failure or self._queue.get()
-        self.waited += time.monotonic() - began
-        if isinstance(item, BaseException):
-            self._failure = item
-            raise item
+        try:
+            item = next(self._batches)
+        finally:
+            self.waited += time.monotonic() - began
         self._state = item.after
         return item
 
     def state(self) -> dict[str, Any]:
-        """The loader's state after the last batch that was handed out, whatever was made ahead."""
+        """Returns the loader's state after the last batch that was handed out, however many were made ahead."""
         return self._state
 
-    def identify(self, fed: DeviceBatch) -> list[dict[str, Any]]:
-        """Where the clips of a batch lie and come from: :meth:`rsjax.data.loader.Loader.identify`.
+    def identify(self, batch: DeviceBatch) -> list[dict[str, Any]]:
+        """Returns where the clips of a batch lie and come from, as :meth:`rsjax.data.loader.Loader.identify` does.
 
-        Of several processes', all rows of the batch, which is read once more for that.
+        If several processes share the batch, all its rows are named; for that, the batch is read once more.
         """
         if not self._loader.shared:
-            return self._loader.identify(fed.clips)
-        with self._loader.whole(fed.before) as whole:
+            return self._loader.identify(batch.clips)
+        with self._loader.whole(batch.before) as whole:
             return whole.identify(next(whole))
 
     def quarantined(self) -> int:
-        """How many records are known to be damaged."""
+        """Returns how many records are known to be damaged."""
         return self._loader.quarantined()
 
     def __enter__(self) -> Self:
@@ -91,25 +85,27 @@ class Prefetch:
 
     def close(self) -> None:
         """Stops the thread and closes the loader."""
-        self._stopped.set()
-        while not self._queue.empty():  # the thread may wait for room
-            self._queue.get_nowait()
-        self._thread.join(JOIN_SECONDS)
+        self._batches.close()
         self._loader.close()
 
-    def _work(self) -> None:
-        item: DeviceBatch | BaseException
-        while not self._stopped.is_set():
-            try:
-                item = self._make()
-            except BaseException as error:  # is raised where the batch is asked for
-                item = error
-            self._queue.put(item)
-            if isinstance(item, BaseException):
-                return
 
-    def _make(self) -> DeviceBatch:
+class _Batches:
+    """A loader's batches on the device, in the form that Grain prefetches from."""
+
+    def __init__(self, loader: Loader, put: Callable[[Arrays], Any]) -> None:
+        self._loader, self._put = loader, put
+
+    def __iter__(self) -> Iterator[DeviceBatch]:
+        return self
+
+    def __next__(self) -> DeviceBatch:
         before = self._loader.state()
         arrays = next(self._loader)
         clips = {name: arrays[name] for name in ("part", "record")}
         return DeviceBatch(self._put(arrays), clips, before, self._loader.state())
+
+    def get_state(self) -> dict[str, Any]:
+        return self._loader.state()
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        raise NotImplementedError("a loader starts from its state")

@@ -1,13 +1,14 @@
 """Records that could not be read: listed in one file, counted over all processes and restarts, few enough to go on."""
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
+
+from filelock import lock_descriptor
 
 from rsjax.data.store import StoreError
 from rsjax.files import disk_guard
@@ -111,5 +112,5 @@ def _rows(payload: bytes) -> list[dict[str, Any]]:
 def _locked(file: IO[bytes]) -> Iterator[None]:
     # Closing the file unlocks it. Where a file system has no locks a record may get two lines, but counts once.
     with contextlib.suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX)
+        lock_descriptor(file.fileno())
     yield

@@ -5,6 +5,7 @@ A :class:`rsjax.clip.Clip` is one kind of record; :mod:`rsjax.data.codec` is how
 
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -18,7 +19,7 @@ from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.data.manifest import ManifestError, check_manifest
-from rsjax.files import FileError, disk_guard, replace_directory
+from rsjax.files import FileError, disk_guard, read_json, replace_directory
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -157,20 +158,16 @@ def open_store(path: Path | str) -> Store:
     place = path / MANIFEST
     ours = any(path.glob("*.array_record"))
     cure = f"delete {path} and make it again" if ours else "give a store, or make one with experiments.ingest"
+    if not os.path.lexists(place) and not ours:
+        reason = f"no store (it has no {MANIFEST})" if path.exists() else "not there"
+        raise StoreError(f"{path}: {reason}; {cure}")
     try:
-        manifest = json.loads(place.read_text())
+        manifest = read_json(place, cure=cure)
         check_manifest(manifest, FORMAT)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        if ours:
-            raise StoreError(f"{place}: missing, so {path} is not a whole store; {cure}") from error
-        there = f"no store (it has no {MANIFEST})" if path.exists() else "not there"
-        raise StoreError(f"{path}: {there}; {cure}") from error
-    except OSError as error:
-        raise StoreError(f"{place}: cannot be read ({error.strerror}); mend the link or permission") from error
     except ManifestError as error:
         raise StoreError(f"{place}: {error}; {cure}") from error
-    except (ValueError, RecursionError) as error:
-        raise StoreError(f"{place}: not JSON ({error}); {cure}") from error
+    except FileError as error:
+        raise StoreError(str(error)) from error
     cure = f"delete {path} and make it again"  # what has such a manifest was a store
     for entry in manifest["splits"].values():
         for file in entry["files"] + ([entry["labels"]] if "labels" in entry else []):

@@ -16,7 +16,7 @@ from rsjax.ablation.grid import Cell, Choice
 from rsjax.ablation.output import write_tables
 from rsjax.ablation.results import lock_of, read_result, run_of
 from rsjax.errors import Preempted, UserError
-from rsjax.files import is_held, lock
+from rsjax.files import lock
 from rsjax.pipeline.run import STAGES, Run
 from tests.ablation import process, toy
 
@@ -166,25 +166,6 @@ def test_only_the_chosen_cells_run_and_the_table_names_all(tmp_path: Path) -> No
     with pytest.raises(UserError, match="--only x"):
         run(toy.cells("loss.gamma=9"), tmp_path, Choice(only=("x",)))
     assert "9.0" not in (tmp_path / "out" / "grid.json").read_text(), "a mistake leaves nothing behind"
-
-
-def test_a_lock_is_one_processs_and_a_place_without_locks_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a" / "lock"
-    assert not is_held(path)
-    assert not path.exists()
-    with lock(path) as free, lock(path) as again:
-        assert (free, again) == (True, False)
-        assert is_held(path)
-    assert not is_held(path)
-
-    def without(*_: object) -> None:
-        raise OSError(95, "Operation not supported")
-
-    monkeypatch.setattr("rsjax.files.fcntl.flock", without)
-    with pytest.raises(UserError, match="this file system has no locks"), lock(path):
-        pass
 
 
 def test_where_hard_links_do_not_go_there_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,4 +76,5 @@ def test_an_error_arrives_where_the_batch_is_asked_for_and_stays() -> None:
 def test_closing_ends_the_thread_while_it_waits_for_room() -> None:
     with Prefetch(loader(), lambda arrays: arrays, ahead=1):
         time.sleep(0.1)
-    assert "prefetch" not in [thread.name for thread in threading.enumerate()]
+        assert any("thread-prefetch" in thread.name for thread in threading.enumerate())
+    assert not any("thread-prefetch" in thread.name for thread in threading.enumerate())

@@ -25,6 +25,7 @@ from rsjax.data.store import (
     open_store,
     write_store,
 )
+from rsjax.files import FileError
 
 ARRAYS = hnp.arrays(
     st.sampled_from([np.uint8, np.int32, np.float32, np.float64, np.bool_]), hnp.array_shapes(min_dims=0, min_side=0)
@@ -154,7 +155,7 @@ def test_full_disk_leaves_the_old_store(path: Path) -> None:
         yield from numbered(2)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(StoreError, match=r"disk is full"):
+    with pytest.raises(FileError, match=r"disk is full"):
         write_store(path, "numbers", {"train": records()}, {"key": "new"})
     assert complete_key(path) == "abc"
     assert [p.name for p in path.parent.iterdir()] == ["set"]

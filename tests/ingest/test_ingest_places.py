@@ -12,7 +12,7 @@ import pytest
 
 from rsjax.data.codec import Record
 from rsjax.data.store import StoreError, open_store
-from rsjax.files import lock
+from rsjax.files import FileError, lock
 from rsjax.ingest import packing
 from rsjax.ingest.clips import ClipConfig
 from rsjax.ingest.episode import EpisodeRef
@@ -176,12 +176,12 @@ def test_a_failed_packing_leaves_the_old_store(tmp_path: Path, monkeypatch: pyte
         yield {}
 
     monkeypatch.setattr(packing, "_records", failing)
-    with pytest.raises(StoreError, match=r"disk is full"):
+    with pytest.raises(FileError, match=r"disk is full"):
         made(plan(tmp_path, Source(3)))
     assert hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest() == before
 
 
 def test_a_loop_of_links_in_place_of_the_store_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "store").symlink_to("store")
-    with pytest.raises(StoreError, match=r"store: cannot write"):
+    with pytest.raises(FileError, match=r"store: cannot write"):
         made(plan(tmp_path, Source(2)))

@@ -8,7 +8,8 @@ import pytest
 
 from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
-from rsjax.data.store import StoreError, complete_key, decode_clip, encode, encode_clip, open_store
+from rsjax.data.store import complete_key, decode_clip, encode, encode_clip, open_store
+from rsjax.files import FileError
 from rsjax.sim import collect as collect_module
 from rsjax.sim.collect import CollectError, collect, collection_key, run_episode
 from rsjax.sim.lift import LiftSim
@@ -172,7 +173,7 @@ def test_full_disk_is_one_clear_line(gl: str, tmp_path: Path, monkeypatch: pytes
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(collect_module, "_simulate", full)
-    with pytest.raises(StoreError, match=r"lift.partial: the disk is full; free some space"):
+    with pytest.raises(FileError, match=r"lift.partial: the disk is full; free some space"):
         collect(CONFIG, tmp_path / "lift", lambda done, total: None)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import LoopConfig
-from rsjax.data.store import StoreError
+from rsjax.files import FileError
 from rsjax.training import checkpoint as module
 from rsjax.training.checkpoint import CheckpointError, Checkpoints, load_weights, save_weights
 from rsjax.training.state import create_state
@@ -78,7 +78,7 @@ def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: 
         ("checkpoints", lambda: checkpoints.save(1, state, {})),
         ("weights", lambda: save_weights(tmp_path / "weights", state.params)),
     ):
-        with pytest.raises(StoreError, match=f"{tmp_path / name}: the disk is full"):
+        with pytest.raises(FileError, match=f"{tmp_path / name}: the disk is full"):
             save()
     checkpoints.close()
     assert [path for path in tmp_path.rglob("*") if path.name != "checkpoints"] == []

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.data.store import StoreError
+from rsjax.data.store import FileError
 from rsjax.training import checkpoint as module
 from rsjax.training.checkpoint import Checkpoints
 
@@ -91,7 +91,7 @@ def test_what_fails_in_the_background_is_told_next(
 
         patch.setattr(module, "write_manifest", fail)
         checkpoints.save(2, state(2), {"next": 2})
-        with pytest.raises(StoreError, match=f"{tmp_path}: {told}"):
+        with pytest.raises(FileError, match=f"{tmp_path}: {told}"):
             checkpoints.save(3, state(3), {}) if then == "save" else getattr(checkpoints, then)()
     assert [path.name for path in tmp_path.iterdir()] == ["1"]
     if then != "close":
@@ -125,7 +125,7 @@ def test_a_disk_that_fills_up_keeps_the_last_checkpoint(
     filler = small_disk / "filler"
     free = 2**21 - sum(path.stat().st_blocks * 512 for path in small_disk.rglob("*"))
     filler.write_bytes(b"x" * (free - spare * 1024))
-    with pytest.raises(StoreError, match="checkpoints: the disk is full"):  # noqa: PT012 - either may tell it
+    with pytest.raises(FileError, match="checkpoints: the disk is full"):  # noqa: PT012 - either may tell it
         checkpoints.save(2, state(2, size), {"next": 2})
         checkpoints.wait()
     assert [path.name for path in (small_disk / "checkpoints").iterdir()] == ["1"]

@@ -10,7 +10,7 @@ from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
-from rsjax.data.store import StoreError
+from rsjax.files import FileError
 from rsjax.training.log import MEASURED, NAME, ScalarLog, read_curve, read_log
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
@@ -113,6 +113,6 @@ def test_a_full_disk_is_told_at_the_step_that_it_cuts_off(tmp_path: Path, monkey
             for step in (1, 2):
                 log.write(step, {"loss": 0.5})
 
-    with pytest.raises(StoreError, match="the disk is full"):
+    with pytest.raises(FileError, match="the disk is full"):
         training()
     assert step == 1

@@ -14,8 +14,8 @@ import pytest
 
 from experiments.ingest import Options, make_executor
 from rsjax.config import ConfigError
-from rsjax.data.store import StoreError
 from rsjax.errors import UserError
+from rsjax.files import FileError
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.jobs.pool import ProcessPool, check_workers, count_workers
 from rsjax.ingest.jobs.runner import Executor, Inline, limit_threads, run
@@ -275,7 +275,7 @@ def test_a_full_disk_ends_the_job_with_one_line(tmp_path: Path, monkeypatch: pyt
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("rsjax.ingest.jobs.work_items._write", full)
-    with pytest.raises(StoreError, match=r"disk is full"):
+    with pytest.raises(FileError, match=r"disk is full"):
         finish(job(tmp_path, Source(2)))
 
 

@@ -1,0 +1,81 @@
+import multiprocessing
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsjax.errors import UserError
+from rsjax.files import is_held, lock, read_json
+
+
+@pytest.mark.parametrize(
+    ("payload", "message"),
+    [
+        (b'{"x": 1}', None),
+        (b"{", r"not JSON"),
+        (b"\xff\xfe\x00", r"not JSON"),
+        (b"[" * 100_000, r"not JSON"),
+        (b"[1, 2]", r"a JSON dict is expected, not \[1, 2\]"),
+        (None, r"missing"),
+    ],
+)
+def test_a_json_file_is_read_or_named_in_one_line(tmp_path: Path, payload: bytes | None, message: str | None) -> None:
+    path = tmp_path / "file.json"
+    if payload is not None:
+        path.write_bytes(payload)
+    if message is None:
+        assert read_json(path) == {"x": 1}
+        return
+    with pytest.raises(UserError, match=f"{path}: {message}.*; make it again"):
+        read_json(path, cure="make it again")
+
+
+def test_a_directory_and_a_loop_of_links_are_no_json_files(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for path, message in ((tmp_path, "Is a directory"), (tmp_path / "loop", "Too many levels of symbolic links")):
+        with pytest.raises(UserError, match=rf"{path}: cannot be read \({message}\)"):
+            read_json(path)
+
+
+def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a" / "lock"
+    assert not is_held(path)
+    assert not path.exists()
+    with lock(path) as free, lock(path) as again:
+        assert (free, again) == (True, False)
+        assert is_held(path)
+    with ThreadPoolExecutor(4) as pool:
+        assert not any(pool.map(is_held, [path] * 40)), "readers do not see each other"
+
+    def without(*_: Any, **__: Any) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("rsjax.files.lock_descriptor", without)
+    with pytest.raises(UserError, match="this file system has no locks"), lock(path):
+        pass
+
+
+def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ready, path = multiprocessing.get_context("fork").Event(), tmp_path / "lock"
+    process = multiprocessing.get_context("fork").Process(target=_keep, args=(path, ready))
+    process.start()
+    assert ready.wait(10) and process.pid
+    with lock(path) as free:
+        assert not free
+    os.kill(process.pid, signal.SIGKILL)
+    with lock(path, wait="waiting for another process") as free:
+        assert free
+    process.join()
+
+
+def _keep(path: Path, ready: Any) -> None:
+    with lock(path):
+        ready.set()
+        signal.pause()
