@@ -25,8 +25,6 @@ class Options:
     """Seeds of the world model's training (train.seed); every combination is run with each."""
     out: Path | None = None
     """Where the grid is kept, a run directory per cell; runs/ablation-PRESET if not given."""
-    store: Path | None = None
-    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
     """Where simulated data sets are kept, to be shared by runs."""
     only: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""How every command reads its arguments and reports its errors."""
+"""Parses the arguments of every command and reports its errors."""
 
 import contextlib
 import dataclasses
@@ -7,79 +7,125 @@ import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
+from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
 from rsjax.config import Config, ConfigError, StageConfig, presets
-from rsjax.config.stages import GRAMMAR, format_stage, parse_stage
+from rsjax.config.stages import format_stage, parse_stage
 from rsjax.errors import Preempted, UserError, did_you_mean
 from rsjax.runtime import sigterm_stops
 
 Options = TypeVar("Options")
 
-CONSTRUCTORS = tyro.constructors.ConstructorRegistry()
+# The fields that ``PRESET --help`` lists; ``--help-all`` lists all. A field that the preset lacks is skipped.
+FIRST_FIELDS = {
+    "sim.episodes": "Simulated episodes, those of the test split included.",
+    "sim.test-episodes": "Episodes of the test split.",
+    "sim.seed": "Seed of the simulated episodes.",
+    "tokenizer-train.steps": "Training steps of the tokenizer.",
+    "tokenizer-train.batch-size": "Clips of a batch, over all devices.",
+    "tokenizer-train.optimizer.learning-rate": "Peak learning rate of the tokenizer.",
+    "model.width": "Channels of the world model.",
+    "model.blocks": "Transformer blocks of the world model.",
+    "model.depth": "Whether the model has a depth branch.",
+    "train.steps": "Training steps of the world model.",
+    "train.stages": "A curriculum, one word per stage: simple:2 difficult:3:restart (see docs/training.md).",
+    "train.batch-size": "Clips of a batch, over all devices.",
+    "train.optimizer.learning-rate": "Peak learning rate of the world model.",
+    "train.seed": "Seed of the world model's training.",
+    "train.checkpoint-every": "Steps between checkpoints.",
+    "train.eval-every": "Steps between evaluations on validation clips; 0: none.",
+    "train.start-from": "A run directory or converted checkpoint to start from.",
+    "loss.depth": "λ₁, the weight of the depth loss.",
+    "loss.keypoint": "λ₂, the weight of the keypoint loss.",
+    "loss.attention": "λ₃, the weight of the attention loss.",
+    "loss.keypoints": "Whether the keypoint and attention losses are used.",
+    "sample.steps": "Decoding steps per generated frame.",
+    "eval.clips": "Test clips to evaluate on.",
+}
+
+REGISTRY = tyro.constructors.ConstructorRegistry()
 
 
-@CONSTRUCTORS.primitive_rule
+@REGISTRY.primitive_rule
 def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
-    """A curriculum's stage is one word, such as ``difficult:3:restart``."""
+    """Reads a stage of a curriculum from one word, such as ``difficult:3:restart``."""
     if info.type is not StageConfig:
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
-        metavar=GRAMMAR,
+        metavar="STAGE",
         instance_from_str=lambda words: parse_stage(words[0]),
         is_instance=lambda value: isinstance(value, StageConfig),
         str_from_instance=lambda stage: [format_stage(stage)],
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class PresetOptions:
+    """Options of every command with a preset. They change the preset before its fields are set."""
+
+    store: Path | None = None
+    """A store of clips made by experiments.ingest, to train on instead of simulated clips."""
+
+    def apply(self, preset: Config) -> Config:
+        """Returns the preset as these options change it."""
+        if self.store is not None:
+            from rsjax.pipeline.own_data import on_store
+
+            preset = on_store(preset, self.store)
+        return preset
+
+
 def parse(argv: Sequence[str], prog: str, description: str, options: Options) -> tuple[Config, Options]:
-    """Reads ``PRESET [--option VALUE] [--section.field VALUE]``.
+    """Parses ``PRESET [--option VALUE] [--section.field VALUE]``.
 
     Args:
         argv: the arguments, without the program's name.
         prog: the command as the user types it, ``python -m experiments.train``.
         description: what the command does, for ``--help``.
-        options: a dataclass of the command's own options, with their defaults. Where it has ``store`` and one is named,
-            the preset is fitted to the clips of that store before its fields are set.
+        options: a dataclass of the command's own options, with their defaults.
 
     Returns:
         The preset with its overrides, checked, and the options.
 
     Raises:
         ConfigError: an unknown preset or field, a value that does not parse, or an impossible combination.
+        SystemExit: status 0, after printing the help that was asked for.
     """
     usage = f"usage: {prog} PRESET [--section.field VALUE]; presets: {', '.join(presets.PRESETS)}"
     if not argv or argv[0].startswith("-"):
-        if not {"-h", "--help"}.intersection(argv):
+        if not {"-h", "--help", "--help-all"}.intersection(argv):
             raise ConfigError(f"name a preset first; {usage}")
-        print(f"{usage}\n{description}\nEvery option and field: {prog} tiny --help")
+        print(f"{usage}\n{description}\nOptions and common fields: {prog} tiny --help; every field: --help-all")
         raise SystemExit(0)
+    prog = f"{prog} {argv[0]}"
     preset = presets.get(argv[0])
-    if hasattr(options, "store") and (store := _named(argv, "store")):
-        from rsjax.pipeline.own_data import on_store
-
-        preset = on_store(preset, Path(store))
-    command: Any = dataclasses.make_dataclass(
-        "Command",
-        [
-            ("options", Annotated[type(options), tyro.conf.arg(name="")]),  # type: ignore[misc]
-            # A field is set by value (--loss.keypoints False), so that one form fits every field.
-            ("config", Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff]),
-        ],
-    )
-    known = _fields(options) + _fields(preset)
-    parsed = _parse(command, command(options, preset), argv[1:], f"{prog} {argv[0]}", description, known)
-    return parsed.config, parsed.options
+    known = [*_flags(PresetOptions()), *_flags(options)]
+    before = _parse(PresetOptions(), argv[1:], prog, "", [*known, *_flags(preset)], rest=True)
+    preset = before.apply(preset)
+    fields: Any = preset
+    if {"-h", "--help"}.intersection(argv):
+        fields, description = _first_fields(preset), f"{description} Every field: {prog} --help-all"
+    elif "--help-all" in argv:
+        argv = ["", "--help"]
+    parts = {"options": options, "before": before, "fields": fields}
+    # Flags are named without their part. Those of a configuration's booleans take a value: --model.depth False.
+    markers: dict[str, Any] = {name: (tyro.conf.arg(name=""),) for name in parts}
+    markers["fields"] += (tyro.conf.FlagConversionOff,)
+    kinds = [(name, Annotated[(type(part), *markers[name])]) for name, part in parts.items()]  # type: ignore[misc]
+    command = dataclasses.make_dataclass("Command", kinds)(**parts)
+    parsed = _parse(command, argv[1:], prog, description, [*known, *_flags(preset)])
+    return parsed.fields, parsed.options
 
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:
-    """Reads the arguments of a command that takes no preset. Arguments and errors as in :func:`parse`."""
-    return _parse(type(options), options, argv, prog, description, _fields(options))
+    """Parses the arguments of a command without a preset. Arguments and errors as in :func:`parse`."""
+    return _parse(options, argv, prog, description, _flags(options))
 
 
 @contextlib.contextmanager
@@ -120,64 +166,64 @@ def _cure(error: Exception) -> str | None:
 
 def _exit(line: str, status: int) -> None:
     print(" ".join(line.split()), file=sys.stderr)
-    if status == UserError.status and _one_of_several():
-        # jax waits for the other processes at the end of this one, in vain, and then aborts with a status of its own.
+    jax = sys.modules.get("jax")
+    if status == UserError.status and jax is not None and jax.distributed.is_initialized():
+        # At exit, jax would wait in vain for the other processes and then abort with a status of its own.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
     raise SystemExit(status)
 
 
-def _one_of_several() -> bool:
-    distributed = sys.modules.get("rsjax.training.distributed")
-    return distributed is not None and distributed.jax.distributed.is_initialized()
+def _parse(default: Any, argv: Sequence[str], prog: str, description: str, known: list[str], rest: bool = False) -> Any:
+    """Parses arguments into a dataclass like ``default``; with ``rest``, skips arguments that it does not have."""
+
+    def refuse(event: parse_errors.ParseErrorEvent) -> None:
+        if message := _message(event, known):  # of an event without a message, tyro prints its own report
+            raise ConfigError(f"{message} (see {prog} --help)")
+
+    settings: dict[str, Any] = {"args": argv, "default": default, "prog": prog, "description": description}
+    settings |= {"registry": REGISTRY, "return_unknown_args": rest, "add_help": not rest}
+    with parse_errors.on_parse_error(refuse):
+        parsed: Any = tyro.cli(type(default), **settings)
+    return parsed[0] if rest else parsed
 
 
-def _parse(kind: Any, default: Any, argv: Sequence[str], prog: str, description: str, known: list[str]) -> Any:
-    captured = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(captured):
-            parsed, unknown = tyro.cli(
-                kind,
-                args=argv,
-                default=default,
-                prog=prog,
-                description=description,
-                return_unknown_args=True,
-                registry=CONSTRUCTORS,
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise ConfigError(f"{_one_line(captured.getvalue())} (see {prog} --help)") from None
-    if unknown:
-        word = unknown[0].partition("=")[0].lstrip("-").replace("_", "-")
-        raise ConfigError(f"unknown argument {unknown[0]!r}{did_you_mean(word, known, '--')} (see {prog} --help)")
-    return parsed
+def _message(event: parse_errors.ParseErrorEvent, known: list[str]) -> str:
+    match event:
+        case parse_errors.UnrecognizedArgs(tokens=[token, *_]):
+            word = token.partition("=")[0].lstrip("-").replace("_", "-")
+            return f"unknown argument {token!r}{did_you_mean(word, known, '--')}"
+        case parse_errors.MissingArgs(missing_arguments=missing):
+            return f"missing {', '.join(item.arg.display_name() for item in missing)}"
+        case parse_errors.InvalidChoice(argument=argument, value=value, choices=choices):
+            return f"{argument.display_name()}: {value!r} is none of {', '.join(choices)}"
+        case parse_errors.BadValue(argument=argument):
+            return f"{argument.display_name()}: its value is missing"
+        case parse_errors.InstantiationFailure(argument=argument, message=message):
+            return f"{argument.display_name()}: {message}" if argument else message
+    return ""
 
 
-def _named(argv: Sequence[str], name: str) -> str | None:
-    """The value of an option that is wanted before the others are read; the last one counts."""
-    found = None
-    for word, after in zip(argv, [*argv[1:], ""], strict=True):
-        if word == f"--{name}":
-            found = after
-        elif word.startswith(f"--{name}="):
-            found = word.partition("=")[2]
-    return found
+def _first_fields(preset: Config) -> Any:
+    """A dataclass of those of FIRST_FIELDS that the preset has, with its values, for ``--help``."""
+    kinds: list[Any] = []
+    values: dict[str, Any] = {}
+    for name, text in FIRST_FIELDS.items():
+        section, _, field = name.replace("-", "_").rpartition(".")
+        part = attrgetter(section)(preset)
+        if hasattr(part, field):
+            key = f"{section}_{field}".replace(".", "_")
+            values[key] = getattr(part, field)
+            hint = get_type_hints(type(part))[field]
+            kinds.append((key, Annotated[hint, tyro.conf.arg(name=name, help=text)]))
+    return dataclasses.make_dataclass("FirstFields", kinds)(**values)
 
 
-def _one_line(report: str) -> str:
-    """The message out of tyro's report: a title, the message, the argument's help and a hint, boxed or ruled off."""
-    lines = [line.strip("│╭╮╰╯ ") for line in report.splitlines()[1:]]
-    blocks = [" ".join(group) for rule, group in groupby(lines, lambda line: set(line) <= set("-─")) if not rule]
-    return " ".join((blocks or [report])[0].split())
-
-
-def _fields(value: Any, prefix: str = "") -> list[str]:
-    """Flags of a dataclass's fields and of those nested in it, without their leading dashes."""
+def _flags(value: Any, prefix: str = "") -> list[str]:
+    """Returns the flags of a dataclass's fields, nested ones included, without their leading dashes."""
     names: list[str] = []
     for field in dataclasses.fields(value):
         inner, name = getattr(value, field.name), prefix + field.name.replace("_", "-")
-        names += _fields(inner, f"{name}.") if dataclasses.is_dataclass(inner) else [name]
+        names += _flags(inner, f"{name}.") if dataclasses.is_dataclass(inner) else [name]
     return names

@@ -17,8 +17,6 @@ class Options:
 
     run_dir: Path | None = None
     """Where the run is kept; runs/PRESET if not given."""
-    store: Path | None = None
-    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
     """Where simulated data sets are kept, to be shared by runs."""
     resume: bool = True

@@ -11,7 +11,7 @@ import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.cli import main_errors, parse, parse_options
+from experiments.cli import FIRST_FIELDS, main_errors, parse, parse_options
 from rsjax.config import Config, ConfigError, presets
 from rsjax.errors import UserError, did_you_mean
 
@@ -92,8 +92,9 @@ def test_overrides_reach_their_field_and_no_other() -> None:
         (["tiny", "--rundir", "x"], "did you mean '--run-dir'?"),
         (["tiny", "extra"], "unknown argument 'extra'"),
         (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),
-        (["tiny", "--train.steps"], "Missing value for argument '--train.steps'"),
-        (["tiny", "--sample.unmask", "worst"], "Expected one of ('random', 'greedy')"),
+        (["tiny", "--train.steps"], "--train.steps: its value is missing"),
+        (["tiny", "--store"], "--store: its value is missing"),
+        (["tiny", "--sample.unmask", "worst"], "--sample.unmask: 'worst' is none of random, greedy"),
         (["tiny", "--sim.frames", "99"], f"model.frames holds positions for {presets.get('tiny').model.frames}"),
         (["debug", "--sim.control-steps", "2"], "is 14 but model.action_dim is 28"),
     ],
@@ -108,22 +109,30 @@ def test_options_without_a_preset() -> None:
     )
     with pytest.raises(ConfigError, match="did you mean '--clips'"):
         parse_options(["a/run", "--clip", "2"], "generate", "", NeedsRun(tyro.MISSING))
-    with pytest.raises(ConfigError, match="Missing from generate: PATH run-dir"):
+    with pytest.raises(ConfigError, match="missing run-dir"):
         parse_options([], "generate", "", NeedsRun(tyro.MISSING))
 
 
-@pytest.mark.parametrize("argv", [["--help"], ["debug", "--help"]])
-def test_help_names_what_there_is(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
     with pytest.raises(SystemExit) as caught:
         read(*argv)
-    shown = capsys.readouterr().out
     assert caught.value.code == 0
-    assert "Trains." in shown
-    assert (
-        (", ".join(presets.PRESETS) in shown)
-        if argv == ["--help"]
-        else ("--loss.keypoints" in shown and "--run-dir" in shown)
-    )
+    text = capsys.readouterr().out
+    assert "Trains." in text
+    return text
+
+
+def test_help_lists_presets_then_first_fields_then_all_fields(capsys: pytest.CaptureFixture[str]) -> None:
+    for argv in (["--help"], ["--help-all"]):
+        assert ", ".join(presets.PRESETS) in shown(capsys, *argv)
+    first, everything = shown(capsys, "debug", "--help"), shown(capsys, "debug", "--help-all")
+    assert [text.count("--run-dir") for text in (first, everything)] == [1, 1]
+    assert [text.count("--loss.gamma") for text in (first, everything)] == [0, 1]
+    assert "--store" in first
+    assert "--help-all" in first
+    for name in FIRST_FIELDS:
+        assert f"--{name} " in first
+        assert f"--{name} " in everything
 
 
 @pytest.mark.parametrize(

@@ -54,9 +54,9 @@ def test_what_has_to_fit_the_clips_is_made_so(clips: Path) -> None:
 
 def test_fields_on_the_command_line_are_checked_against_the_store(clips: Path) -> None:
     argv = ["debug", "--store", str(clips), "--model.frames", "7", "--loss.num-keypoints", "3"]
-    config, options = parse(argv, "train", "", train.Options())
+    config, _ = parse(argv, "train", "", train.Options())
     assert (config.model.frames, config.loss.num_keypoints, config.data.key) == (7, 3, "toy")
-    assert options.store == clips
+    assert config.data.store == str(clips.absolute())
     with pytest.raises(ConfigError, match="data.frames is 6 but model.frames holds positions for 5"):
         parse(["debug", f"--store={clips}", "--model.frames", "5"], "train", "", train.Options())
 

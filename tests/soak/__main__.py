@@ -28,7 +28,7 @@ def main() -> None:
 
 def training_arguments(argv: Sequence[str]) -> tuple[str, ...]:
     """Returns the arguments for ``experiments.train``: those that are not options of this command alone."""
-    own = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options) if field.name != "store"}
+    own = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options)}
     kept, words = [], iter(argv)
     for word in words:
         if word.partition("=")[0].replace("_", "-") not in own:

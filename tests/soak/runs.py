@@ -34,8 +34,6 @@ class Options:
     """What is hit; the stages before it are copied from the reference."""
     out: Path | None = None
     """Where everything is kept; runs/soak-PRESET if not given."""
-    store: Path | None = None
-    """A store of clips to train on instead of simulated ones, made by experiments.ingest."""
     data_dir: Path = Path("data")
     """Where the reference's clips are kept, if they were simulated."""
     reference: Path | None = None
