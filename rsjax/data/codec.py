@@ -1,4 +1,4 @@
-"""A record, which is a dict of arrays and JSON-ready values, as bytes: a checksum, then msgpack. Never pickle."""
+"""Records (dicts of arrays and JSON-ready values) as bytes: a checksum, then msgpack. Never pickle."""
 
 import zlib
 from typing import Any
@@ -10,7 +10,7 @@ Record = dict[str, Any]
 
 
 def encode(record: Record) -> bytes:
-    """A record's payload: CRC-32, then msgpack of its arrays (dtype, shape, bytes) and of its other values."""
+    """Returns a record's payload: CRC-32, then msgpack of its arrays (dtype, shape, bytes) and of its other values."""
     arrays = {
         name: (value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes())
         for name, value in record.items()
@@ -22,10 +22,10 @@ def encode(record: Record) -> bytes:
 
 
 def decode(payload: bytes) -> Record:
-    """The inverse of :func:`encode`.
+    """Inverts :func:`encode`.
 
     Raises:
-        ValueError: if the payload is damaged.
+        ValueError: the payload is damaged.
     """
     if len(payload) < 4 or zlib.crc32(payload[4:]) != int.from_bytes(payload[:4], "little"):
         raise ValueError("its checksum is wrong")

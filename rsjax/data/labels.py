@@ -1,6 +1,6 @@
-"""What each record of a split is called, kept beside the records so that choosing among them reads none.
+"""Labels of the records of a split, kept beside them, so that records are chosen by label without being read.
 
-A label is a word in a column, such as ``difficulty``: ``simple``. Columns are stored as int32 codes into their words.
+A label is a word in a column, such as ``simple`` in ``difficulty``. Columns are stored as int32 codes of their words.
 """
 
 import fnmatch
@@ -17,18 +17,19 @@ from jaxtyping import Bool, Int32
 
 from rsjax.data.codec import Record
 
-Label = Callable[[Record], dict[str, str]]  # a record's word in each column; the columns are always the same
+Words = dict[str, str]  # a record's word in each column
+Label = Callable[[Record], Words]  # the columns are always the same
 
 
 class LabelWriter:
-    """Notes the labels of records that pass by, in order, and writes them to one file."""
+    """Collects the labels of records that pass by, in order, and writes them to one file."""
 
     def __init__(self) -> None:
         self._words: dict[str, dict[str, int]] = {}
         self._codes: dict[str, array[int]] = {}
 
     def noting(self, records: Iterable[Record], label: Label) -> Iterator[Record]:
-        """The same records; each one's labels are noted on the way."""
+        """Yields the same records and notes the labels of each."""
         for record in records:
             for name, word in label(record).items():
                 words = self._words.setdefault(name, {})
@@ -36,7 +37,7 @@ class LabelWriter:
             yield record
 
     def write(self, path: Path) -> dict[str, Any]:
-        """Writes the codes of at least one record; returns what the manifest says of them."""
+        """Writes the codes of at least one record and returns the file's entry in the manifest."""
         buffer = io.BytesIO()
         np.save(buffer, np.stack([np.asarray(codes, np.int32) for codes in self._codes.values()]))
         payload = buffer.getvalue()
@@ -50,8 +51,8 @@ class Labels:
     """The labels of a split.
 
     Attributes:
-        words: each column's, in the order of their first use.
-        codes: each record's place among its column's words, (N,).
+        words: the words of each column, in the order of their first use.
+        codes: the place of each record's word among its column's words, (N,).
     """
 
     words: dict[str, list[str]]
@@ -59,7 +60,7 @@ class Labels:
 
     @classmethod
     def read(cls, path: Path, entry: dict[str, Any]) -> "Labels":
-        """The inverse of :meth:`LabelWriter.write`.
+        """Inverts :meth:`LabelWriter.write`.
 
         Raises:
             OSError: the file cannot be read.
@@ -71,8 +72,12 @@ class Labels:
         codes = np.load(io.BytesIO(payload), allow_pickle=False)
         return cls(entry["words"], dict(zip(entry["words"], codes, strict=True)))
 
+    def of(self, number: int) -> Words:
+        """Returns the labels of one record."""
+        return {name: words[self.codes[name][number]] for name, words in self.words.items()}
+
     def matching(self, patterns: Mapping[str, tuple[str, ...]]) -> Bool[np.ndarray, " N"]:
-        """Which records have, in every column named, a word that one of its patterns (a shell's) matches."""
+        """Returns which records match: in each column named, one of its shell patterns matches the record's word."""
         passes = np.ones(len(next(iter(self.codes.values()))), bool)
         for name, allowed in patterns.items():
             chosen = [any(fnmatch.fnmatchcase(word, pattern) for pattern in allowed) for word in self.words[name]]
@@ -80,7 +85,7 @@ class Labels:
         return passes
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """How many records each word of each column has."""
+        """Returns the number of records of each word of each column."""
         return {
             name: dict(zip(words, np.bincount(self.codes[name], minlength=len(words)).tolist(), strict=True))
             for name, words in self.words.items()

@@ -1,8 +1,8 @@
-"""Records in batches, read with Grain: an endless seeded order that resumes exactly, or one pass in order.
+"""Batches of records, read with Grain in an endless seeded order that resumes exactly.
 
-A batch's arrays are the transform's, stacked, and three more of shape (batch,) that say which clips they are: ``part``
-int32 and ``record`` int64, what :meth:`Loader.identify` reads, and ``index`` int32, the place in the batch over all
-processes of a multi-host run.
+A batch has the transform's arrays, stacked, and three more of shape (batch,): ``part`` int32 and ``record`` int64, by
+which :meth:`Loader.identify` names its clips, and ``index`` int32, the place in the batch over all processes of a
+multi-host run.
 """
 
 import logging
@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,31 +19,30 @@ import grain
 import numpy as np
 
 from rsjax.config import ConfigError
-from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transform, ordered
+from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transform, ordered, place_of
 from rsjax.data.quarantine import MAX_DAMAGED, Quarantine
-from rsjax.data.records import RecordSource, place_of
-from rsjax.data.store import StoreError
+from rsjax.data.store import RecordSource, StoreError
 
-MAX_RESTARTS = 3  # of worker processes that die before they give a batch
-PLACE = "global_next_index"  # as grain's ElasticIterator calls it
+MAX_RESTARTS = 3  # in a row, of worker processes that die before they give a batch
+PLACE = "global_next_index"  # the key in the state of Grain's ElasticIterator
 
 _log = logging.getLogger(__name__)
 
 
 class Loader:
-    """An endless iterator of batches. Made by :func:`batches`; close it, or use it as a context manager.
+    """An endless iterator of batches, made by :func:`batches`. Close it, or use it as a context manager.
 
-    Cuts and batches as grain's ``ElasticIterator`` does, whose workers cannot be told what to do at their start: the
-    order of the batches is the same for any number of processes and workers.
+    The order of the batches is the same for any number of processes and workers. Grain's ``ElasticIterator`` cuts and
+    batches alike, but takes no function that its workers run at their start.
 
     Args:
-        dataset: one element per record, as :func:`rsjax.data.order.ordered` makes them; endless.
-        sources: what a batch's ``part`` counts.
-        batch_size: over all processes.
+        dataset: one element per record, endless, from :func:`rsjax.data.order.ordered`.
+        sources: the sources that a batch's ``part`` counts.
+        batch_size: records per batch, over all processes.
         workers: processes that read and transform; 0: threads of this one.
-        shard: which share of each batch this process gets.
-        quarantine: where damaged records are listed.
-        state: an earlier loader's :meth:`state`.
+        shard: the share of each batch that this process gets.
+        quarantine: the list of damaged records.
+        state: :meth:`state` of an earlier loader.
 
     Raises:
         ConfigError: the batch does not divide over the processes.
@@ -87,7 +86,7 @@ class Loader:
                 arrays = next(self._iterator)
                 self._restarts = 0
                 return arrays
-            except RuntimeError as error:  # so Grain says that a worker was killed, for lack of memory mostly
+            except RuntimeError as error:  # of Grain: a worker was killed, mostly for lack of memory
                 if not self._workers or "terminated unexpectedly" not in str(error):
                     raise
                 self.close()
@@ -116,14 +115,14 @@ class Loader:
         self.close()
 
     def state(self) -> dict[str, Any]:
-        """Where the order stands, JSON-ready: :func:`batches` given this goes on with the batch that would be next."""
+        """Returns the place in the order, JSON-ready, from which :func:`batches` resumes with the next batch."""
         return {PLACE: self._place}
 
     def identify(self, arrays: Arrays) -> list[dict[str, Any]]:
-        """Where the records of a batch lie and where they come from, JSON-ready, one object a row.
+        """Returns where the records of a batch lie and come from, JSON-ready, one object a row.
 
-        ``store``, ``split``, ``record`` and ``file`` say where it lies (of a source that is not a store's, ``record``
-        alone); ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
+        ``store``, ``split``, ``record`` and ``file`` say where it lies (``record`` alone if the source is no store's);
+        ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
         """
         return [
             _describe(self._sources[part], int(record))
@@ -131,7 +130,7 @@ class Loader:
         ]
 
     def whole(self, state: dict[str, Any]) -> "Loader":
-        """A loader of all processes' rows from this state on, read by this process alone: to look at a batch again."""
+        """Returns a loader from this state on that reads the rows of all processes alone, to look at a batch again."""
         return Loader(
             self._dataset,
             self._sources,
@@ -144,15 +143,15 @@ class Loader:
 
     @property
     def shared(self) -> bool:
-        """Whether other processes get the rest of each batch."""
+        """Returns whether other processes get the rest of each batch."""
         return self._shard.shard_count > 1
 
     def quarantined(self) -> int:
-        """How many records are known to be damaged, to all processes and in earlier runs of this stage."""
+        """Returns how many records are known to be damaged, to all processes and in earlier runs of this stage."""
         return self._quarantine.count()
 
     def close(self) -> None:
-        """Stop the worker processes; the next batch starts others."""
+        """Stops the worker processes; the next batch starts others."""
         if self._iterator is not None:
             self._iterator.close()
             self._iterator = None
@@ -170,21 +169,21 @@ def batches(
     max_damaged: float = MAX_DAMAGED,
     shard: grain.sharding.ShardOptions | None = None,
 ) -> Loader:
-    """An endless loader: every epoch shuffled anew, batches across the epochs' borders, the same for any ``workers``.
+    """Returns an endless loader that shuffles every epoch anew; batches cross the borders of epochs.
 
     Args:
-        source: the records; a damaged one is replaced as :class:`rsjax.data.records.Readable` says.
+        source: the records; a damaged one is replaced as in :class:`rsjax.data.order.Readable`.
         transform: record → arrays, see :mod:`rsjax.data.order`.
         batch_size: records per batch, over all processes of a multi-host run.
-        seed: of the order and of the transform's generator.
+        seed: seed of the order and of the transform's generator.
         workers: processes that read and transform; 0 uses threads of this one.
-        state: an earlier loader's :meth:`Loader.state`.
+        state: :meth:`Loader.state` of an earlier loader.
         quarantine: the file that lists damaged records; None: none is written.
         max_damaged: share of the records that may be damaged.
-        shard: which share of each batch this process gets; that of its place among jax's processes if not given.
+        shard: the share of each batch that this process gets; None: by its place among jax's processes.
 
     Raises:
-        StoreError: if the source is empty.
+        StoreError: the source is empty.
     """
     listed = Quarantine(quarantine, len(source), max_damaged)
     stages = [CurriculumStage((MixtureComponent(source, transform),), 0)]
@@ -201,7 +200,7 @@ def staged_batches(
     state: dict[str, Any] | None = None,
     shard: grain.sharding.ShardOptions | None = None,
 ) -> Loader:
-    """The same, of stages one after another. Arguments and errors as in :func:`batches`."""
+    """Returns the loader of a curriculum. Arguments and errors as in :func:`batches`."""
     parts = [part for stage in stages for part in stage.parts]
     if not all(map(len, parts)):
         raise StoreError("the split has no records; collect or tokenize again")
@@ -216,22 +215,6 @@ def staged_batches(
     )
 
 
-def epoch(source: RecordSource, batch_size: int, transform: Transform) -> Iterator[Arrays]:
-    """One pass in order, for evaluation. A damaged record is an error here.
-
-    Each batch also has ``weight``, float32 of shape (batch_size,): 1, but 0 where the last batch is filled up by
-    repeating its last record.
-    """
-    for start in range(0, len(source), batch_size):
-        indices = np.arange(start, start + batch_size)
-        rows = [
-            transform(source[int(index)], np.random.default_rng(int(index))) for index in indices[indices < len(source)]
-        ]
-        rows += [rows[-1]] * (batch_size - len(rows))
-        batch = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        yield batch | {"weight": (indices < len(source)).astype(np.float32)}
-
-
 def _describe(source: RecordSource, record: int) -> dict[str, Any]:
     place = place_of(source, record)
     try:
@@ -242,7 +225,7 @@ def _describe(source: RecordSource, record: int) -> dict[str, Any]:
 
 
 def _start_worker(index: int, count: int) -> None:
-    """In a worker process: signals are its parent's to answer, and it does not outlive its parent."""
+    """Prepares a worker process: it leaves signals to its parent and does not outlive it."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()

@@ -1,10 +1,11 @@
-"""Manifests of stores, which may come from elsewhere, are checked before a file that they name is touched."""
+"""Checks of a store's manifest, which may come from elsewhere, before any file that it names is touched."""
 
 from pathlib import PurePosixPath
 from typing import Any
 
-_MOST = 2**50  # bytes or records
-_KINDS: dict[str, type] = {  # what a manifest may have beside its files, and what others rely on
+FORMAT = 1
+MOST = 2**50  # bytes or records
+OPTIONAL: dict[str, type] = {
     "episodes": dict,
     "counts": dict,
     "filtered": dict,
@@ -15,24 +16,20 @@ _KINDS: dict[str, type] = {  # what a manifest may have beside its files, and wh
 
 
 class ManifestError(Exception):
-    """What is wrong with a manifest, without the file and the cure."""
+    """A manifest is wrong. The message names the field, without the file and the cure."""
 
 
-def check_manifest(manifest: Any, version: int) -> None:
-    """Asks whether a manifest has the fields that a store needs, and names nothing outside its directory.
-
-    Args:
-        manifest: the content of the JSON file.
-        version: of the manifests that can be read.
+def check_manifest(manifest: dict[str, Any]) -> None:
+    """Checks that a manifest has the fields that a store needs and names nothing outside its directory.
 
     Raises:
-        ManifestError: it has not, or does.
+        ManifestError: it lacks a field, has one of another type, or names something elsewhere.
     """
-    _require("format", isinstance(manifest, dict) and "format" in manifest)
-    if manifest["format"] != version:
-        raise ManifestError(f"format {manifest['format']!r:.80}, this code reads format {version}")
+    _require("format", "format" in manifest)
+    if manifest["format"] != FORMAT:
+        raise ManifestError(f"format {manifest['format']!r:.80}, this code reads format {FORMAT}")
     _require("splits", isinstance(manifest.get("splits"), dict))
-    for name, kind in _KINDS.items():
+    for name, kind in OPTIONAL.items():
         _require(name, isinstance(manifest.get(name) or kind(), kind))
     for split, entry in manifest["splits"].items():
         name = f"splits.{split}"
@@ -40,27 +37,27 @@ def check_manifest(manifest: Any, version: int) -> None:
             raise ManifestError(f"splits has {split!r:.80}, which cannot be the name of a file")
         _require(name, isinstance(entry, dict) and isinstance(entry.get("files"), list))
         for number, file in enumerate(entry["files"]):
-            _check_file(f"{name}.files.{number}", file, counted=True)
+            _check_file(f"{name}.files.{number}", file, ("bytes", "count"))
+            if file["count"] > file["bytes"]:
+                counts = f"{file['count']}, more than its {file['bytes']} bytes hold"
+                raise ManifestError(f"{name}.files.{number}.count is {counts}")
         if "labels" in entry:
-            _check_file(f"{name}.labels", entry["labels"], counted=False)
+            _check_file(f"{name}.labels", entry["labels"], ("bytes",))
             _require(f"{name}.labels.words", isinstance(entry["labels"].get("words"), dict))
             _require(f"{name}.labels.crc32", type(entry["labels"].get("crc32")) is int)
 
 
-def _check_file(field: str, file: Any, counted: bool) -> None:
+def _check_file(field: str, file: Any, numbers: tuple[str, ...]) -> None:
     _require(field, isinstance(file, dict))
-    name = file.get("name")
-    if not _is_plain(name):
-        raise ManifestError(f"{field}.name is {name!r:.80}, not a file beside it")
-    for number in ("bytes", "count") if counted else ("bytes",):
+    if not _is_plain(file.get("name")):
+        raise ManifestError(f"{field}.name is {file.get('name')!r:.80}, not a file beside it")
+    for number in numbers:
         value = file.get(number)
-        _require(f"{field}.{number}", type(value) is int and 0 <= value < _MOST)
-    if counted and file["count"] > file["bytes"]:
-        raise ManifestError(f"{field}.count is {file['count']}, more than its {file['bytes']} bytes hold")
+        _require(f"{field}.{number}", type(value) is int and 0 <= value < MOST)
 
 
 def _is_plain(name: Any) -> bool:
-    """Whether it is the name of a file, without a folder."""
+    """Returns whether this is the name of a file, without a folder."""
     named = isinstance(name, str) and name not in ("", ".", "..") and PurePosixPath(name).name == name
     return named and not {"\\", "\0"} & set(name)
 

@@ -1,12 +1,13 @@
-"""The order of the records: stages one after another, each a mixture of parts, each part shuffled anew every epoch.
+"""The order of the records in training: stages of a curriculum, each a mixture of shuffled components.
 
 A transform turns one record into arrays that stack: ``transform(record, rng) -> dict of arrays``. Its generator depends
 only on the loader's seed and the record's place in the order, so random draws resume too. With worker processes it has
-to be picklable: a module's function or a ``functools.partial`` of one.
+to be picklable: a function of a module, or a ``functools.partial`` of one.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import grain
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Int
 
 from rsjax.data.codec import Record
 from rsjax.data.quarantine import Quarantine
-from rsjax.data.records import Readable, RecordSource
+from rsjax.data.store import RecordSource, Source, StoreError
 
 Arrays = dict[str, np.ndarray]
 Transform = Callable[[Record, np.random.Generator], Arrays]
@@ -25,10 +26,10 @@ class MixtureComponent:
     """Records of one source that a stage draws from.
 
     Attributes:
-        source: what is read.
+        source: the source.
         transform: record → arrays, see above.
-        chosen: the numbers of the records that count, in order; None: all.
-        weight: share of the stage's records, relative to its other parts'.
+        chosen: numbers of the records that count, in order; None: all.
+        weight: share of the stage's records, relative to its other components'.
     """
 
     source: RecordSource
@@ -42,25 +43,55 @@ class MixtureComponent:
 
 @dataclass(frozen=True)
 class CurriculumStage:
-    """Parts that are mixed, and for how many records. How many does not matter in the last stage: it is endless."""
+    """Components that are mixed, for so many records. In the last stage the number does not matter: it is endless."""
 
     parts: tuple[MixtureComponent, ...]
     records: int
 
 
-def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine) -> grain.MapDataset:
-    """The records of all stages, one after another; each part shuffled anew in every epoch of its own.
+class Readable:
+    """(number, record) of each record of a component; in place of a damaged one, the next that can be read.
 
-    ``part`` counts the parts of all stages, in order.
+    Raises:
+        StoreError: on reading, if the quarantine has too many records or nothing can be read at all.
+    """
+
+    def __init__(self, component: MixtureComponent, quarantine: Quarantine) -> None:
+        self._source, self._chosen, self._quarantine = component.source, component.chosen, quarantine
+
+    def __len__(self) -> int:
+        return len(self._source) if self._chosen is None else len(self._chosen)
+
+    def __getitem__(self, index: int) -> tuple[int, Record]:
+        for place in range(index, index + len(self)):
+            number = place % len(self) if self._chosen is None else int(self._chosen[place % len(self)])
+            try:
+                return number, self._source[number]
+            except StoreError as error:
+                self._quarantine.note(place_of(self._source, number), error)
+                last = error
+        raise last
+
+
+def place_of(source: RecordSource, record: int) -> dict[str, Any]:
+    """Returns where a record lies, JSON-ready; only its number if the source is not a store's."""
+    return source.locate(record) if isinstance(source, Source) else {"record": int(record)}
+
+
+def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine) -> grain.MapDataset:
+    """Returns the records of all stages, one after another; each component is shuffled anew in each of its epochs.
+
+    The arrays are the transform's, ``record`` (its number in its source) and ``part``, which counts the components of
+    all stages in order.
     """
     mixed, number = [], 0
     for place, stage in enumerate(stages):
         datasets = []
-        for part in stage.parts:
-            datasets.append(_dataset(part, number, _seed(seed, number), quarantine))
+        for component in stage.parts:
+            datasets.append(_dataset(component, number, _seed(seed, number), quarantine))
             number += 1
         # Grain rounds weights to percents of the smallest one.
-        weights = [part.weight for part in stage.parts]
+        weights = [component.weight for component in stage.parts]
         dataset = grain.MapDataset.mix(datasets, weights) if len(datasets) > 1 else datasets[0]
         mixed.append(dataset if place == len(stages) - 1 else dataset[: stage.records])
     before = sum(stage.records for stage in stages[:-1])
@@ -69,15 +100,14 @@ def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine
     return grain.MapDataset.concatenate(mixed) if before else mixed[0]
 
 
-def _dataset(part: MixtureComponent, number: int, seed: int, quarantine: Quarantine) -> grain.MapDataset:
-    source = Readable(part.source, quarantine, part.chosen)
-    dataset = grain.MapDataset.source(source).seed(seed).shuffle().repeat(None)
-    return dataset.random_map(_Numbered(part.transform, number))
+def _dataset(component: MixtureComponent, number: int, seed: int, quarantine: Quarantine) -> grain.MapDataset:
+    dataset = grain.MapDataset.source(Readable(component, quarantine)).seed(seed).shuffle().repeat(None)
+    return dataset.random_map(_Numbered(component.transform, number))
 
 
-def _seed(seed: int, part: int) -> int:
-    """The first part's is the seed itself, so that one part alone is the loader without stages."""
-    return int(np.random.SeedSequence((seed, part)).generate_state(1)[0]) if part else seed
+def _seed(seed: int, number: int) -> int:
+    """Returns the seed itself for the first component, so that it alone is the loader without stages."""
+    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0]) if number else seed
 
 
 @dataclass(frozen=True)

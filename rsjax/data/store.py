@@ -1,6 +1,6 @@
-"""The store: ArrayRecord shards per split and a ``manifest.json``, in one directory that appears whole or not at all.
+"""A store: ArrayRecord shards of each split and a ``manifest.json``, in one directory that is written atomically.
 
-A :class:`rsjax.clip.Clip` is one kind of record; :mod:`rsjax.data.codec` is how a record lies in a shard.
+Records are dicts that :mod:`rsjax.data.codec` encodes; a :class:`rsjax.clip.Clip` is one kind of record.
 """
 
 import dataclasses
@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from array_record.python.array_record_data_source import ArrayRecordDataSource
@@ -18,39 +18,47 @@ from array_record.python.array_record_module import ArrayRecordWriter
 from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.labels import Label, Labels, LabelWriter
-from rsjax.data.manifest import ManifestError, check_manifest
+from rsjax.data.manifest import FORMAT, ManifestError, check_manifest
 from rsjax.files import FileError, disk_guard, read_json, replace_directory
 
-FORMAT = 1
 MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
 SHARD_BYTES = 256 * 2**20
+LINK_CURE = "mend the link or permission"
 
 
 class StoreError(FileError):
-    """A store that cannot be read or written. The message names the file and the cure."""
+    """A store cannot be read or written. The message names the file and the cure."""
+
+
+class RecordSource(Protocol):
+    """Random access to records, such as a :class:`Source`."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Record: ...
 
 
 def encode_clip(clip: Clip) -> Record:
-    """A clip as a record."""
+    """Returns a clip as a record."""
     return {field.name: getattr(clip, field.name) for field in dataclasses.fields(Clip)}
 
 
 def decode_clip(record: Record) -> Clip:
-    """The inverse of :func:`encode_clip`."""
+    """Inverts :func:`encode_clip`."""
     return Clip(**record)
 
 
 class Source:
-    """Random access to one split's records: ``len(source)``, ``source[i]``. Can be sent to other processes.
+    """Random access to the records of one split: ``len(source)``, ``source[i]``. Can be sent to other processes.
 
     Args:
         store: the store's directory.
         split: the split's name.
-        files: each shard's name and number of records, in order.
+        files: name and number of records of each shard, in order.
 
     Raises:
-        StoreError: on reading a record that is damaged; it names the file and the record.
+        StoreError: on reading a damaged record; it names the file and the record.
     """
 
     def __init__(self, store: Path, split: str, files: list[tuple[str, int]]) -> None:
@@ -67,30 +75,25 @@ class Source:
     def __getitem__(self, index: int) -> Record:
         if not 0 <= index < len(self):
             raise IndexError(f"record {index} of a split with {len(self)} records")
-        try:
-            return self._read(index)
-        except Exception:  # as below; a file handle that went stale is not damage, so it is opened once more
-            self._reader = None
-        try:
-            return self._read(index)
-        except Exception as error:  # array_record reports damage as several types
-            shard = self._shard(index)
-            raise StoreError(
-                f"{self._paths[shard]}: record {index - self._starts[shard]} (number {index} of the split) cannot be "
-                f"read: {error}; delete {self._paths[shard].parent} and make it again"
-            ) from error
-
-    def _read(self, index: int) -> Record:
-        reader = self._reader  # another thread may close the one that this object has
-        if reader is None:
-            reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
-        return decode(reader[index])
+        for _ in range(2):  # a file handle that went stale is not damage, so the shards are opened once more
+            try:
+                reader = self._reader  # another thread may reset the attribute
+                if reader is None:
+                    reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
+                return decode(reader[index])
+            except Exception as error:  # array_record reports damage by several types
+                self._reader, damage = None, error
+        shard = self._shard(index)
+        raise StoreError(
+            f"{self._paths[shard]}: record {index - self._starts[shard]} (number {index} of the split) cannot be "
+            f"read: {damage}; delete {self._paths[shard].parent} and make it again"
+        ) from damage
 
     def _shard(self, index: int) -> int:
         return int(np.searchsorted(self._starts, index, side="right")) - 1
 
     def locate(self, index: int) -> dict[str, Any]:
-        """Where a record lies, JSON-ready, without reading it: store, split, its number there, and file."""
+        """Returns where a record lies, JSON-ready: ``store``, ``split``, ``record`` (its number there) and ``file``."""
         return {
             "store": str(self._store.absolute()),
             "split": self._split,
@@ -105,8 +108,8 @@ class Store:
 
     Attributes:
         path: its directory.
-        manifest: what :func:`write_store` wrote: ``format``, ``kind``, ``splits`` (name → ``files`` and ``counts``)
-            and everything in its ``meta``.
+        manifest: the content of its ``manifest.json``: ``format``, ``kind``, ``splits`` (name → ``files``, ``count``)
+            and the ``meta`` of :func:`write_store`.
     """
 
     path: Path
@@ -117,16 +120,20 @@ class Store:
         return tuple(self.manifest["splits"])
 
     def source(self, split: str) -> Source:
-        """The records of one split."""
+        """Returns the records of one split."""
         entry = self._entry(split)
         return Source(self.path, split, [(file["name"], file["count"]) for file in entry["files"]])
 
+    def counts(self) -> dict[str, int]:
+        """Returns the number of records by split."""
+        return {split: len(self.source(split)) for split in self.splits}
+
     def labelled(self, split: str) -> bool:
-        """Whether the store was written with labels."""
+        """Returns whether the records of one split have labels."""
         return "labels" in self._entry(split)
 
     def labels(self, split: str) -> Labels:
-        """What the records of one split are called.
+        """Returns the labels of the records of one split.
 
         Raises:
             StoreError: the store was written without labels, or they are damaged.
@@ -147,44 +154,43 @@ class Store:
 
 
 def open_store(path: Path | str) -> Store:
-    """Open a store, which may be somebody else's, and check that its files are all there and whole.
+    """Opens a store, which may come from elsewhere, and checks that all its files are there and whole.
 
     Raises:
-        StoreError: the place is missing or no store, the manifest or a shard is missing, truncated, of another format
-            or cannot be reached (permissions, a loop of links), or the manifest names a file outside the store or an
-            impossible size. To delete it is the cure only where there are shards, which nobody's own data are.
+        StoreError: there is no store; its manifest or a shard is missing, truncated, of another format or out of reach
+            (permissions, a loop of links); or its manifest names a file outside the store or an impossible size. The
+            cure says to delete the directory only where it holds shards, so that nobody deletes their recordings.
     """
     path = Path(path)
     place = path / MANIFEST
+    again = f"delete {path} and make it again"
     ours = any(path.glob("*.array_record"))
-    cure = f"delete {path} and make it again" if ours else "give a store, or make one with experiments.ingest"
-    if not os.path.lexists(place) and not ours:
-        reason = f"no store (it has no {MANIFEST})" if path.exists() else "not there"
-        raise StoreError(f"{path}: {reason}; {cure}")
+    cure = again if ours else "give a store, or make one with experiments.ingest"
+    if not ours and not os.path.lexists(place):
+        raise StoreError(f"{path}: {f'no store (it has no {MANIFEST})' if path.exists() else 'not there'}; {cure}")
     try:
         manifest = read_json(place, cure=cure)
-        check_manifest(manifest, FORMAT)
+        check_manifest(manifest)
     except ManifestError as error:
         raise StoreError(f"{place}: {error}; {cure}") from error
     except FileError as error:
         raise StoreError(str(error)) from error
-    cure = f"delete {path} and make it again"  # what has such a manifest was a store
     for entry in manifest["splits"].values():
         for file in entry["files"] + ([entry["labels"]] if "labels" in entry else []):
             shard = path / file["name"]
             try:
                 size = shard.stat().st_size
             except FileNotFoundError as error:
-                raise StoreError(f"{shard}: missing; {cure}") from error
+                raise StoreError(f"{shard}: missing; {again}") from error
             except OSError as error:
-                raise StoreError(f"{shard}: cannot be read ({error.strerror}); mend the link or permission") from error
+                raise StoreError(f"{shard}: cannot be read ({error.strerror}); {LINK_CURE}") from error
             if size != file["bytes"]:
-                raise StoreError(f"{shard}: {size} bytes, should be {file['bytes']}; {cure}")
+                raise StoreError(f"{shard}: {size} bytes, should be {file['bytes']}; {again}")
     return Store(path, manifest)
 
 
 def complete_key(path: Path | str) -> str | None:
-    """The content key of a whole store, ``None`` where there is no such thing."""
+    """Returns the content key of a whole store, or None where there is none."""
     try:
         return open_store(path).manifest.get("key")
     except StoreError:
@@ -198,17 +204,18 @@ def write_store(
     meta: dict[str, Any],
     label: Label | None = None,
 ) -> None:
-    """Write a store; it replaces an older one at the same place only when it is complete.
+    """Writes a store; an older one at the same place is replaced only when the new one is complete.
 
     Args:
         path: the store's directory.
-        kind: what the records are, e.g. ``"clips"``.
-        splits: each split's records, consumed once and in order.
-        meta: more of the manifest, JSON-ready; ``key`` is the content key that :func:`complete_key` returns.
-        label: a record's words by column, kept for :meth:`Store.labels`.
+        kind: kind of the records, such as ``"clips"``.
+        splits: records of each split, read once and in order.
+        meta: further fields of the manifest, JSON-ready; ``key`` is the content key that :func:`complete_key` returns.
+        label: returns a record's labels by column, kept for :meth:`Store.labels`.
 
     Raises:
-        StoreError: on a full disk, or where ``path`` holds something that is not a store.
+        FileError: the disk is full or refuses.
+        StoreError: ``path`` holds something that is not a store.
     """
     path = Path(path)
     if path.exists() and not (path / MANIFEST).exists():
@@ -218,25 +225,24 @@ def write_store(
         shutil.rmtree(building, ignore_errors=True)
         building.mkdir(parents=True)
         try:
-            manifest: dict[str, Any] = {"format": FORMAT, "kind": kind, "splits": {}} | meta
-            for split, records in splits.items():
-                manifest["splits"][split] = _write_labelled(building, split, records, label)
+            entries = {split: _write_split(building, split, records, label) for split, records in splits.items()}
+            manifest = {"format": FORMAT, "kind": kind, "splits": entries} | meta
             (building / MANIFEST).write_text(json.dumps(manifest, indent=1))
             replace_directory(building, path)
         finally:
             shutil.rmtree(building, ignore_errors=True)
 
 
-def _write_labelled(folder: Path, split: str, records: Iterable[Record], label: Label | None) -> dict[str, Any]:
-    """Write one split's shards and labels; returns the manifest's entry."""
+def _write_split(folder: Path, split: str, records: Iterable[Record], label: Label | None) -> dict[str, Any]:
+    """Writes the shards and labels of one split and returns its entry in the manifest."""
     labels = LabelWriter()
-    files = _write_split(folder, split, labels.noting(records, label) if label else records)
+    files = _write_shards(folder, split, labels.noting(records, label) if label else records)
     entry: dict[str, Any] = {"files": files, "count": sum(file["count"] for file in files)}
     return entry | ({"labels": labels.write(folder / f"{split}-labels.npy")} if label and files else {})
 
 
-def _write_split(folder: Path, split: str, records: Iterable[Record]) -> list[dict[str, Any]]:
-    """Write one split's shards; returns each one's name, count and size in bytes."""
+def _write_shards(folder: Path, split: str, records: Iterable[Record]) -> list[dict[str, Any]]:
+    """Writes the shards of one split and returns the name, count and size in bytes of each."""
     files: list[dict[str, Any]] = []
     payloads: Iterator[bytes] = map(encode, records)
     payload = next(payloads, None)

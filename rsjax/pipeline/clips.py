@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from rsjax.data.codec import Record
-from rsjax.data.records import RecordSource
-from rsjax.data.store import StoreError
+from rsjax.data.store import RecordSource, StoreError
 from rsjax.pipeline.generator import Codec, Tokens
 from rsjax.progress import note
 

@@ -15,8 +15,7 @@ from rsjax.clip import Batch
 from rsjax.data.depth_color import depth_to_color
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
-from rsjax.data.records import RecordSource
-from rsjax.data.store import Store, StoreError
+from rsjax.data.store import RecordSource, Store, StoreError
 from rsjax.evaluation.depth import depth_scores
 from rsjax.evaluation.pixels import psnr
 from rsjax.evaluation.statistics import over_predicted_frames

@@ -43,11 +43,11 @@ def test_a_filter_by_labels_is_a_filter_by_reading_every_record(
     expected = [i for i in range(COUNT) if source[i]["task"] in meant and source[i]["difficulty"] in difficulties]
     part = PartConfig(tasks=tuple(tasks), difficulties=tuple(difficulties))
     if expected:
-        chosen = choose(part, own, "train")
+        chosen = choose(part, own)
         assert chosen is not None and chosen.tolist() == expected
     else:
         with pytest.raises(StoreError, match="no train record"):
-            choose(part, own, "train")
+            choose(part, own)
 
 
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:

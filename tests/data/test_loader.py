@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
-from rsjax.data.loader import Loader, batches, epoch, staged_batches
+from rsjax.data.loader import Loader, batches, staged_batches
 from rsjax.data.order import CurriculumStage, MixtureComponent, ordered
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Source, StoreError
@@ -221,20 +221,3 @@ def test_too_many_damaged_records_are_an_error_from_a_process_too(tmp_path: Path
             pytest.raises(StoreError, match=r"record 1 cannot be read \(1 of 100 records are damaged; .* at most 0"),
         ):
             next(loader)
-
-
-def test_epoch_covers_all_in_order_and_pads_with_weight_0(source: Source) -> None:
-    taken = take(epoch(source, 5, jitter), 100)
-    np.testing.assert_array_equal(taken["i"].ravel(), [*range(COUNT), COUNT - 1, COUNT - 1])
-    np.testing.assert_array_equal(taken["weight"].ravel(), [1] * COUNT + [0, 0])
-    assert_same(take(epoch(source, 5, jitter), 100), taken)
-
-
-def test_epoch_does_not_hide_damage() -> None:
-    with pytest.raises(StoreError, match=r"record 1 "):
-        list(epoch(Numbers(3, bad={1}), 2, jitter))
-
-
-def test_empty_split_is_an_error() -> None:
-    with pytest.raises(StoreError, match=r"no records"):
-        batches(Numbers(0), jitter, 2, seed=0)

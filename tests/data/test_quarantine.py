@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsjax.data.order import MixtureComponent, Readable
 from rsjax.data.quarantine import Quarantine, read_quarantine
-from rsjax.data.records import Readable
 from rsjax.data.store import StoreError
-from tests.data.toy import Numbers
+from tests.data.toy import Numbers, jitter
 
 DAMAGE = StoreError("shard: cannot be read")
 
@@ -27,7 +27,7 @@ def test_a_damaged_record_is_replaced_by_the_next_of_its_part_that_can_be_read(
     chosen = None if order is None else np.array(order[:15])
     numbers = list(range(20)) if order is None else order[:15]
     sound = [number for number in numbers if number not in bad]
-    readable = Readable(Numbers(20, bad=bad), Quarantine(None, 20, 1.0), chosen)
+    readable = Readable(MixtureComponent(Numbers(20, bad=bad), jitter, chosen), Quarantine(None, 20, 1.0))
     if not sound:
         with pytest.raises(StoreError, match="cannot be read"):
             readable[0]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.data.store import FileError
+from rsjax.files import FileError
 from rsjax.training import checkpoint as module
 from rsjax.training.checkpoint import Checkpoints
 
