@@ -1,30 +1,30 @@
-"""Errors that a user can cure, each one clear line. Commands print them without a traceback."""
+"""Errors that a user can fix. Commands print each as one line without a traceback."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class UserError(Exception):
-    """Something that the user can put right. The message is one line that names the thing and the cure.
+    """The user can fix it. The message is one line that names what is wrong and the cure.
 
-    Not a :class:`ValueError`, so that libraries which catch those (the command-line parser does) pass it on untouched.
+    Not a :class:`ValueError`, because some libraries, such as the command-line parser, catch those.
 
     Attributes:
-        status: what a command that ends with it exits with.
+        status: the exit status of a command that it ends.
     """
 
     status = 2
 
 
 def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
-    """``"; did you mean 'tiny'?"`` for the nearest of ``choices``, or nothing where none is near.
+    """Returns ``"; did you mean 'tiny'?"`` with the nearest of ``choices``, or "" if none is near.
 
-    A choice whose last dotted part is ``word`` counts as nearest: ``steps`` finds ``train.steps``.
+    A choice whose last dotted part is ``word`` counts as nearest: ``steps`` matches ``train.steps``.
 
     Args:
-        word: what was written.
-        choices: what there is.
-        prefix: put before each suggestion, such as the dashes of a flag.
+        word: what the user wrote.
+        choices: all valid words.
+        prefix: precedes each suggestion, such as the dashes of a flag.
     """
     choices = list(choices)
     near = [c for c in choices if c.rpartition(".")[2] == word] or difflib.get_close_matches(word, choices, n=1)
@@ -37,8 +37,8 @@ def first_line(error: object) -> str:
 
 
 class Preempted(BaseException):
-    """The process was told to stop (SIGTERM) and did, with its work saved. The message says what goes on with it.
+    """The process was stopped by SIGTERM, with its work saved. The message says how to resume.
 
-    Not an :class:`Exception`, as :class:`KeyboardInterrupt` is none: it may be raised anywhere, and what handles errors
-    there must not take it for one.
+    Like :class:`KeyboardInterrupt` not an :class:`Exception`: it may be raised anywhere, and error handlers there must
+    not catch it.
     """

@@ -1,4 +1,4 @@
-"""What a stage shows while it runs: a bar on a terminal, a line every ten seconds elsewhere."""
+"""What a stage prints while it runs: a bar on a terminal, a line every ten seconds elsewhere."""
 
 import time
 from collections import deque
@@ -12,43 +12,39 @@ from rich.progress import Progress as RichProgress
 TERMINAL_SECONDS = 0.25
 PLAIN_SECONDS = 10.0
 RATE_WINDOW_SECONDS = 30.0  # short enough to forget the first step, which compiles
-_BAR_COLUMNS = 30  # taken by the bar and the space around it
+_BAR_COLUMNS = 30  # of the bar and the space around it
 
 
 def stage(number: int, of: int, name: str, note: str, console: Console | None = None) -> None:
     """Prints a stage's headline, such as ``[2/6] tokenizer: up to date, skipped``."""
-    _say(console or Console(), f"[{number}/{of}] {name}: {note}")
+    _print(console or Console(), f"[{number}/{of}] {name}: {note}")
 
 
 def note(line: str, console: Console | None = None) -> None:
-    """Prints a line that a stage has to say once, such as that a part of it is off."""
-    _say(console or Console(), f"  note: {line}")
+    """Prints a message of a stage, such as that something is switched off."""
+    _print(console or Console(), f"  note: {line}")
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words: ``42 s``, ``3 min 05 s``, ``2 h 07 min``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    """Formats a time: ``42 s``, ``3 min 05 s``, ``2 h 07 min``."""
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 class Progress:
-    """Shows how far a stage has come, at what rate, the time left and the latest scalars.
-
-    Scalars are converted to numbers only when they are shown, so passing device arrays costs nothing in between.
+    """Shows how far a stage is, its rate, the time left and the latest scalars. A context manager around the work.
 
     Args:
-        stage: what is being done.
-        total: units when it is finished.
-        unit: what is counted, in the plural.
-        start: units that an earlier run had already done.
-        console: where to show; standard output by default.
-        clock: seconds, monotonic.
-        per_unit: what each unit consists of and how many, such as ``("tokens", 16384)``: a second rate.
-        settle: units until which no rate is told, nor counted later: while workers start, it says nothing of the rest.
+        stage: name of the work.
+        total: number of units of the whole stage.
+        unit: name of the units, in the plural.
+        start: number of units that an earlier run finished.
+        console: where to print; default: standard output.
+        clock: returns seconds, monotonic.
+        per_unit: the parts of a unit and their number, such as ``("tokens", 16384)``, for a second rate.
+        settle: number of first units that no rate includes, because workers are still starting.
     """
 
     def __init__(
@@ -80,11 +76,11 @@ class Progress:
         return self
 
     def update(self, done: int, **scalars: SupportsFloat) -> None:
-        """Says that ``done`` of ``total`` units are finished, counted from the stage's beginning (not a step's worth).
+        """Reports progress.
 
         Args:
-            done: units finished so far, those of earlier runs included.
-            scalars: the latest values to show, such as ``loss=0.12``.
+            done: number of finished units of the whole stage, including those of earlier runs.
+            scalars: the latest values, such as ``loss=0.12``. Device arrays cost nothing until they are shown.
         """
         now = self._clock()
         self._done = done
@@ -99,7 +95,7 @@ class Progress:
         parts, values = self._parts(), [f"{name}={float(value):.4g}" for name, value in scalars.items()]
         line = ", ".join(parts + values)
         if self._bar is None:
-            _say(self._console, f"  {self.stage}: {line}")
+            _print(self._console, f"  {self.stage}: {line}")
             return
         if len(self.stage) + _BAR_COLUMNS + len(line) > self._console.width:
             line = f"{', '.join(parts)}\n{', '.join(values)}"
@@ -110,8 +106,8 @@ class Progress:
             self._bar.stop()
         if kind is None:
             seconds, done = self._clock() - self._began, self._done - self._first
-            rate = f" ({', '.join(self._rates(done / seconds))})" if seconds > 0 and done else ""
-            _say(self._console, f"  {self.stage}: {self._done} {self.unit} in {duration(seconds)}{rate}")
+            rates = f" ({', '.join(self._rates(done / seconds))})" if seconds > 0 and done else ""
+            _print(self._console, f"  {self.stage}: {self._done} {self.unit} in {duration(seconds)}{rates}")
 
     def _parts(self) -> list[str]:
         (then, before), (now, done) = self._samples[0], self._samples[-1]
@@ -130,12 +126,12 @@ class Progress:
 
 
 def _thousands(number: float) -> str:
-    """Three digits: ``950``, ``16.4k``, ``2.03M``."""
+    """Formats a number with three digits: ``950``, ``16.4k``, ``2.03M``."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if number >= 0.9995 * size:
             return f"{number / size:#.3g}".rstrip(".") + letter
     return f"{number:.3g}"
 
 
-def _say(console: Console, line: str) -> None:
+def _print(console: Console, line: str) -> None:
     console.print(line, markup=False, highlight=False, soft_wrap=True)

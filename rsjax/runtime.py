@@ -1,4 +1,4 @@
-"""What has to be settled about the process before JAX is loaded."""
+"""Settings of the process that come before JAX is imported."""
 
 import faulthandler
 import os
@@ -15,11 +15,11 @@ HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
 def tune_process() -> None:
-    """Restarts the program, once, with glibc's allocator asking for huge pages (same process id and arguments).
+    """Restarts the program once, with the same process id and arguments, so that glibc allocates huge pages.
 
-    XLA's CPU backend takes fresh memory for every step, and touching it 4 KiB at a time is a quarter of a small model's
-    step. glibc reads its tunables only when a process starts, hence the restart. Does nothing where the user has set
-    this tunable, or off Linux.
+    XLA's CPU backend allocates fresh memory for every step, and touching it 4 KiB at a time takes a quarter of a small
+    model's step. glibc reads its tunables only when a process starts, hence the restart. Does nothing if the user has
+    set this tunable, or off Linux.
     """
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if not sys.platform.startswith("linux") or "glibc.malloc.hugetlb" in tunables:
@@ -31,11 +31,11 @@ def tune_process() -> None:
 
 @contextmanager
 def sigterm_stops() -> Iterator[None]:
-    """Around a command: SIGTERM, by which schedulers say that a process has to go, raises :class:`Preempted`.
+    """Wraps a command: SIGTERM, by which schedulers end a process, raises :class:`Preempted`.
 
-    Such a command ends with the exit status 75 (EX_TEMPFAIL), on which a scheduler is to start it again. Training loops
-    save first (:mod:`rsjax.training.preemption`). SIGUSR1 prints what every thread is doing.
-    Does nothing off the main thread, which alone may handle signals.
+    The command then exits with status 75 (EX_TEMPFAIL), at which a scheduler starts it again. Training loops save first
+    (:mod:`rsjax.training.preemption`). SIGUSR1 prints the stack of every thread. Does nothing off the main thread, the
+    only one that may handle signals.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints: the whole state with the place in the data, and the finished weights that later stages read."""
+"""Checkpoints: the whole training state with its position in the data, and the final weights that later stages read."""
 
 import errno
 import logging
@@ -8,42 +8,45 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from jaxtyping import PyTree
 
 from rsjax.errors import UserError, first_line
 from rsjax.files import FileError, disk_guard
 from rsjax.progress import note
-from rsjax.training.checkpoint_manifest import find_fault, read_metric, write_manifest
+from rsjax.training.checksums import find_fault, read_metric, write_checksums
 from rsjax.training.distributed import agree, is_lead, on_lead
 from rsjax.training.retention import retention
 
-# Orbax tells of every step of every save, and of each error at length in each of its threads; a user has the progress
-# line, and the error arrives as an exception too.
+# Orbax logs every step of every save, and each error at length in each of its threads. Users see the progress line,
+# and the error is raised as well.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
-UNFINISHED = ".orbax-checkpoint-tmp"  # what orbax adds to the name of a checkpoint that is being written
+UNFINISHED = ".orbax-checkpoint-tmp"  # what orbax adds to the name of a checkpoint while it writes it
+
+Tree = TypeVar("Tree")  # a tree of arrays, or of their shapes
 
 
 class CheckpointError(UserError):
-    """A checkpoint that cannot be used. The message names it and the cure."""
+    """A checkpoint cannot be used. The message names it and the cure."""
 
 
 class Checkpoints:
-    """The checkpoints of one training run: state, optimizer and place in the data, saved together.
+    """The checkpoints of one training run: parameters, optimizer and position in the data, saved together.
 
-    A checkpoint is written in the background and appears under its step's name only when it is whole. Of several
-    processes, all make the same calls. What an earlier run left unfinished is removed.
+    A checkpoint is written in the background and appears under its step's name when it is complete. All processes make
+    the same calls. Opening the directory removes what an earlier run left unfinished.
 
     Args:
-        directory: holds one directory a checkpoint; made if it is not there. All processes see the same one.
-        keep_last: the newest checkpoints are kept, this many …
-        keep_every: … and every one at a multiple of this many steps (0: none for that) …
+        directory: has one folder for each checkpoint; created if missing. All processes see the same one.
+        keep_last: keep so many of the newest checkpoints …
+        keep_every: … and those whose step is a multiple of this (0: none) …
         keep_best: … and the one with the lowest metric.
-        read_only: nothing is cleaned up or moved, so that another process may be writing here.
+        read_only: remove and move nothing, because another process may be writing here.
     """
 
     def __init__(
@@ -61,23 +64,24 @@ class Checkpoints:
             self._manager = self._open()
 
     def steps(self) -> list[int]:
-        """The steps of all checkpoints, from the oldest to the newest, which may still be being written."""
+        """Returns the steps of all checkpoints in ascending order; the last may still be being written."""
         return list(self._manager.all_steps())
 
     def latest(self) -> int | None:
-        """The step of the newest checkpoint."""
+        """Returns the step of the newest checkpoint."""
         return self._manager.latest_step()
 
-    def save(self, step: int, state: Any, data: dict[str, Any], metric: float | None = None) -> None:
-        """Begins to save a state under its step; training may go on with it, and donate it, at once.
+    def save(self, step: int, state: PyTree, data: dict[str, Any], metric: float | None = None) -> None:
+        """Starts to save a state; training may continue, and donate the state, at once.
 
-        Where there is a checkpoint of that step, it stays as it is.
+        An existing checkpoint of that step stays as it is.
 
         Args:
-            state: arrays on the host, on one device or on a mesh. Of what is not on a mesh of all processes, the first
-                process's is saved.
-            data: the loader's state, JSON-ready and alike in all processes.
-            metric: what ``keep_best`` goes by, the lower the better; None (or not finite): this one is never the best.
+            state: arrays on the host, on one device or on a mesh. Arrays that are not on a mesh of all processes are
+                saved by the first process.
+            data: the loader's state, JSON-ready and equal in all processes.
+            metric: the value that ``keep_best`` compares, lower is better; a checkpoint without a finite one is never
+                the best.
 
         Raises:
             FileError: the disk is full or refuses, for this checkpoint or the one before.
@@ -89,52 +93,52 @@ class Checkpoints:
             self._metrics[step] = float(metric)
         self._writing = step
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(_writable(state)), data=ocp.args.JsonSave(data))
-        with self._written():
-            _need_room(self.directory, state)
-            self._manager.save(step, args=arguments, force=True)  # force: whatever its own schedule is
+        with self._writes():
+            _need_space(self.directory, state)
+            self._manager.save(step, args=arguments, force=True)  # force: orbax has a schedule of its own
 
-    def restore(self, template: Any) -> tuple[Any, dict[str, Any]]:
-        """The state and the loader's state of the newest checkpoint whose files are as they were written.
+    def restore(self, template: Tree) -> tuple[Tree, dict[str, Any]]:
+        """Returns the state and the loader's state of the newest checkpoint whose files are intact.
 
-        Damaged ones are passed over: a line says so, and they are moved out of the way, to ``bad-<step>``.
+        Damaged ones are skipped with a note, and moved to ``bad-<step>``.
 
         Args:
-            template: a state of the same structure, or its ``jax.ShapeDtypeStruct``s. Arrays come back with the
-                template's shardings, whatever those were that they were saved with; without, on the first device.
+            template: a state of the same structure, or its ``jax.ShapeDtypeStruct``s. Arrays get the template's
+                shardings, whatever shardings they were saved with; without any, they go to the first device.
 
         Raises:
-            CheckpointError: there is no checkpoint, all are damaged, or it is of another architecture.
+            CheckpointError: there is no checkpoint, all are damaged, or it has another architecture.
             FileError: a damaged one cannot be moved, or the last save failed.
         """
         self.wait()
-        step, faults = self._newest_whole()
+        step, faults = self._newest_intact()
         if step is None:
-            told = "; ".join(f"{step}: {fault}" for step, fault in faults) or "there is none"
+            reason = "; ".join(f"{step}: {fault}" for step, fault in faults) or "there is none"
             raise CheckpointError(
-                f"{self.directory}: no checkpoint can be read ({told}); restore them from a copy, or start again with "
-                f"--no-resume"
+                f"{self.directory}: no checkpoint can be read ({reason}); restore them from a copy, or start again "
+                f"with --no-resume"
             )
         arguments = ocp.args.Composite(state=ocp.args.StandardRestore(_shapes(template)), data=ocp.args.JsonRestore())
         try:
             _check_shapes(self.directory / str(step) / "state", template)
             restored = self._manager.restore(step, args=arguments)
-        except Exception as error:  # orbax reports what does not fit as many types
+        except Exception as error:  # orbax reports a mismatch as errors of many types
             raise _misfit(self.directory / str(step), error) from error
         if faults and not self._read_only:
             self._set_aside(faults, step)
         return restored["state"], restored["data"]
 
     def wait(self) -> None:
-        """Waits until what was saved is on disk.
+        """Waits until the last save is on disk.
 
         Raises:
-            FileError: it could not be written; the checkpoints before it are as they were.
+            FileError: it could not be written; the checkpoints before it are unchanged.
         """
-        with self._written():
+        with self._writes():
             self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Waits for what is under way and gives everything back. Raises what :meth:`wait` raises."""
+        """Waits for the last save and releases all resources. Raises what :meth:`wait` raises."""
         try:
             self.wait()
         finally:
@@ -142,31 +146,28 @@ class Checkpoints:
 
     def _open(self) -> ocp.CheckpointManager:
         keep_last, keep_every, keep_best = self._keep
-        self._metrics = {
-            int(path.name): metric
-            for path in self.directory.iterdir()
-            if path.name.isdigit() and (metric := read_metric(path)) is not None
-        }
+        steps = [path for path in self.directory.iterdir() if path.name.isdigit()]
+        self._metrics = {int(path.name): metric for path in steps if (metric := read_metric(path)) is not None}
         options = ocp.CheckpointManagerOptions(
             preservation_policy=retention(keep_last, keep_every, self._metrics if keep_best else None),
             cleanup_tmp_directories=not self._read_only,
-            lightweight_initialize=True,  # else a damaged checkpoint keeps the others from being found
-            # Directories are made before save returns: their making in the background is waited for by signals between
-            # orbax's threads, for minutes where one gets lost.
+            lightweight_initialize=True,  # otherwise one damaged checkpoint makes all of them unreadable
+            # Directories are created before save returns: in the background, orbax's threads signal their creation to
+            # each other, and wait for minutes when a signal is lost.
             async_options=ocp.AsyncOptions(
-                post_finalization_callback=self._write_manifest, create_directories_asynchronously=False
+                post_finalization_callback=self._finish, create_directories_asynchronously=False
             ),
         )
         return ocp.CheckpointManager(self.directory, options=options)
 
-    def _write_manifest(self) -> None:
-        # Called by orbax in its thread, when all is written and only the renaming is left to do.
+    def _finish(self) -> None:
+        # Orbax calls this in its thread, when everything is written and only the rename remains.
         (unfinished,) = self.directory.glob(f"{self._writing}{UNFINISHED}*")
-        write_manifest(unfinished, self._metrics.get(self._writing))
+        write_checksums(unfinished, self._metrics.get(self._writing))
 
     @contextmanager
-    def _written(self) -> Iterator[None]:
-        """Reports what went wrong in orbax's threads, and leaves no part of a checkpoint on a disk that is full."""
+    def _writes(self) -> Iterator[None]:
+        """Turns errors of orbax's threads into a :class:`FileError`, and removes what they left of a checkpoint."""
         try:
             with disk_guard(self.directory):
                 yield
@@ -178,16 +179,15 @@ class Checkpoints:
                 raise
             raise FileError(f"{self.directory}: cannot write a checkpoint ({first_line(error)})") from error
 
-    def _newest_whole(self) -> tuple[int | None, list[tuple[int, str]]]:
-        """The newest step whose files are whole, and what is wrong with those of newer ones."""
-        found, faults = None, []
+    def _newest_intact(self) -> tuple[int | None, list[tuple[int, str]]]:
+        """Returns the newest step whose files are intact, and the faults of newer ones."""
+        faults: list[tuple[int, str]] = []
         for step in reversed(self.steps()) if is_lead() else ():
             fault = find_fault(self.directory / str(step))
             if fault is None:
-                found = step
-                break
+                return agree((step, faults), "checkpoints")
             faults.append((step, fault))
-        return agree((found, faults), "checkpoints")
+        return agree((None, faults), "checkpoints")
 
     def _set_aside(self, faults: list[tuple[int, str]], instead: int) -> None:
         def move() -> None:
@@ -195,7 +195,7 @@ class Checkpoints:
                 aside = self.directory / f"bad-{step}"
                 shutil.rmtree(aside, ignore_errors=True)
                 os.replace(self.directory / str(step), aside)
-                note(f"checkpoint {step} is damaged ({fault}): going on from that of step {instead}; kept as {aside}")
+                note(f"checkpoint {step} is damaged ({fault}): resuming from that of step {instead}; kept as {aside}")
 
         with disk_guard(self.directory):
             on_lead("moving a damaged checkpoint", move)
@@ -203,27 +203,27 @@ class Checkpoints:
             self._manager = self._open()
 
 
-def save_weights(path: Path, weights: Any) -> None:
-    """Writes parameters alone; they appear whole or not at all.
+def save_weights(path: Path, weights: PyTree) -> None:
+    """Writes parameters alone, atomically.
 
-    Called by one process, where there are several; what lies on a mesh of all of them has to be brought to it first.
+    Of several processes one calls this; arrays on a mesh of all processes have to be gathered first.
 
     Raises:
         FileError: the disk is full.
     """
     with disk_guard(path), _checkpointer() as checkpointer:
-        _need_room(path.parent, weights)
+        _need_space(path.parent, weights)
         checkpointer.save(path.absolute(), _writable(weights), force=True)
 
 
-def load_weights(path: Path, like: Any) -> Any:
-    """Reads parameters written by :func:`save_weights`.
+def load_weights(path: Path, like: Tree) -> Tree:
+    """Reads parameters that :func:`save_weights` wrote.
 
     Args:
-        like: parameters (or their shapes) of the same structure.
+        like: parameters of the same structure, or their shapes.
 
     Raises:
-        CheckpointError: there are none, they are of another architecture, or they are damaged.
+        CheckpointError: there are none, they have another architecture, or they are damaged.
     """
     if not path.exists():
         raise CheckpointError(f"{path}: no such weights; train first (python -m experiments.train)")
@@ -235,14 +235,14 @@ def load_weights(path: Path, like: Any) -> Any:
         raise _misfit(path, error) from error
 
 
-def _need_room(folder: Path, tree: Any) -> None:
-    # On a full disk TensorStore prints tracebacks from callbacks that outlive orbax: so it is looked up first.
+def _need_space(folder: Path, tree: PyTree) -> None:
+    # Checked before: on a full disk TensorStore prints tracebacks from callbacks that outlive orbax.
     if shutil.disk_usage(folder).free < sum(x.nbytes for x in jax.tree.leaves(tree)):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
-    """One that waits for no other process."""
+    """Returns one that waits for no other process."""
     me = jax.process_index()
     alone = ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process{me}"
@@ -250,22 +250,22 @@ def _checkpointer() -> ocp.StandardCheckpointer:
     return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
-def _writable(tree: Any) -> Any:
-    # Where there are several processes, orbax refuses device arrays of one of them; host arrays the first one writes.
+def _writable(tree: PyTree) -> PyTree:
+    # With several processes, orbax refuses arrays on a device of one of them; host arrays are written by the first.
     if jax.process_count() == 1:
         return tree
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) and x.is_fully_addressable else x, tree)
 
 
-def _shapes(tree: Any) -> Any:
+def _shapes(tree: PyTree) -> PyTree:
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(x, "sharding", None) or device), tree
     )
 
 
-def _check_shapes(path: Path, like: Any) -> None:
-    # Looked up before anything is read: when a read does not fit, TensorStore prints tracebacks as on a full disk.
+def _check_shapes(path: Path, like: PyTree) -> None:
+    # Checked before reading: at a mismatch TensorStore prints tracebacks, as on a full disk.
     with _checkpointer() as checkpointer:
         saved = _flat_shapes(checkpointer.metadata(path.absolute()).item_metadata.tree)
     wanted = _flat_shapes(like)
@@ -276,13 +276,13 @@ def _check_shapes(path: Path, like: Any) -> None:
             )
 
 
-def _flat_shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+def _flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
     leaves = ocp.tree.to_flat_dict(ocp.tree.serialize_tree(tree, keep_empty_nodes=True))
     return {".".join(map(str, path)): tuple(leaf.shape) for path, leaf in leaves.items() if hasattr(leaf, "shape")}
 
 
-def _misfit(path: Path, reason: object) -> CheckpointError:
+def _misfit(path: Path, error: Exception) -> CheckpointError:
     return CheckpointError(
-        f"{path}: does not fit this configuration or is damaged ({first_line(reason)}); use the configuration it was "
+        f"{path}: does not fit this configuration or is damaged ({first_line(error)}); use the configuration it was "
         f"made with, or another run directory, or delete it"
     )

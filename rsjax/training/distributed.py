@@ -1,6 +1,7 @@
-"""Several processes that train together, through ``jax.distributed``: one a host, or one a device.
+"""Several processes that train together through ``jax.distributed``: one on each host, or one for each device.
 
-Process 0 is the lead: it alone writes what is written once. On one host all of this does nothing, or the obvious.
+Process 0 is the lead: only it writes what is written once. With one process, all functions here work and wait for
+nobody.
 """
 
 import importlib.util
@@ -8,7 +9,7 @@ import itertools
 import json
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -18,61 +19,70 @@ from orbax.checkpoint import multihost
 from rsjax.errors import Preempted, UserError, first_line
 
 BARRIER_SECONDS = 7 * 24 * 3600  # the others wait while the lead simulates, tokenizes and evaluates
-JOIN_SECONDS = 1800  # a node that takes another's place may be long in coming
+JOIN_SECONDS = 1800  # replacing a lost node can take long
 SHUTDOWN_SECONDS = 30  # how long a process that failed waits for the others before it exits
 
-_numbers = itertools.count()  # all processes come to the same barriers in the same order
+# The variable that a launcher sets for each process that it starts, and the one with the number of processes.
+_LAUNCHERS = {"OMPI_MCA_orte_hnp_uri": "OMPI_COMM_WORLD_SIZE", "SLURM_STEP_NODELIST": "SLURM_NTASKS"}
+
+_numbers = itertools.count()  # all processes pass the same barriers in the same order
+
+Json = TypeVar("Json")  # a JSON-ready value
 
 
 class HostsError(UserError):
-    """Several processes that were not told how to join each other, or whose lead failed."""
+    """Several processes have contradictory options, or their lead failed."""
 
 
 class LostHostError(HostsError):
-    """Processes that cannot join each other, or one that lost the others: to be started again."""
+    """Processes cannot join each other, or one lost the others: start them again."""
 
     status = os.EX_TEMPFAIL
 
 
-def cluster(environ: Mapping[str, str]) -> str:
-    """What started this process as one of several, as jax names it: slurm, ompi, gketpu, k8s, or tpu (to be asked for).
+def has_peers(environ: Mapping[str, str]) -> bool:
+    """Returns whether this process was started as one of several by Open MPI, Slurm, GKE or Kubernetes.
+
+    ``jax.distributed.initialize`` recognizes these itself, but cannot be called to find out: without a cluster it
+    fails, a lone Slurm task or MPI rank it leaves one GPU of all, and it has to come before any computation.
 
     Args:
-        environ: environment variables.
-
-    Returns:
-        The name; empty where this is a process of its own.
+        environ: environment variables; nothing else is looked at, no server is asked.
     """
+    if any(mark in environ and int(environ.get(size, 1)) > 1 for mark, size in _LAUNCHERS.items()):
+        return True
     tpu_hosts = environ.get("TPU_PROCESS_ADDRESSES") or environ.get("TPU_WORKER_HOSTNAMES", "")
-    slices = int(environ.get("MEGASCALE_NUM_SLICES") or 1)
-    if "SLURM_STEP_NODELIST" in environ and int(environ.get("SLURM_NTASKS", 1)) > 1:
-        return "slurm"
-    if "OMPI_MCA_orte_hnp_uri" in environ and int(environ.get("OMPI_COMM_WORLD_SIZE", 1)) > 1:
-        return "ompi"
     if tpu_hosts:
-        return "gketpu" if "," in tpu_hosts or slices > 1 else ""
-    if "JOB_COMPLETION_INDEX" in environ and importlib.util.find_spec("kubernetes"):
-        return "k8s"
-    # A TPU machine of a pod knows the others from Google's metadata server alone.
-    return "tpu" if importlib.util.find_spec("libtpu") and "TPU_SKIP_MDS_QUERY" not in environ else ""
+        return "," in tpu_hosts or int(environ.get("MEGASCALE_NUM_SLICES") or 1) > 1
+    return "JOB_COMPLETION_INDEX" in environ and importlib.util.find_spec("kubernetes") is not None
+
+
+def _on_tpu(environ: Mapping[str, str]) -> bool:
+    """Returns whether this may be a machine of a TPU pod, whose peers only Google's metadata server knows."""
+    # jax sets the variable when it is imported on a machine without TPU chips.
+    return "TPU_SKIP_MDS_QUERY" not in environ and importlib.util.find_spec("libtpu") is not None
 
 
 def initialize(coordinator: str = "", processes: int | None = None, process_id: int | None = None) -> None:
-    """Joins the processes that were started together; before anything asks jax for a device. Nothing on one host.
+    """Joins the processes that were started together. Call it before jax uses a device. One process does nothing.
 
     Args:
-        coordinator: HOST:PORT of process 0, as all can reach it. With none of the three, the cluster is asked
-            (:func:`cluster`).
-        processes: how many there are.
-        process_id: which one this is, 0 … processes - 1.
+        coordinator: HOST:PORT of process 0, reachable by all. Without any of the three arguments, jax gets them from
+            the cluster.
+        processes: number of processes.
+        process_id: number of this process, 0 … processes - 1.
 
     Raises:
-        HostsError: an option is missing or out of range, or the processes do not find each other.
+        HostsError: an option is missing or out of range, or the processes cannot join each other.
     """
-    arguments = _arguments(coordinator, processes, process_id)
-    if arguments is None:
+    peers = has_peers(os.environ)
+    alone = not coordinator and processes is None and process_id is None
+    if alone and not peers and not _on_tpu(os.environ):
         return
-    # Else jax catches SIGTERM for itself, and a process that nobody has told how to stop does not stop.
+    arguments = {} if alone else _address(coordinator, processes, process_id)
+    if processes == 1:
+        return
+    # Otherwise jax handles SIGTERM itself, and a process that gets it does not stop.
     jax.config.update("jax_enable_preemption_service", False)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
@@ -80,31 +90,26 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
             **arguments, initialization_timeout=JOIN_SECONDS, shutdown_timeout_seconds=SHUTDOWN_SECONDS
         )
     except (RuntimeError, ValueError) as error:
-        if not coordinator and cluster(os.environ) == "tpu" and isinstance(error, ValueError):
-            return  # libtpu is installed, but no TPU is here
-        reason = first_line(error)
+        if alone and not peers and isinstance(error, ValueError):
+            return  # a TPU machine that is not part of a pod
         raise LostHostError(
-            f"process {process_id if coordinator else 'of a cluster'} cannot join the others ({reason}); start all "
-            f"of them, with the same --coordinator and --processes, which all of them can reach"
+            f"process {'of a cluster' if alone else process_id} cannot join the others ({first_line(error)}); start "
+            f"all of them, with the same --coordinator and --processes, and a --coordinator that all of them can reach"
         ) from error
 
 
-def _arguments(coordinator: str, processes: int | None, process_id: int | None) -> dict[str, Any] | None:
-    """Those of ``jax.distributed.initialize``; None where there is one process."""
+def _address(coordinator: str, processes: int | None, process_id: int | None) -> dict[str, Any]:
+    """Checks the options; returns them as arguments of ``jax.distributed.initialize``."""
     options = {"--coordinator": coordinator or None, "--processes": processes, "--process-id": process_id}
     missing = [name for name, value in options.items() if value is None]
-    if len(missing) == len(options):
-        found = cluster(os.environ)
-        return None if not found else {} if found == "tpu" else {"cluster_detection_method": found}
-    if missing or processes is None or process_id is None:
+    if processes is None or process_id is None or missing:
         raise HostsError(f"{' and '.join(missing)} missing; several hosts need {', '.join(options)}, or none of them")
     if not 0 <= process_id < processes:
         raise HostsError(f"--process-id is {process_id}; with --processes {processes} it is 0 … {processes - 1}")
-    if not coordinator.rpartition(":")[2].isdigit() or not coordinator.rpartition(":")[0]:
+    host, _, port = coordinator.rpartition(":")
+    if not host or not port.isdigit():
         raise HostsError(f"--coordinator is {coordinator!r}; it is HOST:PORT of process 0")
-    if processes == 1:
-        return None
-    # With detection off, a process keeps all its devices: Slurm's would leave it one.
+    # With Slurm's detection active, a process would get only one of its devices.
     return {
         "coordinator_address": coordinator,
         "num_processes": processes,
@@ -114,7 +119,7 @@ def _arguments(coordinator: str, processes: int | None, process_id: int | None) 
 
 
 def is_lead() -> bool:
-    """Whether this process writes what is written once."""
+    """Returns whether this process writes what is written once."""
     return jax.process_index() == 0
 
 
@@ -122,10 +127,10 @@ def barrier(name: str) -> None:
     """Waits until every process is here.
 
     Args:
-        name: where, for the error.
+        name: names the place in the error.
 
     Raises:
-        HostsError: another process is gone.
+        LostHostError: another process is gone.
     """
     wait = multihost.get_barrier_sync_fn()
     try:
@@ -133,14 +138,14 @@ def barrier(name: str) -> None:
     except jax.errors.JaxRuntimeError as error:
         raise LostHostError(
             f"another process was lost ({name}); its own message says why; start all of them again"
-        ) from (error)
+        ) from error
 
 
-def agree(value: Any, name: str = "agree") -> Any:
-    """The lead's ``value``, on every process; all of them have to ask.
+def agree(value: Json, name: str = "agree") -> Json:
+    """Returns the lead's ``value`` on every process. All processes have to call it.
 
     Args:
-        value: JSON-ready. The others' is not looked at.
+        value: JSON-ready. The other processes' values are ignored.
         name: as in :func:`barrier`.
     """
     if jax.process_count() == 1:
@@ -148,21 +153,22 @@ def agree(value: Any, name: str = "agree") -> Any:
     barrier(name)  # a collective of the devices would not wait as long
     text = json.dumps(value).encode() if is_lead() else b""
     size = int(multihost_utils.broadcast_one_to_all(np.int32(len(text))))
-    padded = np.zeros(-(-size // 256) * 256, np.uint8)  # of few sizes, as each is compiled
+    padded = np.zeros(-(-size // 256) * 256, np.uint8)  # each size is compiled, so there are few
     padded[: len(text)] = np.frombuffer(text, np.uint8)
     return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded))[:size])
 
 
 def anywhere(flag: bool) -> bool:
-    """Whether ``flag`` is set on any process: such as that one was told to stop. All of them have to ask."""
+    """Returns whether ``flag`` is set on any process. All processes have to call it."""
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
 def on_lead(name: str, work: Callable[[], None]) -> None:
-    """Does ``work`` on the lead while the others wait; where it fails, all fail.
+    """Does ``work`` on the lead while the others wait. If it fails, it fails on all processes.
 
     Raises:
-        HostsError: on the others, where it failed on the lead.
+        HostsError: on the others, if it failed on the lead.
+        Preempted: on the others, if the lead was stopped.
     """
     failure: BaseException | None = None
     if is_lead():
@@ -172,10 +178,10 @@ def on_lead(name: str, work: Callable[[], None]) -> None:
             if jax.process_count() == 1:
                 raise
             failure = error
-    told = agree(None if failure is None else f"{type(failure).__name__}: {failure}", name)
+    reason = agree(None if failure is None else f"{type(failure).__name__}: {failure}", name)
     if failure is not None:
         raise failure
-    if told is not None:
-        if told.startswith(f"{Preempted.__name__}: "):
-            raise Preempted(told)
-        raise HostsError(f"{name} failed on process 0 ({told})")
+    if reason is not None:
+        if reason.startswith(f"{Preempted.__name__}: "):
+            raise Preempted(reason)
+        raise HostsError(f"{name} failed on process 0 ({reason})")

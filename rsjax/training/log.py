@@ -1,13 +1,11 @@
-"""What a training run writes down as it goes: JSON lines, TensorBoard, pictures, and Weights & Biases where asked for.
+"""The log of a training run: JSON lines, TensorBoard, images, and Weights & Biases on request.
 
-``log.jsonl`` is the record that resumes exactly; the others are views of it.
+``log.jsonl`` is the record that a resumed run continues exactly; the others are views of it.
 """
 
 import io
 import json
-from collections.abc import Callable
-from contextlib import suppress
-from functools import partial
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,31 +14,20 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from rsjax.files import disk_guard, write_atomically
-from rsjax.training.tensorboard import Board
+from rsjax.training.tensorboard import TensorBoardWriter
 from rsjax.training.wandb_run import WandbRun
 
 NAME = "log.jsonl"
 PICTURES = "pictures"
-# Scalars that measure the machine: no two runs agree on them.
+# Scalars that measure the machine: they differ between any two runs.
 MEASURED = frozenset(
-    {
-        "seconds_per_step",
-        "data_wait_share",
-        "tokens_per_second",
-        "images_per_second",
-        "device_gib",
-        "device_peak_gib",
-        "host_gib",
-    }
+    {"seconds_per_step", "data_wait_share", "tokens_per_second", "images_per_second"}
+    | {"device_gib", "device_peak_gib", "host_gib"}
 )
 
 
-def read_log(directory: Path) -> list[dict[str, Any]]:
-    """All logged steps: dicts of "step" and scalars. Empty where nothing was logged; a torn last line is left out.
-
-    A step has two rows where its held-out scalars were written too.
-    """
-    path = directory / NAME
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Reads a file of JSON lines. Returns [] if there is none; a torn last line is left out."""
     rows = []
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
@@ -50,22 +37,32 @@ def read_log(directory: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes a file of JSON lines, atomically."""
+    write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def read_log(directory: Path) -> list[dict[str, Any]]:
+    """Reads all logged steps: dicts of "step" and scalars. A step with validation scalars has a second row for them."""
+    return read_rows(directory / NAME)
+
+
 def read_curve(directory: Path) -> list[dict[str, Any]]:
-    """:func:`read_log` without what measures the machine: equal for a run that was stopped and one that was not."""
+    """Does :func:`read_log` without machine measurements: an interrupted run gives the same as an uninterrupted one."""
     return [{k: v for k, v in row.items() if k not in MEASURED} for row in read_log(directory)]
 
 
 class ScalarLog:
-    """Appends to a directory's log; what a resumed run will do again is cut off first.
+    """Appends to a directory's log, after cutting off the steps that a resumed run repeats.
 
     Args:
         directory: where ``log.jsonl``, ``tensorboard/``, ``pictures/`` and W&B's files go.
-        start: the step that the run resumes after.
-        wandb: the Weights & Biases project to log to as well; none where it is empty.
-        resume: False begins a new W&B run where there was one.
+        start: the step after which the run resumes.
+        wandb: the Weights & Biases project to log to as well; "": none.
+        resume: False starts a new W&B run even if there is one.
 
     Raises:
-        StoreError: the disk is full.
+        FileError: the disk is full.
         WandbError: Weights & Biases is missing or cannot start.
     """
 
@@ -73,49 +70,49 @@ class ScalarLog:
         self._directory = directory
         kept = [row for row in read_log(directory) if row["step"] <= start]
         with disk_guard(directory):
-            write_atomically(directory / NAME, "".join(json.dumps(row) + "\n" for row in kept).encode())
+            write_rows(directory / NAME, kept)
             self._file = (directory / NAME).open("a")
-            self._boards: list[Board | WandbRun] = [Board(directory / "tensorboard", start)]
+            self._views: list[TensorBoardWriter | WandbRun] = [TensorBoardWriter(directory / "tensorboard", start)]
         if wandb:
-            self._boards.append(WandbRun(directory, wandb, resume))
+            self._views.append(WandbRun(directory, wandb, resume))
 
     def write(self, step: int, scalars: dict[str, float]) -> None:
         """Logs scalars of one step.
 
         Raises:
-            StoreError: the disk is full.
+            FileError: the disk is full.
         """
         with disk_guard(self._directory):
             self._file.write(json.dumps({"step": step} | scalars) + "\n")
             self._file.flush()
-            for board in self._boards:
-                board.write(step, scalars)
+            for view in self._views:
+                view.write(step, scalars)
 
     def image(self, step: int, name: str, image: UInt8[np.ndarray, "H W 3"]) -> None:
-        """Shows a picture, 0–255, and keeps it as ``pictures/NAME-STEP.png``; a file name's characters only.
+        """Logs an image, 0–255, and writes it to ``pictures/NAME-STEP.png``.
 
         Raises:
-            StoreError: the disk is full.
+            FileError: the disk is full.
         """
         path = self._directory / PICTURES / f"{name}-{step:07d}.png"
+        buffer = io.BytesIO()
+        Image.fromarray(image).save(buffer, "PNG")
         with disk_guard(self._directory):
             path.parent.mkdir(exist_ok=True)
-            write_atomically(path, _png(image))
-            for board in self._boards:
-                board.image(step, name, image)
+            write_atomically(path, buffer.getvalue())
+            for view in self._views:
+                view.image(step, name, image)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        closes: list[Callable[[], None]] = [partial(board.close, failed=kind is not None) for board in self._boards]
-        for close in (self._file.close, *closes):
-            # The error that is under way counts; a full disk would be told a second time.
-            with disk_guard(self._directory) if kind is None else suppress(OSError):
-                close()
+        def guard() -> AbstractContextManager[None]:
+            # The error under way counts; a full disk would be reported a second time.
+            return disk_guard(self._directory) if kind is None else suppress(OSError)
 
-
-def _png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()
+        with guard():
+            self._file.close()
+        for view in self._views:
+            with guard():
+                view.close(failed=kind is not None)

@@ -1,4 +1,4 @@
-"""How much memory a process takes."""
+"""Memory that a process uses."""
 
 import os
 from pathlib import Path
@@ -9,12 +9,11 @@ GIB = 2.0**30
 
 
 def memory_scalars() -> dict[str, float]:
-    """Memory now, in GiB.
+    """Returns memory use in GiB.
 
-    Returns:
-        ``device_gib`` and ``device_peak_gib``: what the fullest of this process's devices holds, and has held at the
-        most; on a device that does not tell, such as a CPU, what the process holds. ``host_gib``: the process's
-        resident set; 0 where the operating system is not Linux.
+    ``device_gib`` and ``device_peak_gib`` are the use and peak use of the fullest of this process's devices; on a
+    device without such counts, such as a CPU, those of the process. ``host_gib`` is the process's resident set; 0 if
+    the operating system is not Linux.
     """
     host, host_peak = _resident_set()
     stats = [device.memory_stats() or {} for device in jax.local_devices()]
@@ -24,10 +23,10 @@ def memory_scalars() -> dict[str, float]:
 
 
 def _resident_set() -> tuple[int, int]:
-    """Bytes of this process that are in memory, now and at the most."""
+    """Returns the bytes of this process that are in memory, now and at the peak, which psutil does not have."""
     path = Path(f"/proc/{os.getpid()}/status")
     if not path.exists():
         return 0, 0
-    fields = dict(line.partition(":")[::2] for line in path.read_text().splitlines())
+    fields = dict(line.split(":", 1) for line in path.read_text().splitlines())
     now, peak = (int(fields[name].split()[0]) * 1024 for name in ("VmRSS", "VmHWM"))
     return now, peak

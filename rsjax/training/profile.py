@@ -1,26 +1,25 @@
-"""A trace of some training steps, to be looked at in a browser."""
+"""A trace of some training steps, to be viewed in a browser."""
 
 import contextlib
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import jax
+from jaxtyping import PyTree
 
 from rsjax.files import disk_guard
 from rsjax.progress import note
 
-SKIPPED = 5  # steps before the trace: the first compiles, the next ones fill queues
+SKIPPED = 5  # steps before the trace: the first one compiles, the next ones fill queues
 
 
 class Profile:
-    """Traces ``count`` steps from step ``first`` on. Used as a context manager around the loop; only one at a time.
-
-    Only the lead process of several traces.
+    """A context manager around a training loop that traces some steps. Of several processes only the lead traces.
 
     Args:
-        directory: where the trace goes; each one gets a directory of its own there.
-        first: the first step that is traced.
-        count: steps; 0: none.
+        directory: each trace gets a folder of its own in it.
+        first: the first step to trace.
+        count: number of steps; 0: none.
     """
 
     def __init__(self, directory: Path, first: int, count: int) -> None:
@@ -30,20 +29,15 @@ class Profile:
 
     @classmethod
     def after(cls, directory: Path, start: int, last: int, count: int) -> "Profile":
-        """``count`` steps, once a few have been done.
-
-        Args:
-            start: steps done before.
-            last: the last step that will be done.
-        """
+        """Returns a profile of ``count`` steps of a run from ``start`` + 1 to ``last``, after the first few."""
         return cls(directory, start + 1 + max(0, min(SKIPPED, last - start - count)), count)
 
-    def at(self, step: int, pending: Any = None) -> None:
-        """Called before each step: starts or ends the trace where it is time.
+    def at(self, step: int, pending: PyTree = None) -> None:
+        """Starts or ends the trace when it is time. Call it before each step.
 
         Args:
-            step: the step that comes next.
-            pending: arrays that the device may still be computing, such as the state; waited for at both ends.
+            step: the next step.
+            pending: arrays that the device may still be computing, such as the state; awaited at both ends.
         """
         if not self._running and self._first <= step < self._end:
             jax.block_until_ready(pending)
@@ -57,12 +51,9 @@ class Profile:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if not self._running:
-            return
-        if kind is None:
-            self._stop()
-        else:  # a trace of what there was; its own trouble must not hide the error that is under way
-            with contextlib.suppress(Exception):
+        # The trace's own errors must not hide the one under way.
+        with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
+            if self._running:
                 self._stop()
 
     def _stop(self) -> None:

@@ -3,47 +3,40 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from orbax.checkpoint.checkpoint_managers import (
-    AnyPreservationPolicy,
-    EveryNSteps,
-    LatestN,
-    PolicyCheckpointInfo,
-    PreservationContext,
-    PreservationPolicy,
-)
+from orbax.checkpoint import checkpoint_managers as ocm
 
 
 @dataclass
-class Best(PreservationPolicy):
-    """Keeps the checkpoint with the lowest metric, of equal ones the newest; none where none has a metric.
+class Best(ocm.PreservationPolicy):
+    """Keeps the checkpoint with the lowest metric, the newest one of equals; none if none has a metric.
 
-    Orbax's own BestN keeps the metrics where a damaged one stops it from opening the others.
+    Orbax's BestN keeps the metrics in each checkpoint, where a damaged one stops it from opening the others.
 
     Attributes:
-        metrics: each step's, where it has one.
+        metrics: by step.
     """
 
     metrics: Mapping[int, float]
 
     def should_preserve(
-        self, checkpoints: Sequence[PolicyCheckpointInfo], *, context: PreservationContext
-    ) -> Sequence[bool]:
+        self, checkpoints: Sequence[ocm.PolicyCheckpointInfo], *, context: ocm.PreservationContext
+    ) -> list[bool]:
         judged = [(self.metrics[info.step], -info.step) for info in checkpoints if info.step in self.metrics]
         best = -min(judged)[1] if judged else None
         return [info.step == best for info in checkpoints]
 
 
-def retention(keep_last: int, keep_every: int, metrics: Mapping[int, float] | None) -> PreservationPolicy:
-    """Keeps what any of three rules asks for.
+def retention(keep_last: int, keep_every: int, metrics: Mapping[int, float] | None) -> ocm.PreservationPolicy:
+    """Returns the policy that keeps every checkpoint to which one of three rules applies.
 
     Args:
-        keep_last: the newest checkpoints, this many.
-        keep_every: every one at a multiple of this many steps; 0: none for that.
-        metrics: the one with the lowest metric, by these; None: none for that.
+        keep_last: number of newest checkpoints to keep.
+        keep_every: keep those whose step is a multiple of this; 0: no such rule.
+        metrics: keep the one with the lowest of these, by step; None: no such rule.
     """
-    policies: list[PreservationPolicy] = [LatestN(keep_last)]
+    policies: list[ocm.PreservationPolicy] = [ocm.LatestN(keep_last)]
     if keep_every:
-        policies.append(EveryNSteps(keep_every))
+        policies.append(ocm.EveryNSteps(keep_every))
     if metrics is not None:
         policies.append(Best(metrics))
-    return AnyPreservationPolicy(policies)
+    return ocm.AnyPreservationPolicy(policies)

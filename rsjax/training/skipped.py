@@ -1,30 +1,30 @@
-"""Steps that were left out because their loss or gradient was not finite, with what is needed to replay them."""
+"""The steps that training skipped because their loss or gradient was not finite, with what it takes to replay them."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import disk_guard
+from rsjax.training.log import read_rows, write_rows
 
 NAME = "skipped.jsonl"
 
 
 def read_skipped(directory: Path) -> list[dict[str, Any]]:
-    """The steps that a training stage left out, one dict each.
+    """Reads the skipped steps of a training stage.
 
-    Keys: ``step``; ``loss`` and ``grad_norm`` as text, for JSON has no NaN; ``records``, where the clips lie and come
-    from; ``data``, the loader's state before the batch: given to
-    :meth:`rsjax.data.curriculum.LoaderFactory.replay`, the batch comes back.
+    Returns:
+        A dict for each: ``step``; ``loss`` and ``grad_norm`` as text, because JSON has no NaN; ``records``, the clips'
+        files and origins; ``data``, the loader's state before the batch, from which
+        :meth:`rsjax.data.curriculum.LoaderFactory.replay` reads it again.
     """
-    path = directory / NAME
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return read_rows(directory / NAME)
 
 
 class SkippedSteps:
-    """Keeps ``skipped.jsonl`` in a training stage's directory, where a step was left out; later lines are cut off.
+    """Keeps ``skipped.jsonl`` in a training stage's directory; without a skipped step there is no file.
 
     Args:
-        start: the step that the run resumes after.
+        start: the step after which the run resumes; later lines are cut off.
     """
 
     def __init__(self, directory: Path, start: int) -> None:
@@ -34,15 +34,15 @@ class SkippedSteps:
             self._write()
 
     def add(self, step: int, scalars: dict[str, float], records: list[dict[str, Any]], data: dict[str, Any]) -> None:
-        """Writes one step down.
+        """Adds a step.
 
         Raises:
-            StoreError: the disk is full.
+            FileError: the disk is full.
         """
-        told = {name: str(scalars[name]) for name in ("loss", "grad_norm")}
-        self._rows.append({"step": step, **told, "records": records, "data": data})
+        reason = {name: str(scalars[name]) for name in ("loss", "grad_norm")}
+        self._rows.append({"step": step, **reason, "records": records, "data": data})
         self._write()
 
     def _write(self) -> None:
         with disk_guard(self._path):
-            write_atomically(self._path, "".join(json.dumps(row) + "\n" for row in self._rows).encode())
+            write_rows(self._path, self._rows)

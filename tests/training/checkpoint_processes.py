@@ -1,22 +1,15 @@
-"""One of two processes with two virtual devices each: ``… ID PORT DIRECTORY``.
+"""Checkpoints of two processes with two devices each; :mod:`tests.training.hosts` runs this in both."""
 
-They save what is cut over four devices, damage the newest checkpoint, and read the one before under other placements.
-"""
-
-import sys
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-jax.config.update("jax_num_cpu_devices", 2)
-
-import jax.numpy as jnp  # noqa: E402 - the devices are counted first
-import numpy as np  # noqa: E402
-from jax.experimental import multihost_utils  # noqa: E402
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec  # noqa: E402
-
-from rsjax.training.checkpoint import Checkpoints, load_weights, save_weights  # noqa: E402
+from rsjax.training.checkpoint import Checkpoints, load_weights, save_weights
 
 
 def state(step: int) -> dict[str, Any]:
@@ -44,7 +37,9 @@ def assert_state(restored: dict[str, Any], step: int, where: dict[str, Any]) -> 
             np.testing.assert_array_equal(shard.data, value[shard.index])
 
 
-def main(me: int, directory: Path) -> None:
+def save_together(directory: Path) -> None:
+    """Saves sharded states, damages the newest checkpoint, and restores the one before with other shardings."""
+    me = jax.process_index()
     mesh = jax.make_mesh((2, 2), ("data", "fsdp"), axis_types=(AxisType.Auto,) * 2)
     cut = shardings(mesh, PartitionSpec("fsdp"))
     here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
@@ -72,10 +67,3 @@ def main(me: int, directory: Path) -> None:
         np.testing.assert_array_equal(load_weights(directory / "weights", template(alone))["cut"], state(9)["cut"])
     multihost_utils.sync_global_devices("saved")
     np.testing.assert_array_equal(load_weights(directory / "weights", template(alone))["cut"], state(9)["cut"])
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.distributed.initialize(f"localhost:{sys.argv[2]}", 2, int(sys.argv[1]))
-    main(int(sys.argv[1]), Path(sys.argv[3]))
-    print("done")

@@ -1,9 +1,10 @@
 """One of several processes that train together: ``python -m tests.training.hosts FOLDER [HOST:PORT PROCESSES ID]``.
 
-Without an address it trains alone, on one device. Each way takes a few steps on the real loader's batches and saves a
-checkpoint in FOLDER/WAY: pmap of a small network (quickly compiled), fsdp of the world model. Prints, as JSON, the
-losses of each way's steps with a batch's places, and what the processes tell each other; the lead writes each way's
-last parameters to FOLDER/WAY-PROCESSES.npz.
+Without an address it joins the Slurm task that its environment describes, or trains alone on one device. Each way takes
+a few steps on the real loader's batches and saves a checkpoint in FOLDER/WAY: pmap of a small network (quickly
+compiled), fsdp of the world model. Several processes also save sharded checkpoints in FOLDER/checkpoints. Prints, as
+JSON, the losses of each way's steps with the clips' places in the batch, and what the processes exchange; the lead
+writes each way's last parameters to FOLDER/WAY-PROCESSES.npz.
 """
 
 import json
@@ -23,6 +24,7 @@ from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.objectives import Objective
 from rsjax.training.placement import Placement
+from tests.training.checkpoint_processes import save_together
 from tests.training.devices import LOOP, MODEL, STEPS, WITH_DEPTH, Small
 
 WAYS: dict[str, dict[str, Any]] = {"pmap": {"placement": "pmap"}, "fsdp": {"placement": "mesh", "fsdp": 2}}
@@ -30,7 +32,7 @@ OBJECTIVES: dict[str, Objective] = {"pmap": Small(), "fsdp": WITH_DEPTH}
 
 
 def records(count: int = 11) -> list[Arrays]:
-    """Clips that are as uneven as they are many: of every third one nothing counts, keypoints are hidden at random."""
+    """Returns clips of uneven weight: every third one counts nothing, keypoints are hidden at random."""
     rng, shape = np.random.default_rng(0), (MODEL.frames, MODEL.grid, MODEL.grid)
     return [
         {
@@ -62,7 +64,7 @@ def train(objective: Objective, loop: LoopConfig, folder: Path) -> dict[str, Any
         checkpoints = Checkpoints(folder)
         checkpoints.save(STEPS, placement.portable(state), loader.state())
         checkpoints.close()
-    # What a resumed run does: it has to fit the step that was compiled.
+    # A resumed run does this: the state has to fit the compiled step.
     checkpoints = Checkpoints(folder)
     restored, _ = checkpoints.restore(placement.template(objective, loop))
     checkpoints.close()
@@ -78,8 +80,8 @@ def failing() -> None:
         raise UserError("no room")
 
 
-def told() -> dict[str, Any]:
-    """What processes say to each other."""
+def exchanged() -> dict[str, Any]:
+    """Returns what the processes exchange."""
     me = jax.process_index()
     try:
         distributed.on_lead("a stage", failing)
@@ -98,9 +100,14 @@ def told() -> dict[str, Any]:
 def main(folder: Path, *address: str) -> dict[str, Any]:
     if address:
         distributed.initialize(address[0], int(address[1]), int(address[2]))
-    fields: dict[str, dict[str, Any]] = WAYS if address else {way: {"placement": "jit"} for way in WAYS}
+    else:
+        distributed.initialize()
+    several = jax.process_count() > 1
+    if several:
+        save_together(folder / "checkpoints")
+    fields: dict[str, dict[str, Any]] = WAYS if several else {way: {"placement": "jit"} for way in WAYS}
     trained = {way: train(OBJECTIVES[way], replace(LOOP, **fields[way]), folder / way) for way in WAYS}
-    return {"trained": trained, "told": told()}
+    return {"trained": trained, "exchanged": exchanged()}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
 import gc
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,10 +28,16 @@ def collected() -> Iterator[None]:
     gc.collect()
 
 
+@pytest.fixture(scope="module")
+def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("trained")
+    train(LOOP, directory)
+    return directory
+
+
 @pytest.fixture
-def trained(tmp_path: Path) -> Path:
-    train(LOOP, tmp_path)
-    return tmp_path
+def trained(trained_once: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained_once, tmp_path / "trained"))
 
 
 def truncate_largest(directory: Path) -> None:

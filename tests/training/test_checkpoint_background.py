@@ -29,14 +29,14 @@ def assert_newest(directory: Path, step: int, size: int = 1000) -> None:
 
 @pytest.fixture
 def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Nothing that is saved appears before this is set."""
-    release, finish = threading.Event(), module.write_manifest
+    """No checkpoint is finished before this event is set."""
+    release, finish = threading.Event(), module.write_checksums
 
     def wait_and_finish(*arguments: Any) -> None:
         assert release.wait(60)
         finish(*arguments)
 
-    monkeypatch.setattr(module, "write_manifest", wait_and_finish)
+    monkeypatch.setattr(module, "write_checksums", wait_and_finish)
     yield release
     release.set()
 
@@ -71,15 +71,15 @@ def test_host_arrays_may_change_while_they_are_written(tmp_path: Path, held: thr
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (OSError(errno.ENOSPC, "No space left on device"), "the disk is full"),
         (ValueError("UNAVAILABLE: no\nmore"), r"cannot write a checkpoint \(UNAVAILABLE: no\)$"),
     ],
 )
 @pytest.mark.parametrize("then", ["save", "wait", "close"])
-def test_what_fails_in_the_background_is_told_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, told: str, then: str
+def test_a_failure_in_the_background_is_reported_by_the_next_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, message: str, then: str
 ) -> None:
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, state(1), {"next": 1})
@@ -89,9 +89,9 @@ def test_what_fails_in_the_background_is_told_next(
         def fail(*_: Any) -> None:
             raise error
 
-        patch.setattr(module, "write_manifest", fail)
+        patch.setattr(module, "write_checksums", fail)
         checkpoints.save(2, state(2), {"next": 2})
-        with pytest.raises(FileError, match=f"{tmp_path}: {told}"):
+        with pytest.raises(FileError, match=f"{tmp_path}: {message}"):
             checkpoints.save(3, state(3), {}) if then == "save" else getattr(checkpoints, then)()
     assert [path.name for path in tmp_path.iterdir()] == ["1"]
     if then != "close":
@@ -118,14 +118,14 @@ def test_a_disk_that_fills_up_keeps_the_last_checkpoint(
 ) -> None:
     size = 2**17  # 512 KiB, which do not compress
     usage = module.shutil.disk_usage(small_disk)
-    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage)  # another process takes the room meanwhile
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage)  # another process takes the space meanwhile
     checkpoints = Checkpoints(small_disk / "checkpoints")
     checkpoints.save(1, state(1, size), {"next": 1})
     checkpoints.wait()
     filler = small_disk / "filler"
     free = 2**21 - sum(path.stat().st_blocks * 512 for path in small_disk.rglob("*"))
     filler.write_bytes(b"x" * (free - spare * 1024))
-    with pytest.raises(FileError, match="checkpoints: the disk is full"):  # noqa: PT012 - either may tell it
+    with pytest.raises(FileError, match="checkpoints: the disk is full"):  # noqa: PT012 - either may report it
         checkpoints.save(2, state(2, size), {"next": 2})
         checkpoints.wait()
     assert [path.name for path in (small_disk / "checkpoints").iterdir()] == ["1"]

@@ -1,5 +1,6 @@
 import contextlib
 import io
+import json
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -13,8 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsjax.data.codec import encode
+from rsjax.training import checksums
 from rsjax.training.checkpoint import CheckpointError, Checkpoints
-from rsjax.training.checkpoint_manifest import find_fault
+from rsjax.training.checksums import find_fault
 
 STEPS = (1, 2)
 
@@ -60,7 +63,7 @@ def files(checkpoint: Path) -> list[Path]:
 
 
 def restored(directory: Path) -> tuple[int, str]:
-    """The step of what is restored, which has to be as it was saved, and what is said."""
+    """Restores the newest step, which has to be as it was saved. Returns it and the output."""
     checkpoints, said = Checkpoints(directory), io.StringIO()
     with contextlib.redirect_stdout(said):
         got, data = checkpoints.restore(state(0))
@@ -80,17 +83,17 @@ def test_damage_is_harmless_or_the_checkpoint_before_is_used(
         way(damaged, share)
         step, said = restored(directory)
         if step == 2:
-            # Orbax's notes at the top are not read; a flipped bit of the manifest may be one of the metric's.
+            # Orbax's notes at the top are not read; a bit of the checksums' JSON may not matter.
             assert damaged.parent == directory / "2"
             assert said == ""
         else:
             assert step == 1
             assert f"checkpoint 2 is damaged ({damaged.relative_to(directory / '2')}: " in said
-            assert f"going on from that of step 1; kept as {directory}/bad-2" in said
+            assert f"resuming from that of step 1; kept as {directory}/bad-2" in said
             assert said.count("\n") == 1
 
 
-def test_damage_of_any_file_in_a_folder_is_found(written: Path, copy: Path) -> None:
+def test_damage_of_any_file_in_a_folder_is_detected(written: Path, copy: Path) -> None:
     inner = [path for path in files(written / "2") if path.parent != written / "2"]
     assert len(inner) > 5
     assert find_fault(copy / "2") is None
@@ -101,6 +104,28 @@ def test_damage_of_any_file_in_a_folder_is_found(written: Path, copy: Path) -> N
                 way(there, share)
                 assert str(path.relative_to(written / "2")) in str(find_fault(copy / "2"))
                 shutil.copy(path, there)
+
+
+def test_every_flipped_bit_of_the_checksums_is_detected_or_harmless(copy: Path) -> None:
+    path = copy / "2" / checksums.NAME
+    intact, content = path.read_bytes(), json.loads(path.read_text())
+    for bit in range(0, 8 * len(intact), 31):
+        damaged = bytearray(intact)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        if find_fault(copy / "2") is None:
+            assert json.loads(path.read_text()) == content
+
+
+def test_a_checkpoint_of_an_earlier_version_is_still_checked(copy: Path) -> None:
+    path = copy / "2" / checksums.NAME
+    files = json.loads(path.read_text())["files"]
+    path.unlink()
+    (copy / "2" / checksums.OLD_NAME).write_bytes(encode({"metric": 0.5, "files": files}))
+    assert checksums.read_metric(copy / "2") == 0.5
+    assert restored(copy)[0] == 2
+    truncate(copy / "2" / "data" / "metadata", 0.5)
+    assert restored(copy)[0] == 1
 
 
 def test_after_a_fall_back_the_same_step_can_be_saved_again(copy: Path) -> None:
@@ -146,7 +171,7 @@ def test_another_architecture_is_no_damage(copy: Path) -> None:
 
 
 def test_a_damaged_checkpoint_before_another_architecture_stays_where_it_is(copy: Path) -> None:
-    delete(copy / "2" / "manifest.msgpack", 0)
+    delete(copy / "2" / checksums.NAME, 0)
     checkpoints = Checkpoints(copy)
     with pytest.raises(CheckpointError, match=rf"{copy}/1: does not fit this configuration"):
         checkpoints.restore({"w": jnp.zeros(3)})

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -14,22 +15,32 @@ import yaml
 from experiments.cli import parse
 from experiments.train import Options
 from rsjax.training import distributed
+from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.distributed import HostsError
+from tests.training.checkpoint_processes import state
 from tests.training.test_placement import ROOT, virtual
 
 Results = dict[str, Any]
+SLURM = {
+    "SLURM_JOB_ID": "7",
+    "SLURM_STEP_NODELIST": "n[1-2]",
+    "SLURM_NTASKS": "2",
+    "SLURM_PROCID": "0",
+    "SLURM_LOCALID": "0",
+}
 
 
-def begin(folder: Path, devices: int, *address: str) -> subprocess.Popen[str]:
+def start(folder: Path, devices: int, *address: str, **environ: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.training.hosts", str(folder), *address]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=ROOT, env=virtual(devices), stdout=pipe, stderr=pipe, text=True)
+    pipe, environment = subprocess.PIPE, virtual(devices) | environ
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 
-def ended(process: subprocess.Popen[str]) -> Results:
+def result(process: subprocess.Popen[str]) -> Results:
     out, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
-    return json.loads(out.splitlines()[-1])
+    *notes, last = out.splitlines()
+    return json.loads(last) | {"notes": notes}
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +50,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(folder: Path) -> list[Results]:
-    """Of two processes with two devices each, and of one with one."""
+    """Of two processes with two devices each, and of one with one device.
+
+    Process 0 gets the address from its environment, as a Slurm task, and process 1 as arguments.
+    """
     with socket.socket() as free:
         free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
-    pair = [begin(folder, 2, address, "2", str(number)) for number in range(2)]
-    processes = [*pair, begin(folder / "alone", 1)]
+        port = str(free.getsockname()[1])
+    slurm = SLURM | {"SLURM_STEP_NODELIST": "localhost,other", "JAX_COORDINATOR_PORT": port}
+    pair = [start(folder, 2, **slurm), start(folder, 2, f"localhost:{port}", "2", "1")]
+    processes = [*pair, start(folder / "alone", 1)]
     try:
-        return [ended(process) for process in processes]
+        return [result(process) for process in processes]
     finally:
         for process in processes:
             process.kill()  # where one failed, the other would wait for it
@@ -63,45 +78,53 @@ def test_two_processes_train_as_one(way: str, results: list[Results], folder: Pa
         np.testing.assert_allclose(ours[name], theirs[name], atol=1e-5)
 
 
+def test_two_processes_save_checkpoints_together_and_one_reads_them(results: list[Results], folder: Path) -> None:
+    damaged = "checkpoint 3 is damaged (data/metadata: No such file or directory)"
+    assert [sum(damaged in note for note in result["notes"]) for result in results] == [1, 0, 0]
+    saved = state(4)
+    checkpoints = Checkpoints(folder / "checkpoints")
+    restored, data = checkpoints.restore(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), saved))
+    checkpoints.close()
+    assert data == {"next": 4}
+    jax.tree.map(np.testing.assert_array_equal, restored, saved)
+
+
 def test_every_clip_knows_its_place_in_the_global_batch(results: list[Results]) -> None:
     assert [result["trained"]["fsdp"]["index"] for result in results] == [[0, 2, 4, 6], [1, 3, 5, 7], [*range(8)]]
 
 
 def test_processes_see_their_own_devices_and_all(results: list[Results]) -> None:
-    assert [result["told"]["devices"] for result in results] == [[2, 4], [2, 4], [1, 1]]
+    assert [result["exchanged"]["devices"] for result in results] == [[2, 4], [2, 4], [1, 1]]
 
 
-def test_all_hear_what_the_lead_says_and_whether_anyone_was_told_to_stop(results: list[Results]) -> None:
+def test_all_get_the_leads_value_and_learn_whether_any_has_to_stop(results: list[Results]) -> None:
     for result in results[:2]:
-        assert result["told"]["agree"] == {"from": 0, "text": "λ" * 300}
-        assert result["told"]["anywhere"] == [True, False]
-    assert results[2]["told"]["anywhere"] == [False, False]
+        assert result["exchanged"]["agree"] == {"from": 0, "text": "λ" * 300}
+        assert result["exchanged"]["anywhere"] == [True, False]
+    assert results[2]["exchanged"]["anywhere"] == [False, False]
 
 
 def test_where_the_leads_work_fails_all_fail(results: list[Results]) -> None:
-    failures = [result["told"]["failed"] for result in results]
+    failures = [result["exchanged"]["failed"] for result in results]
     assert failures == ["no room", "a stage failed on process 0 (UserError: no room)", "no room"]
 
 
-SLURM = {"SLURM_STEP_NODELIST": "n[1-2]", "SLURM_PROCID": "1"}
-
-
 @pytest.mark.parametrize(
-    ("environ", "name"),
+    ("environ", "several"),
     [
-        ({}, ""),
-        (SLURM | {"SLURM_NTASKS": "2"}, "slurm"),
-        (SLURM | {"SLURM_NTASKS": "1"}, ""),
-        ({"SLURM_JOB_ID": "7", "SLURM_NTASKS": "2"}, ""),  # a batch script outside srun
-        ({"OMPI_MCA_orte_hnp_uri": "x", "OMPI_COMM_WORLD_SIZE": "2"}, "ompi"),
-        ({"TPU_WORKER_HOSTNAMES": "a,b", "TPU_WORKER_ID": "0"}, "gketpu"),
-        ({"TPU_WORKER_HOSTNAMES": "localhost", "TPU_WORKER_ID": "0"}, ""),
-        ({"TPU_WORKER_HOSTNAMES": "a", "MEGASCALE_NUM_SLICES": "2"}, "gketpu"),
-        ({"JOB_COMPLETION_INDEX": "0"}, ""),  # jax would ask for the kubernetes package
+        ({}, False),
+        (SLURM, True),
+        (SLURM | {"SLURM_NTASKS": "1"}, False),
+        ({"SLURM_JOB_ID": "7", "SLURM_NTASKS": "2"}, False),  # a batch script outside srun
+        ({"OMPI_MCA_orte_hnp_uri": "x", "OMPI_COMM_WORLD_SIZE": "2"}, True),
+        ({"TPU_WORKER_HOSTNAMES": "a,b", "TPU_WORKER_ID": "0"}, True),
+        ({"TPU_WORKER_HOSTNAMES": "localhost", "TPU_WORKER_ID": "0"}, False),
+        ({"TPU_WORKER_HOSTNAMES": "a", "MEGASCALE_NUM_SLICES": "2"}, True),
+        ({"JOB_COMPLETION_INDEX": "0"}, False),  # jax would need the kubernetes package
     ],
 )
-def test_the_cluster_is_known_by_what_it_sets(environ: Mapping[str, str], name: str) -> None:
-    assert distributed.cluster(environ) == name
+def test_launchers_are_recognized_by_their_environment_variables(environ: Mapping[str, str], several: bool) -> None:
+    assert distributed.has_peers(environ) == several
 
 
 @pytest.mark.parametrize(
@@ -113,7 +136,7 @@ def test_the_cluster_is_known_by_what_it_sets(environ: Mapping[str, str], name: 
         (("h", 2, 0), "--coordinator is 'h'; it is HOST:PORT"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options: tuple[Any, ...], message: str) -> None:
+def test_contradictory_options_are_refused(options: tuple[Any, ...], message: str) -> None:
     with pytest.raises(HostsError, match=message):
         distributed.initialize(*options)
 
@@ -127,7 +150,7 @@ def test_one_process_stays_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert distributed.agree("this") == "this"
 
 
-def test_the_launch_files_give_the_command_what_it_knows() -> None:
+def test_the_launch_files_use_options_of_the_command() -> None:
     job = list(yaml.safe_load_all((ROOT / "launch/kubernetes.yaml").read_text()))[1]["spec"]
     command = job["template"]["spec"]["containers"][0]["command"][-1].replace("$JOB_COMPLETION_INDEX", "1")
     program, *arguments = shlex.split(command.partition(" -m ")[2])

@@ -106,7 +106,7 @@ def test_when_it_breaks_training_goes_on_and_that_is_told_once(
             log.write(step, {"loss": 0.5})
     assert [row["step"] for row in read_log(stage)] == [1, 2]
     told = capsys.readouterr().out
-    assert told.count("Weights & Biases is off until the next start (the service is gone); training goes on") == 1
+    assert told.count("Weights & Biases is off until the next start (the service is gone); training continues") == 1
 
 
 def test_when_it_cannot_start_the_cure_is_one_line(wandb: Stub, stage: Path) -> None:
