@@ -69,8 +69,8 @@ def split_store(place: Path, options: Split) -> list[Any]:
 
     if options.parts < 0:
         raise ConfigError(f"--parts is {options.parts}; it is how many stores to make")
-    parts = into_parts(options.parts, options.into) if options.parts else None
-    return list(split(place, parts or by_label(place, options.by, options.into)).values())
+    even, into = options.parts, options.into
+    return list(split(place, into_parts(place, even, into) if even else by_label(place, options.by, into)).values())
 
 
 def tokenize(place: Path, run: Path) -> Any:

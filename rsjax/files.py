@@ -1,8 +1,10 @@
 """Files that other processes and later runs read: written atomically, locked, with clear errors on a full disk."""
 
 import errno
+import hashlib
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -43,6 +45,13 @@ def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete 
     if not isinstance(content, kind):
         raise FileError(f"{path}: a JSON {kind.__name__} is expected, not {content!r:.80}; {cure}")
     return content
+
+
+def safe_id(text: str) -> str:
+    """Returns a file name for any text: the text itself if it is one, otherwise what is left of it and a hash."""
+    kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip(".-")[:100]
+    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return kept if kept and kept == text else f"{kept or 'episode'}-{digest}"
 
 
 def replace_directory(new: Path, path: Path) -> None:

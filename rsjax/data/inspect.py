@@ -14,9 +14,8 @@ from jaxtyping import UInt8
 
 from rsjax.data.codec import Record
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.merge import NONE, shapes
-from rsjax.data.store import Store, StoreError
-from rsjax.data.token_sets import counts, token_sets
+from rsjax.data.store import NO_ARRAY, Store, StoreError
+from rsjax.data.token_sets import token_sets
 
 BARS = " ▁▂▃▄▅▆▇█"
 _GAP = 4  # pixels between pictures
@@ -93,7 +92,7 @@ def look(store: Store, most: int = 200) -> Contents:
             low, high, width = min(low, actions.min()), max(high, actions.max()), actions.shape[-1]
     return Contents(
         splits={name: len(store.source(name)) for name in store.splits},
-        shapes={} if damaged else shapes(store),
+        shapes={} if damaged else store.shapes(),
         words=_words(store),
         lengths=dict(sorted(lengths.items())),
         motion=motion,
@@ -105,7 +104,7 @@ def look(store: Store, most: int = 200) -> Contents:
         depth=(depths, looked),
         episodes={split: len(names) for split, names in store.manifest.get("episodes", {}).items()},
         left_out=_left_out(store),
-        tokens={key: counts(tokens) for key, tokens in token_sets(store).items()},
+        tokens={key: tokens.counts() for key, tokens in token_sets(store).items()},
         damaged=damaged,
     )
 
@@ -145,7 +144,7 @@ def render(contents: Contents) -> list[str]:
     lines += [f"left out  {_counted(contents.left_out)}"] if contents.left_out else []
     lines += [f"cameras   {_counted(contents.cameras)}"] if contents.cameras else []
     lines += [f"rate      {rate} {count}×" for rate, count in contents.rates.items()]
-    lines += [f"{name:<9} {shape}" for name, shape in contents.shapes.items() if shape != NONE]
+    lines += [f"{name:<9} {shape}" for name, shape in contents.shapes.items() if shape != NO_ARRAY]
     if contents.actions:
         width, low, mean, high = contents.actions
         lines.append(f"actions   {width} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}")

@@ -1,37 +1,40 @@
-"""Stores into one, and one into several. Records are copied one at a time; what is replaced is replaced whole.
+"""Merging stores into one and splitting one into several. Records are copied one at a time.
 
-A store is moved by moving its directory: its manifest names its files without their place.
+Training can mix stores as it reads (:mod:`rsjax.data.curriculum`). A merged store is for everything else: one set of
+statistics, one validation split, one place to inspect, evaluate and send elsewhere. Its directory can be moved, as its
+manifest names its files without their place.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from rsjax.config import content_key
-from rsjax.data.codec import Record
-from rsjax.data.labels import Labels
-from rsjax.data.store import MANIFEST, Store, StoreError, open_store, write_store
+from rsjax.data.labels import Words
+from rsjax.data.normalization import Statistics
+from rsjax.data.store import MANIFEST, NO_ARRAY, Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, token_sets, tokens_key
-from rsjax.ingest.actions import Statistics
-from rsjax.ingest.episode import safe_id
+from rsjax.files import safe_id
 
-UNITS = ("action_mean", "action_std", "depth_range")  # what a store's numbers are told in
-LEFT_OUT = ("filtered", "quarantine")  # by episode, why
-OF_ALL = ("format", "splits", "key", "counts", "episodes", "success_share")  # of a manifest: not true of a part
-Words = dict[str, str]
-Chosen = Callable[[str, int, Words], bool]
+UNITS = ("action_mean", "action_std", "depth_range")  # fields of a manifest that normalization reads
+LEFT_OUT = ("filtered", "quarantine")  # fields with a reason for each episode that was left out
+OF_WHOLE = ("format", "splits", "key", "counts", "episodes", "success_share")  # fields that are not true of a part
+
+Numbers = dict[str, list[int]]  # of chosen records, by split
 
 
 def merge(paths: Sequence[Path], out: Path) -> Store:
-    """One store of all records of several, split by split, in the order given.
+    """Writes all records of several stores into one, split by split, in the order of the stores.
 
-    Units that differ are made those of all train records together; records say their depth range, so that is set anew.
-    Tokens that lie beside all of the clips come along, unless depth ranges differ, on which depth tokens depend.
+    Statistics of actions and depth ranges that differ become those of all train records together; depth ranges in the
+    records' provenance change with them. Token sets that all the stores have are merged too, unless depth ranges
+    differ, on which depth tokens depend.
 
     Raises:
-        StoreError: fewer than two, one twice, stores of other kinds or shapes, tokens of another tokenizer or depth
-            range, or ``out`` cannot be written or is one of them.
+        StoreError: fewer than two stores, one of them twice, stores of other kinds or shapes, tokens of another
+            tokenizer or depth range, or ``out`` exists or lies in one of them.
+        FileError: ``out`` cannot be written.
     """
     stores = [open_store(path) for path in paths]
     _check_mergeable(stores, out)
@@ -39,73 +42,25 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
     merged = _write_merged(stores, out, key)
     if all(_depth_range(store) == _depth_range(merged) for store in stores):
         sets = [token_sets(store) for store in stores]
-        for tokenizer in set.intersection(*(set(one) for one in sets)):
+        for tokenizer in set.intersection(*map(set, sets)):
             _write_merged([one[tokenizer] for one in sets], out / FOLDER / tokenizer, tokens_key(key, tokenizer))
     return merged
 
 
-def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
-    """What the stores left out; an episode of the same name in two of them is told with its store."""
-    told: dict[str, str] = {}
-    for store in stores:
-        for episode, why in store.manifest.get(name, {}).items():
-            told[f"{episode} ({store.path})" if episode in told else episode] = why
-    return told
+def split(path: Path, parts: Mapping[Path, Numbers]) -> dict[Path, Store]:
+    """Writes chosen records of a store into new stores.
 
-
-def _episodes(stores: Sequence[Store]) -> dict[str, list[str]]:
-    """Of each split."""
-    told: dict[str, list[str]] = {}
-    for store in stores:
-        for split, episodes in store.manifest["episodes"].items():
-            told.setdefault(split, []).extend(episodes)
-    return told
-
-
-def _depth_range(store: Store) -> Any:
-    return store.manifest.get("depth_range")
-
-
-def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
-    first = stores[0].manifest
-    meta = {name: value for name, value in first.items() if name not in OF_ALL}
-    meta |= (
-        _units(stores)
-        | {
-            "key": key,
-            "merged": [{"path": str(store.path), "key": store.manifest.get("key")} for store in stores],
-        }
-        | {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
-    )
-    if all("episodes" in store.manifest for store in stores):
-        meta["episodes"] = _episodes(stores)
-    if all(store.manifest.get("success_share") is not None for store in stores):
-        meta["success_share"] = _weighted(stores, "success_share")
-    stamp = meta["depth_range"]
-    restamp = first["kind"] == "clips" and any(_depth_range(store) != stamp for store in stores)
-    writer = _Copy(labels=all(_labelled(store, split) for store in stores for split in store.splits))
-    splits = {}
-    for split in dict.fromkeys(split for store in stores for split in store.splits):
-        parts = [(store, split, None) for store in stores if split in store.splits]
-        splits[split] = writer.records(parts, stamp if restamp else _KEEP)
-    write_store(out, first["kind"], splits, meta, writer.label if writer.labels else None)
-    return open_store(out)
-
-
-def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
-    """Stores of chosen records of one, which keep its units: what was learnt on the whole can read the parts.
-
-    Tokens that lie beside the clips are split with them.
+    They keep its statistics, so models trained on the whole can read the parts. Its token sets are split with it.
 
     Args:
-        outs: for each new store, whether it takes a record: of (split, number there, words of its labels).
+        parts: the records of each new store, from :func:`by_label` or :func:`into_parts`.
 
     Raises:
-        StoreError: nothing is chosen for one of them, or it cannot be written.
+        StoreError: no record is chosen for a new store, or its place is taken or lies in the old one.
+        FileError: a new store cannot be written.
     """
     store = open_store(path)
     sets = token_sets(store)
-    parts = {out: {name: _chosen(store, name, chosen) for name in store.splits} for out, chosen in outs.items()}
     for out, numbers in parts.items():
         _check_free(out, [store])
         if not any(numbers.values()):
@@ -115,89 +70,146 @@ def split(path: Path, outs: Mapping[Path, Chosen]) -> dict[Path, Store]:
         _write_part(store, numbers, out, key)
         for tokenizer, tokens in sets.items():
             _write_part(tokens, numbers, out / FOLDER / tokenizer, tokens_key(key, tokenizer))
-    return {out: open_store(out) for out in outs}
+    return {out: open_store(out) for out in parts}
 
 
-def _write_part(store: Store, numbers: Mapping[str, list[int]], out: Path, key: str) -> None:
-    meta = {name: value for name, value in store.manifest.items() if name not in (*OF_ALL, "action_count")}
-    writer = _Copy(labels=all(_labelled(store, name) for name in store.splits))
-    splits = {name: writer.records([(store, name, numbers[name])], _KEEP) for name in store.splits}
-    write_store(out, store.manifest["kind"], splits, meta | {"key": key}, writer.label if writer.labels else None)
-
-
-def by_label(path: Path, column: str, folder: Path) -> dict[Path, Chosen]:
-    """For :func:`split`: a store in ``folder`` for each word of a column, such as ``difficulty``, named by it.
+def by_label(path: Path, column: str, folder: Path) -> dict[Path, Numbers]:
+    """Returns, for :func:`split`, a store in ``folder`` for each word of a column, such as ``difficulty``.
 
     Raises:
         StoreError: the store has no such labels.
     """
     store = open_store(path)
-    found: dict[str, None] = {}
-    for name in store.splits:
-        if len(store.source(name)):
-            words = store.labels(name).words
-            if column not in words:
-                raise StoreError(f"{path / MANIFEST}: no label {column!r}; it has {', '.join(words)}")
-            found |= dict.fromkeys(words[column])
-    return {folder / safe_id(word): _is(column, word) for word in found}
+    parts: dict[Path, Numbers] = {}
+    for name, count in store.counts().items():
+        if not count:
+            continue
+        labels = store.labels(name)
+        if column not in labels.words:
+            raise StoreError(f"{path / MANIFEST}: no label {column!r}; it has {', '.join(labels.words)}")
+        for code, word in enumerate(labels.words[column]):
+            numbers = parts.setdefault(folder / safe_id(word), {split: [] for split in store.splits})
+            numbers[name] = (labels.codes[column] == code).nonzero()[0].tolist()
+    return parts
 
 
-def into_parts(count: int, folder: Path) -> dict[Path, Chosen]:
-    """For :func:`split`: ``count`` stores in ``folder`` of as many records each, as nearly as it goes."""
-    return {folder / f"part-{part:03d}": _every(count, part) for part in range(count)}
+def into_parts(path: Path, count: int, folder: Path) -> dict[Path, Numbers]:
+    """Returns, for :func:`split`, ``count`` stores in ``folder`` whose numbers of records differ by one at most."""
+    sizes = open_store(path).counts()
+    return {
+        folder / f"part-{part:03d}": {name: list(range(part, size, count)) for name, size in sizes.items()}
+        for part in range(count)
+    }
 
 
-def _is(column: str, word: str) -> Chosen:
-    return lambda split, number, words: words[column] == word
+class _Copy(dict[str, Any]):
+    """A record with the labels that it has in the store from which it is copied."""
+
+    words: Words
 
 
-def _every(count: int, part: int) -> Chosen:
-    return lambda split, number, words: number % count == part
+def _copies(
+    parts: Iterable[tuple[Store, str, Iterable[int]]], labelled: bool, changes: dict[str, Any]
+) -> Iterator[_Copy]:
+    """Yields the records of (store, split, numbers), with changes of their provenance."""
+    for store, name, numbers in parts:
+        source = store.source(name)
+        labels = store.labels(name) if labelled and len(source) else None
+        for number in numbers:
+            record = _Copy(source[number])
+            if changes:
+                record["provenance"] = record["provenance"] | changes
+            if labels is not None:
+                record.words = labels.of(number)
+            yield record
 
 
-NONE = "none"  # the shape of an array that is left out
-_KEEP = object()  # a depth range that is not to be changed
+def _write_part(store: Store, numbers: Numbers, out: Path, key: str) -> None:
+    meta = {name: value for name, value in store.manifest.items() if name not in (*OF_WHOLE, "action_count")}
+    labelled = _labelled([store])
+    splits = {name: _copies([(store, name, numbers[name])], labelled, {}) for name in store.splits}
+    write_store(out, store.manifest["kind"], splits, meta | {"key": key}, _words if labelled else None)
 
 
-@dataclass
-class _Copy:
-    """Hands records on, and remembers the labels of the one that was handed on last.
-
-    Attributes:
-        labels: whether the sources have them.
-    """
-
-    labels: bool
-    _words: Words = field(default_factory=dict)
-
-    def records(self, parts: Sequence[tuple[Store, str, list[int] | None]], depth_range: Any) -> Iterator[Record]:
-        """Of (store, split, numbers or None for all), with this depth range in their provenance."""
-        for store, name, numbers in parts:
-            source = store.source(name)
-            labels = store.labels(name) if self.labels and len(source) else None
-            for number in range(len(source)) if numbers is None else numbers:
-                self._words = _words(labels, number)
-                record = source[number]
-                if depth_range is not _KEEP:
-                    record = record | {"provenance": record["provenance"] | {"depth_range": depth_range}}
-                yield record
-
-    def label(self, record: Record) -> Words:
-        return self._words
-
-
-def _words(labels: Labels | None, number: int) -> Words:
-    return {} if labels is None else {name: words[labels.codes[name][number]] for name, words in labels.words.items()}
+def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
+    first = stores[0].manifest
+    meta = {name: value for name, value in first.items() if name not in OF_WHOLE} | _statistics(stores)
+    meta |= {"key": key, "merged": [{"path": str(one.path), "key": one.manifest.get("key")} for one in stores]}
+    meta |= {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
+    if all("episodes" in store.manifest for store in stores):
+        meta["episodes"] = _episodes(stores)
+    if all(store.manifest.get("success_share") is not None for store in stores):
+        sizes = [sum(store.counts().values()) for store in stores]
+        shares = [store.manifest["success_share"] * size for store, size in zip(stores, sizes, strict=True)]
+        meta["success_share"] = sum(shares) / max(1, sum(sizes))
+    stamp = {"depth_range": meta["depth_range"]}
+    changed = first["kind"] == "clips" and any(_depth_range(store) != meta["depth_range"] for store in stores)
+    labelled = _labelled(stores)
+    splits = {
+        name: _copies(
+            [(store, name, range(store.counts()[name])) for store in stores if name in store.splits],
+            labelled,
+            stamp if changed else {},
+        )
+        for name in dict.fromkeys(name for store in stores for name in store.splits)
+    }
+    write_store(out, first["kind"], splits, meta, _words if labelled else None)
+    return open_store(out)
 
 
-def _labelled(store: Store, name: str) -> bool:
-    return not len(store.source(name)) or store.labelled(name)
+def _words(record: Any) -> Words:
+    return record.words
 
 
-def _chosen(store: Store, name: str, chosen: Chosen) -> list[int]:
-    count = len(store.source(name))
-    labels = store.labels(name) if count and store.labelled(name) else None
-    return [number for number in range(count) if chosen(name, number, _words(labels, number))]
+def _labelled(stores: Sequence[Store]) -> bool:
+    return all(store.labelled(name) for store in stores for name, count in store.counts().items() if count)
+
+
+def _depth_range(store: Store) -> Any:
+    return store.manifest.get("depth_range")
+
+
+def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
+    """Returns the reasons of all stores by episode; an episode that two stores have is named with the later store."""
+    reasons: dict[str, str] = {}
+    for store in stores:
+        for episode, why in store.manifest.get(name, {}).items():
+            reasons[f"{episode} ({store.path})" if episode in reasons else episode] = why
+    return reasons
+
+
+def _episodes(stores: Sequence[Store]) -> dict[str, list[str]]:
+    """Returns the episodes of all stores by split."""
+    episodes: dict[str, list[str]] = {}
+    for store in stores:
+        for name, ids in store.manifest["episodes"].items():
+            episodes.setdefault(name, []).extend(ids)
+    return episodes
+
+
+def _statistics(stores: Sequence[Store]) -> dict[str, Any]:
+    """Returns the statistics of all train records together; fields that all stores agree on stay as they are."""
+    manifests = [store.manifest for store in stores]
+    units = {name: manifests[0].get(name) for name in UNITS}
+    alike = all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests)
+    if alike and not all("action_count" in manifest for manifest in manifests):
+        return units
+    total = reduce(Statistics.merged, map(_action_statistics, stores))
+    ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
+    merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
+    unit = next((manifest["depth_unit"] for manifest in manifests if manifest.get("depth_unit")), None)
+    return total.to_json() | {"depth_range": merged, "depth_unit": unit} | (units if alike else {})
+
+
+def _action_statistics(store: Store) -> Statistics:
+    if "action_count" in store.manifest:
+        return Statistics.from_json(store.manifest)
+    source = store.source("train")
+    if not len(source):
+        raise StoreError(
+            f"{store.path}: its train split has no records, so its actions have no statistics; leave it out"
+        )
+    return reduce(Statistics.merged, (Statistics.of(source[n]["actions"][1:]) for n in range(len(source))))
 
 
 def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
@@ -206,33 +218,33 @@ def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
     if len({store.path.resolve() for store in stores}) < len(stores):
         raise StoreError("a store cannot be merged with itself; name each once")
     _check_free(out, stores)
-    one = stores[0]
-    tokens = one.manifest.get("kind") == "tokens"
-    columns = _columns(one)
-    told = {store.manifest["depth_unit"]: store.path for store in stores if store.manifest.get("depth_unit")}
-    if len(told) > 1:
-        units = "; ".join(f"{unit} in {path}" for unit, path in told.items())
+    depths = {store.manifest["depth_unit"]: store.path for store in stores if store.manifest.get("depth_unit")}
+    if len(depths) > 1:
+        units = "; ".join(f"{unit} in {path}" for unit, path in depths.items())
         raise StoreError(f"depth_unit: {units}; such depth does not mix: ingest one of them with --depth none")
+    one = stores[0]
+    fields = ("kind", "tokenizer", *(("depth_range",) if one.manifest.get("kind") == "tokens" else ()))
+    columns, ours = _columns(one), one.shapes()
     for other in stores[1:]:
-        for name in ("kind", "tokenizer", *(("depth_range",) if tokens else ())):
+        for name in fields:
             if other.manifest.get(name) != one.manifest.get(name):
                 raise StoreError(
                     f"{other.path}: its {name} is {other.manifest.get(name)}, that of {one.path} is "
                     f"{one.manifest.get(name)}; such stores can be mixed in training (docs/training.md), not merged"
                 )
-        there, here = shapes(other), shapes(one)
-        differing = next((name for name in here | there if _differ(here.get(name), there.get(name))), None)
-        if differing:
-            raise StoreError(
-                f"{other.path}: {differing} is {there.get(differing)}, in {one.path} {here.get(differing)}; make both "
-                f"with the same settings"
-            )
+        theirs = other.shapes()
+        for name in ours | theirs:
+            shapes = theirs.get(name), ours.get(name)
+            if shapes[0] != shapes[1] and NO_ARRAY not in shapes:  # depth may be missing from any clip
+                raise StoreError(
+                    f"{other.path}: {name} is {shapes[0]}, in {one.path} {shapes[1]}; make both with the same settings"
+                )
         if columns is not None and _columns(other) not in (None, columns):
             raise StoreError(f"{other.path}: its labels are {_columns(other)}, those of {one.path} {columns}")
 
 
 def _check_free(out: Path, stores: Sequence[Store]) -> None:
-    """Raises :class:`StoreError` where something is already, or a store that is read would be written into."""
+    """Raises :class:`StoreError` if something is at ``out``, or ``out`` lies in a store that is read."""
     if out.exists():
         raise StoreError(f"{out}: is there already; choose another place, or delete it")
     for store in stores:
@@ -240,62 +252,7 @@ def _check_free(out: Path, stores: Sequence[Store]) -> None:
             raise StoreError(f"{out}: lies in {store.path}, which is read; choose another place")
 
 
-def _differ(here: str | None, there: str | None) -> bool:
-    """Whether two shapes of one array cannot be in one store. Depth may be missing from any clip."""
-    return here != there and NONE not in (here, there)
-
-
 def _columns(store: Store) -> list[str] | None:
-    """The names of a store's labels; None where it has none."""
+    """Returns the names of a store's label columns, or None if it has none."""
     entries = [entry["labels"] for entry in store.manifest["splits"].values() if "labels" in entry]
     return sorted(entries[0]["words"]) if entries else None
-
-
-def shapes(store: Store) -> dict[str, str]:
-    """Type and shape of each array of the store's first record; ``NONE`` for one that is left out."""
-    for name in store.splits:
-        source = store.source(name)
-        if len(source):
-            record = source[0]
-            return {
-                key: f"{value.dtype} {value.shape}" if hasattr(value, "dtype") else NONE
-                for key, value in record.items()
-                if hasattr(value, "dtype") or value is None
-            }
-    return {}
-
-
-def _units(stores: Sequence[Store]) -> dict[str, Any]:
-    """Of all train records together, each as they stand where all stores agree."""
-    manifests = [store.manifest for store in stores]
-    units = {name: manifests[0].get(name) for name in UNITS}
-    alike = all({name: manifest.get(name) for name in UNITS} == units for manifest in manifests)
-    if alike and not all("action_count" in manifest for manifest in manifests):
-        return units
-    total: Statistics | None = None
-    for store in stores:
-        one = Statistics.from_json(store.manifest) if "action_count" in store.manifest else _measured(store)
-        total = one if total is None else total.merged(one)
-    assert total is not None
-    ranges = [manifest["depth_range"] for manifest in manifests if manifest.get("depth_range")]
-    merged = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
-    unit = next((manifest["depth_unit"] for manifest in manifests if manifest.get("depth_unit")), None)
-    return total.to_json() | {"depth_range": merged, "depth_unit": unit} | (units if alike else {})
-
-
-def _measured(store: Store) -> Statistics:
-    source = store.source("train")
-    total: Statistics | None = None
-    for number in range(len(source)):
-        one = Statistics.of(source[number]["actions"][1:])
-        total = one if total is None else total.merged(one)
-    if total is None:
-        raise StoreError(
-            f"{store.path}: its train split has no records, so its actions have no statistics; leave it out"
-        )
-    return total
-
-
-def _weighted(stores: Sequence[Store], name: str) -> float:
-    sizes = [sum(len(store.source(part)) for part in store.splits) for store in stores]
-    return sum(s.manifest[name] * size for s, size in zip(stores, sizes, strict=True)) / max(1, sum(sizes))

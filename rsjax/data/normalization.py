@@ -1,32 +1,33 @@
-"""What turns a data set's units into a model's, and back.
+"""Normalization of actions and depth, and the statistics that it comes from.
 
-Axes: B clips, T frames, A action dimensions.
+Axes: B clips, T frames, A action dimensions, N rows.
 """
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from rsjax.data.store import MANIFEST, Store, StoreError
 from rsjax.errors import UserError
 from rsjax.files import FileError, read_json, write_atomically
 
-_FILE = "units.json"
+FILE = "units.json"
 
 
 @dataclass(frozen=True)
 class Normalization:
-    """Those of a data set.
+    """The numbers that turn a data set's units into a model's.
 
     Attributes:
-        action_mean: of each action dimension over the training split, (A,).
-        action_std: likewise.
-        depth_range: near and far end of the depth colour map, metres; None where no clip has depth.
+        action_mean: mean of each action dimension over the training split, (A,).
+        action_std: standard deviation, likewise.
+        depth_range: near and far end of the depth colour map, metres; None if no clip has depth.
     """
 
     action_mean: tuple[float, ...]
@@ -35,10 +36,10 @@ class Normalization:
 
     @classmethod
     def create(cls, store: Store) -> "Normalization":
-        """The units in a store's manifest.
+        """Reads the normalization of a store's manifest.
 
         Raises:
-            StoreError: it names none.
+            StoreError: the manifest has no statistics.
         """
         try:
             return cls._of(store.manifest)
@@ -48,12 +49,12 @@ class Normalization:
 
     @classmethod
     def load(cls, run: Path) -> "Normalization":
-        """Those that a run was trained in.
+        """Reads the normalization that a run was trained with.
 
         Raises:
-            UserError: they are missing, because the run has not come so far, or damaged.
+            UserError: the file is missing, because the run has not come so far, or damaged.
         """
-        path = run / _FILE
+        path = run / FILE
         try:
             return cls._of(read_json(path))
         except (FileError, ValueError, KeyError, TypeError) as error:
@@ -61,7 +62,7 @@ class Normalization:
 
     def save(self, run: Path) -> None:
         """Writes what :meth:`load` reads."""
-        write_atomically(run / _FILE, json.dumps(asdict(self)).encode())
+        write_atomically(run / FILE, json.dumps(asdict(self)).encode())
 
     @classmethod
     def _of(cls, values: dict[str, Any]) -> "Normalization":
@@ -74,16 +75,64 @@ class Normalization:
         return cls(tuple(mean), tuple(std), tuple(near_far) if near_far else None)
 
     def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
-        """What the action encoder sees: actions at zero mean and unit variance; row 0, into the first frame, is zero.
+        """Returns the inputs of the action encoder: actions at zero mean and unit variance; row 0 is zero.
 
-        A dimension that hardly varies is not blown up: its deviation counts as at least 0.001.
+        So that a dimension that hardly varies is not blown up, its deviation counts as at least 0.001.
 
         Args:
-            actions: in the data's units.
-            integrate: append their sum over the frames so far, at a quarter of its size.
+            actions: actions in the data's units; row t leads into frame t.
+            integrate: append a quarter of their sum over the frames so far; A2 is then 2 A, otherwise A.
         """
         scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
         scaled[..., 0, :] = 0.0
         if integrate:
             scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
         return scaled.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Statistics of action rows, each (A,), that add up over parts of a data set without keeping the rows."""
+
+    count: int
+    mean: Float64[np.ndarray, " A"]
+    square: Float64[np.ndarray, " A"]  # sum of squared distances from the mean
+    low: Float64[np.ndarray, " A"]
+    high: Float64[np.ndarray, " A"]
+
+    @classmethod
+    def of(cls, rows: Float[np.ndarray, "N A"]) -> "Statistics":
+        """Returns the statistics of at least one row. Leave out row 0 of a clip, into which nothing led."""
+        wide = rows.astype(np.float64)
+        mean = wide.mean(0)
+        return cls(len(wide), mean, ((wide - mean) ** 2).sum(0), wide.min(0), wide.max(0))
+
+    def merged(self, other: "Statistics") -> "Statistics":
+        """Returns the statistics of the rows of both.
+
+        Raises:
+            StoreError: the actions have different lengths.
+        """
+        if len(self.mean) != len(other.mean):
+            raise StoreError(f"actions of {len(other.mean)} dimensions among such of {len(self.mean)}; leave it out")
+        count, away = self.count + other.count, other.mean - self.mean
+        return Statistics(
+            count,
+            self.mean + away * other.count / count,
+            self.square + other.square + away**2 * self.count * other.count / count,
+            np.minimum(self.low, other.low),
+            np.maximum(self.high, other.high),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns ``action_count``, ``action_mean``, ``action_std``, ``action_min``, ``action_max``."""
+        std = np.sqrt(self.square / self.count)
+        arrays = {"mean": self.mean, "std": std, "min": self.low, "max": self.high}
+        return {"action_count": self.count} | {f"action_{name}": array.tolist() for name, array in arrays.items()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Statistics":
+        """Inverts :meth:`to_json`."""
+        mean, std, low, high = (np.array(values[f"action_{name}"]) for name in ("mean", "std", "min", "max"))
+        count = values["action_count"]
+        return cls(count, mean, std**2 * count, low, high)

@@ -24,6 +24,7 @@ from rsjax.files import FileError, disk_guard, read_json, replace_directory
 MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
 SHARD_BYTES = 256 * 2**20
+NO_ARRAY = "none"  # the shape of an array that a record does without
 LINK_CURE = "mend the link or permission"
 
 
@@ -127,6 +128,15 @@ class Store:
     def counts(self) -> dict[str, int]:
         """Returns the number of records by split."""
         return {split: len(self.source(split)) for split in self.splits}
+
+    def shapes(self) -> dict[str, str]:
+        """Returns type and shape of each array of the first record, ``NO_ARRAY`` where it has none."""
+        source = next((source for source in map(self.source, self.splits) if len(source)), None)
+        return {
+            name: NO_ARRAY if value is None else f"{value.dtype} {value.shape}"
+            for name, value in (source[0] if source else {}).items()
+            if value is None or hasattr(value, "dtype")
+        }
 
     def labelled(self, split: str) -> bool:
         """Returns whether the records of one split have labels."""

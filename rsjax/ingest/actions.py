@@ -136,54 +136,6 @@ def unflipped(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]
     return quaternions * signs[: len(quaternions), None].astype(quaternions.dtype)
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Of every action row seen so far, each (A,): what normalises them, kept with the data set. Rows are not kept."""
-
-    count: int
-    mean: Float64[np.ndarray, " A"]
-    square: Float64[np.ndarray, " A"]  # sum of squared distances from the mean
-    low: Float64[np.ndarray, " A"]
-    high: Float64[np.ndarray, " A"]
-
-    @classmethod
-    def of(cls, rows: Float[np.ndarray, "N A"]) -> "Statistics":
-        """Of at least one row. A clip's row 0, into which nothing led, should not be among them."""
-        wide = rows.astype(np.float64)
-        mean = wide.mean(0)
-        return cls(len(wide), mean, ((wide - mean) ** 2).sum(0), wide.min(0), wide.max(0))
-
-    def merged(self, other: "Statistics") -> "Statistics":
-        """Of the rows of both.
-
-        Raises:
-            EpisodeError: they are of actions of different lengths.
-        """
-        if len(self.mean) != len(other.mean):
-            raise EpisodeError(f"actions of {len(other.mean)} dimensions among such of {len(self.mean)}; leave it out")
-        count, away = self.count + other.count, other.mean - self.mean
-        return Statistics(
-            count,
-            self.mean + away * other.count / count,
-            self.square + other.square + away**2 * self.count * other.count / count,
-            np.minimum(self.low, other.low),
-            np.maximum(self.high, other.high),
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """``action_count``, ``action_mean``, ``action_std``, ``action_min``, ``action_max``."""
-        std = np.sqrt(self.square / self.count)
-        arrays = {"mean": self.mean, "std": std, "min": self.low, "max": self.high}
-        return {"action_count": self.count} | {f"action_{name}": array.tolist() for name, array in arrays.items()}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "Statistics":
-        """The inverse of :meth:`to_json`."""
-        mean, std, low, high = (np.array(values[f"action_{name}"]) for name in ("mean", "std", "min", "max"))
-        count = values["action_count"]
-        return cls(count, mean, std**2 * count, low, high)
-
-
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
     """Row t becomes row t - offset. Beyond the ends places and held dimensions stay as they are, steps are none."""
     wanted = np.arange(len(rows)) - offset

@@ -21,8 +21,9 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rsjax.config import require, to_dict
 from rsjax.data.codec import Record
+from rsjax.data.normalization import Statistics
 from rsjax.data.store import Source
-from rsjax.ingest.actions import ActionConfig, Layout, Statistics, sampled_actions
+from rsjax.ingest.actions import ActionConfig, Layout, sampled_actions
 from rsjax.ingest.annotators.categories import UNKNOWN, CategoryConfig
 from rsjax.ingest.annotators.depth import FilledDepths
 from rsjax.ingest.annotators.protocols import Tracked

@@ -8,7 +8,6 @@ Axes: N recorded frames, H×W pixels, A action dimensions, S state dimensions.
 
 import errno
 import hashlib
-import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.errors import UserError
+from rsjax.files import safe_id as safe_id  # readers import it from here
 
 _WHOLE, _EDGE = 2**18, 2**13  # bytes: files up to the first go whole into a fingerprint, others with both ends
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
@@ -202,12 +202,6 @@ def plain(path: Path) -> Path:
     if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
         raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
     return path
-
-
-def safe_id(text: str) -> str:
-    """A file name for any text: itself where it is one, otherwise what can be kept of it and a hash."""
-    kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip(".-")[:100]
-    return kept if kept and kept == text else f"{kept or 'episode'}-{hashlib.sha256(_bytes(text)).hexdigest()[:8]}"
 
 
 def _bytes(text: str) -> bytes:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rsjax.data.codec import Record
+from rsjax.data.normalization import Statistics
 from rsjax.data.store import StoreError, open_store, write_store
-from rsjax.ingest.actions import Statistics
 from rsjax.ingest.clips import words
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.jobs.work_items import Job, Unit

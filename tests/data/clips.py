@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from rsjax.data.codec import Record
+from rsjax.data.normalization import Statistics
 from rsjax.data.store import Store, open_store, write_store
-from rsjax.ingest.actions import Statistics
 
 DIFFICULTIES = ("simple", "difficult")
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.data.merge import by_label, into_parts, merge, split
+from rsjax.data.normalization import Statistics
 from rsjax.data.store import Store, StoreError, open_store
-from rsjax.ingest.actions import Statistics
 from tests.data.clips import clip_store, numbers, words
 
 
@@ -63,7 +63,9 @@ def test_parts_are_of_one_size_and_together_the_whole(
 ) -> None:
     folder = tmp_path_factory.mktemp("parts")
     clip_store(folder / "a", 0, clips)
-    parts = [numbers(store) for store in split(folder / "a", into_parts(count, folder / "parts")).values()]
+    parts = [
+        numbers(store) for store in split(folder / "a", into_parts(folder / "a", count, folder / "parts")).values()
+    ]
     assert sorted(chain(*parts)) == list(range(clips))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
@@ -95,12 +97,12 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path) -> None:
         merge([a, tmp_path / "deep"], a / "inside")
     before = numbers(open_store(a))
     with pytest.raises(StoreError, match=r"a: is there already"):
-        split(a, {tmp_path / "new": lambda *_: True, a: lambda split, number, words: number == 0})
+        split(a, {tmp_path / "new": {"train": [0]}, a: {"train": [0]}})
     assert numbers(open_store(a)) == before and not (tmp_path / "new").exists()
     with pytest.raises(StoreError, match=r"no label 'colour'; it has task, difficulty"):
         by_label(a, "colour", tmp_path)
     with pytest.raises(StoreError, match=r"no record of .* is chosen"):
-        split(a, {tmp_path / "none": lambda name, number, words: False})
+        split(a, {tmp_path / "none": {"train": []}})
 
 
 def test_clips_with_and_without_depth_go_together_but_not_metres_and_relative_depth(tmp_path: Path) -> None:

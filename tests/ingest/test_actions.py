@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rsjax.config import ConfigError
-from rsjax.ingest.actions import ActionConfig, Layout, Statistics, led_into, sampled_actions, unflipped
+from rsjax.ingest.actions import ActionConfig, Layout, led_into, sampled_actions, unflipped
 from rsjax.ingest.episode import EpisodeError
 
 FLOATS = st.floats(-10, 10, width=32)
@@ -114,21 +114,6 @@ def test_signs_of_quaternions_do_not_change_what_leads_from_one_to_the_other(fli
     np.testing.assert_allclose(made, sampled_actions(smooth, frames, config, layout), atol=1e-6)
 
 
-@given(ROWS, ROWS)
-def test_statistics_of_parts_are_those_of_the_whole(left: np.ndarray, right: np.ndarray) -> None:
-    right = np.resize(right, (len(right), left.shape[1]))
-    parts, whole = Statistics.of(left).merged(Statistics.of(right)), np.concatenate([left, right]).astype(np.float64)
-    stored = Statistics.from_json(json.loads(json.dumps(parts.to_json()))).to_json()
-    for name, expected in (
-        ("mean", whole.mean(0)),
-        ("std", whole.std(0)),
-        ("min", whole.min(0)),
-        ("max", whole.max(0)),
-    ):
-        np.testing.assert_allclose(stored[f"action_{name}"], expected, atol=1e-6)
-    assert stored["action_count"] == len(whole)
-
-
 def test_what_does_not_fit_is_told() -> None:
     rows = np.zeros((3, 2), np.float32)
     with pytest.raises(ConfigError, match="actions.compose is 'sum'; choose one of join, last, stack"):
@@ -139,8 +124,6 @@ def test_what_does_not_fit_is_told() -> None:
         sampled_actions(rows, np.arange(3), EVERY, Layout("absolute", quaternions=(2,)))
     with pytest.raises(EpisodeError, match="names dimension -1, but actions have 2"):
         sampled_actions(rows, np.arange(3), EVERY, Layout("delta", held=(-1,)))
-    with pytest.raises(EpisodeError, match="actions of 3 dimensions among such of 2"):
-        Statistics.of(rows).merged(Statistics.of(np.zeros((1, 3))))
 
 
 def test_a_layout_survives_json() -> None:
