@@ -211,12 +211,14 @@ def _first_fields(preset: Config) -> Any:
     values: dict[str, Any] = {}
     for name, text in FIRST_FIELDS.items():
         section, _, field = name.replace("-", "_").rpartition(".")
-        part = attrgetter(section)(preset)
-        if hasattr(part, field):
-            key = f"{section}_{field}".replace(".", "_")
-            values[key] = getattr(part, field)
-            hint = get_type_hints(type(part))[field]
-            kinds.append((key, Annotated[hint, tyro.conf.arg(name=name, help=text)]))
+        try:
+            part = attrgetter(section)(preset)
+            value = getattr(part, field)
+        except AttributeError:
+            continue
+        key = f"{section}_{field}".replace(".", "_")
+        kinds.append((key, Annotated[get_type_hints(type(part))[field], tyro.conf.arg(name=name, help=text)]))
+        values[key] = value
     return dataclasses.make_dataclass("FirstFields", kinds)(**values)
 
 

@@ -1,10 +1,10 @@
-"""A curriculum's stage as one word of a command line: ``simple:2``, ``difficult:3:restart``.
+"""Reads and writes one stage of a curriculum as a word of a command line: ``simple:2``, ``difficult:3:restart``.
 
-A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; parts are joined by ``+``. A part is
-``DIFFICULTIES[/TASKS][=WEIGHT][@STORE]``: patterns with commas between them, ``all`` for every one, and the directory
-of another store. So ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two of its clips from the run's own
-picking and placing for each difficult one of run b. Names with one of ``: + @ = / ,`` are out of its reach; Python's
-:class:`StageConfig` takes them.
+A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; ``+`` joins its parts. A part is
+``DIFFICULTIES[/TASKS][=WEIGHT][@STORE]``: shell patterns joined by commas (``all`` matches everything), a weight, and
+the directory of another store. So ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two picking or placing
+clips of the run's own for each difficult clip of run b. Names that contain one of ``: + @ = / ,`` cannot be written
+this way; in Python, :class:`StageConfig` takes them.
 """
 
 import math
@@ -17,10 +17,10 @@ EXAMPLE = "simple:2 or difficult:3:restart"
 
 
 def parse_stage(text: str) -> StageConfig:
-    """The stage that the word describes.
+    """Returns the stage that a word describes.
 
     Raises:
-        ConfigError: it describes none; the message says what is wrong and how it is written.
+        ConfigError: the word is malformed; the message says where, and how a stage is written.
     """
     body = text.removesuffix(":restart")
     parts, colon, epochs = body.rpartition(":")
@@ -34,7 +34,7 @@ def parse_stage(text: str) -> StageConfig:
 
 
 def format_stage(stage: StageConfig) -> str:
-    """The inverse of :func:`parse_stage`."""
+    """Returns the word that describes a stage; the inverse of :func:`parse_stage`."""
     parts = "+".join(_format_part(part) for part in stage.parts)
     return f"{parts}:{_plain(stage.epochs)}{':restart' if stage.restart else ''}"
 
@@ -60,20 +60,20 @@ def _format_part(part: PartConfig) -> str:
     return f"{difficulties}{tasks}{weight}{'@' if part.store else ''}{part.store}"
 
 
-def _patterns(text: str, what: str, patterns: str) -> tuple[str, ...]:
-    found = tuple("*" if pattern == "all" else pattern for pattern in patterns.split(","))
-    if "" in found:
-        raise _error(text, f"a {what} is empty; all stands for every one")
-    return found
+def _patterns(text: str, name: str, joined: str) -> tuple[str, ...]:
+    patterns = tuple("*" if pattern == "all" else pattern for pattern in joined.split(","))
+    if "" in patterns:
+        raise _error(text, f"a {name} is empty; write all to match every {name}")
+    return patterns
 
 
-def _number(text: str, what: str, value: str) -> float:
+def _number(text: str, name: str, value: str) -> float:
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not (math.isfinite(number) and number > 0):
-        raise _error(text, f"{what} {value!r} is no number above 0")
+        raise _error(text, f"{name} {value!r} is not a number above 0")
     return number
 
 

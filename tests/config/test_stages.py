@@ -1,4 +1,4 @@
-"""A curriculum's stages: on the command line, in a stored configuration, and in content keys."""
+"""Stages of a curriculum on the command line, in a stored configuration, and in content keys."""
 
 import dataclasses
 import json
@@ -42,14 +42,15 @@ def read(*argv: str) -> Config:
     return parse(argv, "train", "", NoOptions())[0]
 
 
+@settings(max_examples=40)
 @given(STAGES)
-def test_a_stage_survives_its_word(stage: StageConfig) -> None:
+def test_parsing_inverts_formatting(stage: StageConfig) -> None:
     assert parse_stage(format_stage(stage)) == stage
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(STAGES, max_size=3).map(tuple))
-def test_stages_survive_json_and_differ_in_their_keys(stages: tuple[StageConfig, ...]) -> None:
+def test_stages_survive_json_and_change_the_content_key(stages: tuple[StageConfig, ...]) -> None:
     loop = LoopConfig(stages=stages)
     assert from_dict(LoopConfig, json.loads(json.dumps(to_dict(loop)))) == loop
     assert hash(loop) == hash(dataclasses.replace(loop))
@@ -74,7 +75,7 @@ def test_the_papers_curriculum_on_the_command_line() -> None:
     )
 
 
-def test_a_word_can_say_all_that_a_stage_has() -> None:
+def test_a_word_can_set_every_field() -> None:
     assert parse_stage("simple,hard/pick*,place=2.5@runs/b+all:0.5") == StageConfig(
         (PartConfig(("pick*", "place"), ("simple", "hard"), "runs/b", 2.5), PartConfig()), 0.5
     )
@@ -84,19 +85,19 @@ def test_a_word_can_say_all_that_a_stage_has() -> None:
     ("word", "reason"),
     [
         ("simple", "its epochs are missing"),
-        ("simple:two", "epochs 'two' is no number above 0"),
-        ("simple:0", "epochs '0' is no number above 0"),
-        ("simple:nan", "epochs 'nan' is no number above 0"),
-        ("simple:2:restrt", "epochs 'restrt' is no number above 0"),
-        ("simple=x:2", "weight 'x' is no number above 0"),
-        ("simple=-1:2", "weight '-1' is no number above 0"),
+        ("simple:two", "epochs 'two' is not a number above 0"),
+        ("simple:0", "epochs '0' is not a number above 0"),
+        ("simple:nan", "epochs 'nan' is not a number above 0"),
+        ("simple:2:restrt", "epochs 'restrt' is not a number above 0"),
+        ("simple=x:2", "weight 'x' is not a number above 0"),
+        ("simple=-1:2", "weight '-1' is not a number above 0"),
         ("simple@:2", "nothing follows its @"),
-        (":2", "a difficulty is empty; all stands for every one"),
+        (":2", "a difficulty is empty; write all to match every difficulty"),
         ("simple/:2", "a task is empty"),
         ("simple+:2", "a difficulty is empty"),
     ],
 )
-def test_a_mistake_is_named_with_how_it_is_written(word: str, reason: str) -> None:
+def test_an_error_names_the_mistake_and_the_syntax(word: str, reason: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read("tiny", "--train.stages", word)
     assert f"stage '{word}': {reason}" in str(caught.value)
