@@ -1,1 +1,1 @@
-"""Public checkpoints into the project's own format and out again. ``python -m rsjax.convert --help``"""
+"""Imports public checkpoints and exports weights under public names. ``python -m rsjax.convert --help``"""

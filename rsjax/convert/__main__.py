@@ -1,4 +1,4 @@
-"""Public checkpoints in and out. ``python -m rsjax.convert tokenizer IN OUT``"""
+"""Imports and exports public checkpoints. ``python -m rsjax.convert tokenizer IN OUT``"""
 
 import argparse
 import sys
@@ -10,30 +10,32 @@ from rsjax.errors import UserError
 PROG = "python -m rsjax.convert"
 
 
+KINDS = {
+    "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
+    "genie": "1xgpt's Genie (STMaskGIT); reads the config.json beside IN",
+    "lpips": "the perceptual distance: torchvision's backbone and the published heads",
+}
+
+
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    top = argparse.ArgumentParser(PROG, description="Reads public PyTorch and safetensors files, and writes them.")
-    kinds = top.add_subparsers(dest="kind", required=True, metavar="tokenizer|genie|lpips")
-    helps = {
-        "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
-        "genie": "1xgpt's Genie (STMaskGIT); its config.json is read where it lies beside IN",
-        "lpips": "the perceptual distance: torchvision's backbone and the published heads",
-    }
-    for kind, text in helps.items():
+    """Returns the parser of the command line."""
+    top = argparse.ArgumentParser(PROG, description="Imports and exports PyTorch and safetensors checkpoints.")
+    kinds = top.add_subparsers(dest="kind", required=True, metavar="|".join(KINDS))
+    for kind, text in KINDS.items():
         command = kinds.add_parser(kind, help=text, description=text)
         command.add_argument("source", metavar="IN", type=Path, help="a public file, or a directory made here")
         command.add_argument("out", metavar="OUT", type=Path, help="a directory, or a .safetensors file")
         if kind == "tokenizer":
-            command.add_argument("--weights", choices=("raw", "ema"), default="raw", help="the last, or their average")
+            command.add_argument("--weights", choices=("raw", "ema"), default="raw", help="ema: their moving average")
         if kind == "genie":
-            command.add_argument("--heads", type=int, help="attention heads, where no config.json tells")
+            command.add_argument("--heads", type=int, help="attention heads, if there is no config.json")
         if kind == "lpips":
-            command.add_argument("--heads-file", type=Path, help="where IN is the backbone alone")
+            command.add_argument("--heads-file", type=Path, help="the published heads, if IN is only the backbone")
     return top
 
 
 def main(argv: Sequence[str]) -> None:
-    """Converts; prints what was written. Errors that the user can cure are one line, with exit status 2."""
+    """Converts and prints what was written. Prints a :class:`UserError` as one line and exits with status 2."""
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.convert import commands

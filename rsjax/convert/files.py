@@ -1,4 +1,4 @@
-"""Tensor files as dictionaries of numpy arrays. Nothing that a file holds is ever executed."""
+"""Reads and writes tensor files as dictionaries of numpy arrays, without executing anything from them."""
 
 import importlib
 from pathlib import Path
@@ -18,17 +18,18 @@ PICKLED = (".ckpt", ".pt", ".pth", ".bin")  # PyTorch's own; a pickle inside
 
 
 class ConvertError(UserError):
-    """A file that cannot be converted. The message names it and the cure."""
+    """A file cannot be converted. The message names it and the cure."""
 
 
 def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
-    """The tensors of a file by name, and its metadata (none but in safetensors).
+    """Returns the tensors of a file by name, and its metadata (always empty for PyTorch's files).
 
     Args:
-        path: a ``.safetensors`` file, or one of PyTorch's, whose ``state_dict`` is taken where it has one.
+        path: a ``.safetensors`` file, or one of PyTorch's; of the latter, the ``state_dict`` if it has one.
 
     Raises:
-        ConvertError: no such file, of another kind, damaged, or holding more than tensors; or PyTorch is needed.
+        ConvertError: the file does not exist, is of another kind, is damaged, or holds more than tensors; or PyTorch
+            is not installed.
     """
     if not path.is_file():
         raise ConvertError(f"{path}: no such file")
@@ -36,20 +37,25 @@ def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
         return _read_safetensors(path)
     if path.suffix in PICKLED:
         return _read_torch(path), {}
-    raise ConvertError(f"{path}: not a kind of file that is read; give one that ends in {SAFE} or {', '.join(PICKLED)}")
+    raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
 
 
 def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
-    """Writes a safetensors file that appears whole or not at all.
+    """Writes a safetensors file atomically. Errors as in :func:`write_file`."""
+    # safetensors writes memory in its order, ignoring strides.
+    contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
+    write_file(path, safetensors.numpy.save(contiguous, metadata))
+
+
+def write_file(path: Path, payload: bytes) -> None:
+    """Writes a file atomically, with its parent directories.
 
     Raises:
-        StoreError: the disk is full, or the place cannot be written.
+        FileError: the disk is full, or the directory is not writable.
     """
-    # safetensors writes memory as it lies, whatever the strides.
-    contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
     with disk_guard(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, safetensors.numpy.save(contiguous, metadata))
+        write_atomically(path, payload)
 
 
 def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
@@ -65,19 +71,19 @@ def _read_torch(path: Path) -> Tensors:
         torch: Any = importlib.import_module("torch")
     except ImportError:
         raise ConvertError(
-            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install 'rsjax[torch]'), or give the "
-            f"same weights as a {SAFE} file, which needs nothing"
+            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install 'rsjax[torch]'), or pass the "
+            f"same weights as a {SAFE} file"
         ) from None
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch reports damage, and what it refuses to run, as many types
+    except Exception as error:  # torch raises many types for damage and for content that it refuses
         raise ConvertError(
-            f"{path}: refused, it is damaged or holds more than tensors, and loading that could run any code "
-            f"({first_line(error)}); give the same weights as a {SAFE} file"
+            f"{path}: refused: it is damaged, or holds more than tensors, which could run any code when loaded "
+            f"({first_line(error)}); pass the same weights as a {SAFE} file"
         ) from error
     state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(x, torch.Tensor) for x in state.values()):
-        raise ConvertError(f"{path}: neither holds tensors by name nor has a state_dict that does")
-    # numpy has no bfloat16; float32 holds every one of its numbers.
-    values = {name: x.detach() for name, x in state.items()}  # parameters that want a gradient refuse numpy()
+        raise ConvertError(f"{path}: holds no tensors by name, and no state_dict with them")
+    # numpy has no bfloat16; float32 represents each of its numbers.
+    values = {name: x.detach() for name, x in state.items()}  # parameters that require a gradient refuse numpy()
     return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy() for name, x in values.items()}

@@ -1,6 +1,6 @@
-"""The public names of 1xgpt's STMaskGIT, the "Genie" baseline: the RGB branch of a model without actions.
+"""Maps the names of 1xgpt's STMaskGIT (the Genie baseline) to the RGB branch of a model without actions.
 
-Weights do not tell everything: heads and muP stand in the ``config.json`` beside them (GenieConfig).
+The weights' shapes do not reveal the number of heads or muP; the ``config.json`` beside them (a GenieConfig) does.
 """
 
 import json
@@ -17,35 +17,33 @@ from rsjax.models.roboscape.world_model import WorldModel
 
 CONFIG = "config.json"
 
-# Settings under which the public network has other parameters than this project's.
+# The only values under which the public network has the same parameters as this project's.
 FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
 
 
 def table(config: ModelConfig) -> Table:
-    """Every public tensor of the network.
+    """Returns an entry for each public tensor of the network.
 
     Raises:
-        ConvertError: positions are not learned, which no public tensor tells.
+        ConvertError: the network has rotary positions, which the public format cannot express.
     """
     if config.positions != "learned":
         raise ConvertError(
-            f"the public format has no name for these parts of the network: model.positions {config.positions!r}; "
-            f"only learned positions can go out"
+            f"the public format cannot express model.positions {config.positions!r}; only a model with learned "
+            f"positions can be exported"
         )
     entries: list[Entry] = [
         Entry("pos_embed_TSC", "pos_embed", "lead"),
         Entry("token_embed.mask_token_embed", "rgb_embed/mask_token_embed", "lead"),
     ]
     for k in range(config.vocabularies):
-        entries.append(
-            Entry(f"token_embed.factored_embeds.{k}.weight", f"rgb_embed/factored_embed_{k}/embedding"),
-        )
+        entries.append(Entry(f"token_embed.factored_embeds.{k}.weight", f"rgb_embed/factored_embed_{k}/embedding"))
     for i in range(config.blocks):
         layer, path = f"decoder.layers.{i}", "blocks/rgb"
         if not config.qk_norm:
             entries += norm(f"{layer}.norm1", f"{path}/norm1", i) + norm(f"{layer}.norm2", f"{path}/norm2", i)
         for name in ("spatial_attn", "temporal_attn"):
-            # Rows (3, heads, head width) on both sides, so that the transpose is all.
+            # Both sides order the rows (3, heads, head width), so a transpose is enough.
             entries.append(Entry(f"{layer}.{name}.qkv.weight", f"{path}/{name}/qkv/kernel", "linear", i))
             entries += weight_and_bias(f"{layer}.{name}.proj", f"{path}/{name}/proj", "linear", i)
             if config.qk_norm:
@@ -56,71 +54,56 @@ def table(config: ModelConfig) -> Table:
     return tuple(entries)
 
 
-def read_settings(path: Path) -> dict[str, Any]:
-    """The GenieConfig beside a file of weights; empty where there is none.
+def read_settings(weights: Path) -> dict[str, Any]:
+    """Reads the GenieConfig beside a file of weights; returns an empty dict if there is none.
 
     Raises:
-        ConvertError: it is damaged, or settings of something else.
+        ConvertError: the file is damaged or is not a GenieConfig.
     """
-    beside = path.parent / CONFIG
-    if not beside.exists():
+    path = weights.parent / CONFIG
+    if not path.exists():
         return {}
     try:
-        settings = json.loads(beside.read_text())
+        settings = json.loads(path.read_text())
     except ValueError as error:
-        raise ConvertError(f"{beside}: not JSON ({error})") from error
-    if not isinstance(settings, dict):
-        raise ConvertError(f"{beside}: not a GenieConfig; it holds no settings by name")
-    if not settings.keys() & {"num_layers", "num_heads"}:
+        raise ConvertError(f"{path}: not JSON ({error})") from error
+    if not isinstance(settings, dict) or not settings.keys() & {"num_layers", "num_heads"}:
         raise ConvertError(
-            f"{beside}: not a GenieConfig; it has neither num_layers nor num_heads; put the published one beside "
-            f"{path.name}, or nothing of that name"
+            f"{path}: not a GenieConfig; it has neither num_layers nor num_heads; put the published one beside "
+            f"{weights.name}, or delete it"
         )
     return settings
 
 
 def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None) -> ModelConfig:
-    """The network that these tensors are of, from names, shapes and settings.
+    """Infers the network from the names and shapes of its tensors and from its settings.
 
     Args:
-        settings: a GenieConfig's fields; those on training are not read.
-        heads: overrides the settings' num_heads.
+        settings: a GenieConfig's fields; those about training are ignored.
+        heads: overrides num_heads of the settings.
 
     Raises:
-        ConvertError: they are no Genie's, contradict the settings, or leave the number of heads open; or the settings
-            are of a network that this project does not have.
+        ConvertError: the tensors are not a Genie's, contradict the settings, or leave the number of heads unknown; or
+            the settings describe a network that this project does not have.
     """
     position, first = tensors.get("pos_embed_TSC"), tensors.get("token_embed.factored_embeds.0.weight")
     hidden = tensors.get("decoder.layers.0.mlp.fc1.weight")
     if position is None or position.ndim != 4 or first is None or hidden is None:
         raise ConvertError(f"{source}: holds no weights of a Genie (STMaskGIT), such as pos_embed_TSC")
     _, frames, cells, width = position.shape
-    counts = [
+    blocks, vocabularies = (
         sum(name.startswith(start) and name.endswith(end) for name in tensors)
         for start, end in (("decoder.layers.", ".mlp.fc1.weight"), ("token_embed.factored_embeds.", ".weight"))
-    ]
-    blocks, vocabularies = counts
-    shared = tensors.get("decoder.layers.0.spatial_attn.norm.weight")
-    found = {
-        "num_layers": blocks,
-        "d_model": width,
-        "T": frames,
-        "S": cells,
-        "image_vocab_size": len(first) ** vocabularies,
-        "num_factored_vocabs": vocabularies,
-        "factored_vocab_size": len(first),
-        "qk_norm": shared is not None,
-        "mlp_ratio": len(hidden) / width,
-    }
-    _check_settings(source, settings, found)
+    )
+    shared = tensors.get("decoder.layers.0.spatial_attn.norm.weight")  # of qk-norm: one value per channel of a head
     if heads is None:
         heads = settings.get("num_heads", None if shared is None else width // len(shared))
     if not isinstance(heads, int) or heads < 1:
         raise ConvertError(
-            f"{source}: the number of attention heads is {heads or 'unknown'} and the weights do not tell; put the "
-            f"published {CONFIG} beside the file, or give --heads (8 in the public models)"
+            f"{source}: the number of attention heads is {heads or 'unknown'} and cannot be inferred from the weights; "
+            f"put the published {CONFIG} beside the file, or set --heads (8 in the public models)"
         )
-    return ModelConfig(
+    config = ModelConfig(
         frames=frames,
         grid=math.isqrt(cells),
         code_bits=vocabularies * round(math.log2(len(first))),
@@ -134,23 +117,25 @@ def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads
         qk_norm=shared is not None,
         mup=bool(settings.get("use_mup", False)),
     )
+    _check_settings(source.parent / CONFIG, settings, settings_of(config) | {"S": cells})
+    return config
 
 
-def _check_settings(source: Path, settings: dict[str, Any], found: dict[str, Any]) -> None:
-    config = source.parent / CONFIG
-    for name, only in FIXED.items():
-        if settings.get(name) not in (None, only):
-            given, known = (json.dumps(value) for value in (settings[name], only))
-            raise ConvertError(f"{config}: {name} {given} is not supported, only {known}")
+def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, Any]) -> None:
     # Older configurations leave factored_vocab_size out or null: it follows from the others.
-    told = {name: settings[name] for name in found if settings.get(name) is not None}
-    wrong = [f"{name} is {told[name]}, not {found[name]}" for name in told if told[name] != found[name]]
+    written = {name: value for name, value in settings.items() if value is not None}
+    for name, only in FIXED.items():
+        if written.get(name, only) != only:
+            given, known = json.dumps(written[name]), json.dumps(only)
+            raise ConvertError(f"{path}: {name} {given} is not supported, only {known}")
+    names = inferred.keys() & written.keys() - {"num_heads", "use_mup", "attn_drop", "mlp_drop"}
+    wrong = [f"{n} is {written[n]}, not {x}" for n, x in inferred.items() if n in names and written[n] != x]
     if wrong:
-        raise ConvertError(f"{config}: does not fit the weights beside it: {'; '.join(wrong)}")
+        raise ConvertError(f"{path}: does not fit the weights beside it: {'; '.join(wrong)}")
 
 
 def settings_of(config: ModelConfig) -> dict[str, Any]:
-    """The GenieConfig of a model; the inverse of :func:`infer_config`."""
+    """Returns the GenieConfig of a model; the inverse of :func:`infer_config`."""
     return {
         "num_layers": config.blocks,
         "num_heads": config.heads,
@@ -172,10 +157,10 @@ def settings_of(config: ModelConfig) -> dict[str, Any]:
 def from_public(
     source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None
 ) -> tuple[ModelConfig, Any]:
-    """A model and its parameters from a public file's tensors. Arguments and errors as in :func:`infer_config`.
+    """Returns a model's configuration and parameters, converted from a public file's tensors.
 
-    Raises:
-        ConvertError: also where tensors are missing, left over or misshapen.
+    Arguments and errors as in :func:`infer_config`; also raises ConvertError if tensors are missing, unexpected or of
+    another shape.
     """
     config = infer_config(source, tensors, settings, heads)
     shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))

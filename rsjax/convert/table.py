@@ -1,7 +1,7 @@
-"""Tables between public tensor names and flax parameters, and the two ways through them.
+"""Tables that map public tensor names to flax parameters, and the conversion in both directions.
 
-A table is data: one :class:`Entry` per public tensor. Reading uses every tensor exactly once and fills every parameter
-exactly once; whatever does not fit is named, all of it in one error.
+A table has one :class:`Entry` per public tensor. Reading uses every tensor exactly once and fills every parameter
+exactly once; one error names everything that does not fit.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -23,63 +23,62 @@ LAYOUTS: dict[Layout, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.nda
     "conv": (lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1)),  # OIHW ↔ HWIO
     "lead": (lambda x: x[0], lambda x: x[None]),  # torch keeps a leading axis of one
 }
-NAMED = 8  # misfits of each kind that an error names; the others are counted
+NAMED = 8  # names of each kind in an error; the others are counted
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One public tensor and the parameter, or the part of one, that it is."""
+    """A public tensor and the parameter, or the slice of a stacked parameter, that holds it."""
 
     key: str  # public name, dotted
-    path: str  # flax path, parts joined by /
+    path: str  # flax path, joined by /
     layout: Layout = "same"
-    layer: int | None = None  # place along the leading axis of a parameter that is stacked over blocks
+    layer: int | None = None  # index along the leading axis of a parameter that is stacked over blocks
 
 
 Table = tuple[Entry, ...]
 
 
 def weight_and_bias(key: str, path: str, layout: Layout, layer: int | None = None) -> Table:
-    """A linear layer or convolution that has a bias."""
+    """Returns the entries of a linear layer or convolution with a bias."""
     return (Entry(f"{key}.weight", f"{path}/kernel", layout, layer), Entry(f"{key}.bias", f"{path}/bias", layer=layer))
 
 
 def norm(key: str, path: str, layer: int | None = None) -> Table:
-    """A normalisation with scale and shift."""
+    """Returns the entries of a normalisation with scale and shift."""
     return (Entry(f"{key}.weight", f"{path}/scale", layer=layer), Entry(f"{key}.bias", f"{path}/bias", layer=layer))
 
 
 def public_shapes(table: Table, shapes: Any) -> dict[str, Shape]:
-    """The shape of every public tensor.
+    """Returns the shape of every public tensor.
 
     Args:
         shapes: the parameters, or their ``jax.eval_shape``.
 
     Raises:
-        ConvertError: the network has parameters that the table does not know, or the other way round.
+        ConvertError: the network and the table do not have the same parameters.
     """
     flat = flatten_dict(shapes, sep="/")
     _check_complete(table, {path: leaf.shape for path, leaf in flat.items()})
-    found: dict[str, Shape] = {}
+    public: dict[str, Shape] = {}
     for entry in table:
         own = flat[entry.path].shape if entry.layer is None else flat[entry.path].shape[1:]
-        found[entry.key] = LAYOUTS[entry.layout][1](np.broadcast_to(np.float32(0), own)).shape
-    return found
+        public[entry.key] = LAYOUTS[entry.layout][1](np.broadcast_to(np.float32(0), own)).shape
+    return public
 
 
 def to_params(source: object, tensors: Tensors, table: Table, shapes: Any) -> dict[str, Any]:
-    """Public tensors to float32 parameters.
+    """Converts public tensors to float32 parameters.
 
     Args:
-        source: where the tensors are from, for the error.
-        tensors: exactly those of the table, any floating type.
+        source: the file of the tensors, for errors.
+        tensors: exactly those of the table, of any floating type.
         shapes: ``jax.eval_shape`` of the parameters.
 
     Raises:
-        ConvertError: a tensor is missing, left over or of another shape; all are named.
+        ConvertError: tensors are missing, unexpected or of another shape; the message names them all.
     """
-    expected = public_shapes(table, shapes)
-    check(source, {key: x.shape for key, x in tensors.items()}, expected)
+    check(source, tensors, public_shapes(table, shapes))
     flat = {path: np.empty(leaf.shape, np.float32) for path, leaf in flatten_dict(shapes, sep="/").items()}
     for entry in table:
         value = LAYOUTS[entry.layout][0](tensors[entry.key])
@@ -88,10 +87,10 @@ def to_params(source: object, tensors: Tensors, table: Table, shapes: Any) -> di
 
 
 def to_tensors(params: Any, table: Table) -> Tensors:
-    """Parameters to public tensors; the inverse of :func:`to_params`.
+    """Converts parameters to public tensors; the inverse of :func:`to_params`.
 
     Raises:
-        ConvertError: the network has parameters for which there is no public name.
+        ConvertError: the public format has no name for a parameter of the network.
     """
     public_shapes(table, params)
     flat = flatten_dict(params, sep="/")
@@ -101,21 +100,24 @@ def to_tensors(params: Any, table: Table) -> Tensors:
     }
 
 
-def check(source: object, found: dict[str, Shape], expected: dict[str, Shape]) -> None:
-    """Compares names and shapes.
+def check(source: object, tensors: Tensors, expected: dict[str, Shape]) -> None:
+    """Compares names and shapes of tensors.
 
     Raises:
-        ConvertError: they differ; every kind of misfit is named.
+        ConvertError: tensors are missing, unexpected or of another shape; the message names them all.
     """
-    reshaped = [key for key in found.keys() & expected.keys() if found[key] != expected[key]]
     misfits: dict[str, Collection[str]] = {
-        "missing": expected.keys() - found.keys(),
-        "left over": found.keys() - expected.keys(),
-        "misshapen": [f"{key} is {found[key]}, not {expected[key]}" for key in reshaped],
+        "missing": expected.keys() - tensors.keys(),
+        "unexpected": tensors.keys() - expected.keys(),
+        "of another shape": [
+            f"{key} is {tensors[key].shape}, not {shape}"
+            for key, shape in expected.items()
+            if key in tensors and tensors[key].shape != shape
+        ],
     }
-    told = [f"{kind}: {_some(names)}" for kind, names in misfits.items() if names]
-    if told:
-        raise ConvertError(f"{source}: its tensors do not fit the network that they seem to be of; {'; '.join(told)}")
+    listed = "; ".join(f"{kind}: {_some(names)}" for kind, names in misfits.items() if names)
+    if listed:
+        raise ConvertError(f"{source}: its tensors do not fit the network inferred from them; {listed}")
 
 
 def _check_complete(table: Table, shapes: dict[str, Shape]) -> None:

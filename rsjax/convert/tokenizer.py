@@ -1,10 +1,10 @@
-"""The MAGVIT-2 tokenizer's public names (Open-MAGVIT2), both generations, raw weights or their average.
+"""Maps the names of Open-MAGVIT2's tokenizer, both generations, raw weights or their moving average.
 
-A public file holds ``encoder.*`` and ``decoder.*``, their exponential average under ``model_ema.`` with the dots left
-out of the names, and the training losses' networks.
+A public file holds ``encoder.*`` and ``decoder.*``, their exponential moving average under ``model_ema.`` with the dots
+removed from the names, and the networks of the training losses.
 """
 
-from dataclasses import dataclass
+from collections import Counter
 from typing import Any, Literal
 
 import jax
@@ -16,35 +16,22 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 
 Weights = Literal["raw", "ema"]
 
-CELLS = 16  # along each side of the public models' grids; weights do not tell the size of the images
+CELLS = 16  # along each side of the public models' grids; the size of the images cannot be inferred from weights
 
-# What a public file holds beside the wanted weights: names that begin so are left aside.
-LEFT_ASIDE: dict[Weights, tuple[str, ...]] = {
+# Prefixes of the tensors to ignore.
+IGNORED: dict[Weights, tuple[str, ...]] = {
     "raw": ("loss.", "model_ema."),
     "ema": ("loss.", "encoder.", "decoder.", "model_ema.loss", "model_ema.decay", "model_ema.num_updates"),
 }
 
 
-@dataclass(frozen=True)
-class Converted:
-    """A tokenizer out of a public file.
-
-    Attributes:
-        left_aside: how many tensors of each group were known but not wanted.
-    """
-
-    config: TokenizerConfig
-    params: Any
-    left_aside: dict[str, int]
-
-
 def public_name(key: str, weights: Weights) -> str:
-    """How the file spells a name of the table."""
+    """Returns a public file's name for a key of the table."""
     return key if weights == "raw" else f"model_ema.{key.replace('.', '')}"
 
 
 def table(config: TokenizerConfig) -> Table:
-    """Every public tensor of the network; raw names."""
+    """Returns an entry for each public tensor of the network, under its raw name."""
     levels = range(len(config.channel_multipliers))
     widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
     entries: list[Entry] = [Entry("encoder.conv_in.weight", "encoder/conv_in/kernel", "conv")]
@@ -63,10 +50,9 @@ def table(config: TokenizerConfig) -> Table:
     for level in reversed(levels):
         place = f"decoder.up.{level}"
         if config.adaptive_norm:
+            key, path = f"decoder.adaptive.{level}", f"decoder/adaptive_{level}"
             for name in ("gamma", "beta"):
-                entries += weight_and_bias(
-                    f"decoder.adaptive.{level}.{name}", f"decoder/adaptive_{level}/{name}", "linear"
-                )
+                entries += weight_and_bias(f"{key}.{name}", f"{path}/{name}", "linear")
         entries += _blocks(f"{place}.block", f"decoder/up_{level}_block", config.res_blocks, width, widths[level])
         width = widths[level]
         if level > 0:
@@ -86,11 +72,11 @@ def _blocks(key: str, path: str, count: int, width_in: int, width_out: int) -> l
 
 
 def infer_config(source: object, tensors: Tensors, weights: Weights) -> TokenizerConfig:
-    """The network that these tensors are of, from names and shapes; images of 16×16 tokens are assumed.
+    """Infers the network from the names and shapes of its tensors, assuming images of 16×16 tokens.
 
     Raises:
-        ConvertError: they are no tokenizer's, or hold no average where that is asked for.
-        ConfigError: they are of a network that this project cannot build.
+        ConvertError: the tensors are not a tokenizer's, or include no moving average where ``weights`` is "ema".
+        ConfigError: this project cannot build the network.
     """
 
     def get(key: str) -> Any:
@@ -105,8 +91,7 @@ def infer_config(source: object, tensors: Tensors, weights: Weights) -> Tokenize
     ends = [get(key) for key in ("encoder.conv_in.weight", "encoder.conv_out.weight")]
     levels, blocks = count("encoder.down.{}.block.0.conv1.weight"), count("encoder.down.0.block.{}.conv1.weight")
     if any(x is None or x.ndim != 4 for x in ends) or not levels:
-        kind = "averaged (ema) " if weights == "ema" else ""
-        cure = "; its raw weights: --weights raw" if weights == "ema" else ""
+        kind, cure = ("averaged (ema) ", "; try --weights raw") if weights == "ema" else ("", "")
         raise ConvertError(
             f"{source}: holds no {kind}weights of a MAGVIT-2 tokenizer, such as "
             f"{public_name('encoder.conv_in.weight', weights)}{cure}"
@@ -129,27 +114,29 @@ def infer_config(source: object, tensors: Tensors, weights: Weights) -> Tokenize
 
 def from_public(
     source: object, tensors: Tensors, weights: Weights = "raw", config: TokenizerConfig | None = None
-) -> Converted:
-    """A tokenizer from a public file's tensors.
+) -> tuple[TokenizerConfig, Any, Counter[str]]:
+    """Converts a public file's tensors to a tokenizer.
 
     Args:
-        source: where the tensors are from, for errors.
-        weights: those of the last step, or their average.
-        config: the network; inferred if not given.
+        source: the file of the tensors, for errors.
+        weights: those of the last step, or their moving average.
+        config: the network; None infers it.
+
+    Returns:
+        The configuration, the parameters, and how many tensors were ignored, by the first words of their names.
 
     Raises:
-        ConvertError: tensors are missing, left over or misshapen, or are no tokenizer's.
+        ConvertError: tensors are missing, unexpected or of another shape, or are not a tokenizer's.
     """
     config = config or infer_config(source, tensors, weights)
     entries = table(config)
-    spelled = {public_name(entry.key, weights): entry.key for entry in entries}
+    keys = {public_name(entry.key, weights): entry.key for entry in entries}
     kept: Tensors = {}
-    aside: dict[str, int] = {}
+    ignored: Counter[str] = Counter()
     for name, x in tensors.items():
-        if name not in spelled and name.startswith(LEFT_ASIDE[weights]):
-            group = ".".join(name.split(".")[: 2 if name.startswith("loss.") else 1])
-            aside[group] = aside.get(group, 0) + 1
+        if name not in keys and name.startswith(IGNORED[weights]):
+            ignored[".".join(name.split(".")[: 2 if name.startswith("loss.") else 1])] += 1
         else:
-            kept[spelled.get(name, name)] = x
+            kept[keys.get(name, name)] = x
     shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
-    return Converted(config, to_params(source, kept, entries, shapes), aside)
+    return config, to_params(source, kept, entries, shapes), ignored

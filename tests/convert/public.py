@@ -1,4 +1,4 @@
-"""Public checkpoints once more: names and shapes as their authors' code makes them, and what that code computes.
+"""A second implementation of the public checkpoints: names, shapes and computation of their authors' code.
 
 Plain numpy in torch's layout (NCHW, OIHW, (out, in)), float64, without the project's tables or models.
 """
@@ -13,7 +13,7 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def random_tensors(shapes: Shapes, seed: int = 0) -> Tensors:
-    """Without a zero or a one among them, so that nothing hides; small where there are many inputs."""
+    """Returns tensors without zeros or ones, which could hide errors; smaller values for more inputs."""
     rng = np.random.default_rng(seed)
     return {
         name: rng.normal(scale=0.5 / math.sqrt(max(1, math.prod(shape[1:]) / 4)), size=shape).astype(np.float32)
@@ -69,7 +69,7 @@ def tokenizer_shapes(ch: int, mult: Sequence[int], res: int, bits: int, adaptive
 
 
 def conv2d(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | None = None, stride: int = 1) -> np.ndarray:
-    """Cross-correlation; a 3×3 one with a pixel of zeros on all four sides."""
+    """Cross-correlation; 3×3 kernels pad one pixel of zeros on all sides."""
     side = weight.shape[-1]
     x = np.pad(x, ((0, 0), (0, 0), (side // 2, side // 2), (side // 2, side // 2)))
     windows = np.lib.stride_tricks.sliding_window_view(x, (side, side), axis=(2, 3))[:, :, ::stride, ::stride]
@@ -84,7 +84,7 @@ def group_norm(x: np.ndarray, groups: int = 32) -> np.ndarray:
 
 
 class TokenizerNet:
-    """The published tokenizer's two halves, on (B, 3, H, W) in [-1, 1]."""
+    """The published tokenizer's encoder and decoder, on (B, 3, H, W) in [-1, 1]."""
 
     def __init__(self, tensors: Tensors, levels: int, res: int) -> None:
         self.t = {name: x.astype(np.float64) for name, x in tensors.items()}
@@ -179,7 +179,7 @@ class GenieNet:
         return x @ self.t[f"{name}.weight"].T + self.t.get(f"{name}.bias", 0.0)
 
     def norm(self, name: str, x: np.ndarray) -> np.ndarray:
-        """LayerNorm; where the checkpoint has none of that name, nothing."""
+        """LayerNorm, or the identity if the checkpoint has none of that name."""
         if f"{name}.weight" not in self.t:
             return x
         centred = x - x.mean(-1, keepdims=True)

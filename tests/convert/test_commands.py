@@ -1,4 +1,4 @@
-"""The command from files to files, as a user runs it."""
+"""The command, from files to files."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def assert_same(path: Path, expected: Tensors) -> None:
 
 
 @pytest.mark.parametrize("kind", ["tokenizer", "genie"])
-def test_in_and_out_again_is_the_same_to_the_bit_both_ways(kind: str, tmp_path: Path) -> None:
+def test_import_and_export_are_inverse_to_the_bit(kind: str, tmp_path: Path) -> None:
     kinds: dict[str, tuple[Tensors, Any]] = {"tokenizer": (TOKENIZER, TokenizerConfig), "genie": (GENIE, ModelConfig)}
     tensors, part = kinds[kind]
     write_safetensors(tmp_path / "in.safetensors", tensors, {})
@@ -63,7 +63,7 @@ def test_one_directory_holds_a_tokenizer_and_a_model(tmp_path: Path) -> None:
     assert load_part(tmp_path / "both", ModelConfig)[0].heads == 2
 
 
-def test_a_tokenizer_goes_out_with_the_settings_that_its_weights_do_not_tell(tmp_path: Path) -> None:
+def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None:
     write_safetensors(tmp_path / "in.safetensors", TOKENIZER, {})
     convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
     config, params = load_part(tmp_path / "own", TokenizerConfig)
@@ -74,19 +74,19 @@ def test_a_tokenizer_goes_out_with_the_settings_that_its_weights_do_not_tell(tmp
     assert load_part(tmp_path / "again", TokenizerConfig)[0] == other
 
 
-def test_it_tells_what_was_made_and_what_was_left_aside(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_its_output_and_what_it_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rest = {"loss.discriminator.main.0.bias": np.zeros(64, np.float32)}
     write_safetensors(tmp_path / "in.safetensors", TOKENIZER | rest, {})
     convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
     made, aside = capsys.readouterr().out.splitlines()
     assert f"{len(TOKENIZER)} raw tensors" in made
-    assert aside == "left aside: 1 tensors of loss.discriminator"
+    assert aside == "ignored: 1 tensors of loss.discriminator"
 
 
 @pytest.mark.parametrize(
     ("settings", "told"), [(None, True), ({"num_heads": 2}, True), ({"num_heads": 2, "use_mup": False}, False)]
 )
-def test_it_tells_where_a_genie_is_taken_for_one_without_mup(
+def test_the_command_says_when_it_assumes_no_mup(
     settings: dict[str, Any] | None, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_safetensors(tmp_path / "in.safetensors", GENIE, {})
@@ -96,7 +96,7 @@ def test_it_tells_where_a_genie_is_taken_for_one_without_mup(
     assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == told
 
 
-def test_lpips_in_two_files_makes_the_file_that_is_loaded(tmp_path: Path) -> None:
+def test_load_lpips_reads_what_two_files_are_converted_to(tmp_path: Path) -> None:
     write_safetensors(tmp_path / "net.safetensors", backbone("alexnet"), {})
     write_safetensors(tmp_path / "heads.safetensors", heads("alexnet"), {})
     out = tmp_path / "lpips.safetensors"
@@ -106,7 +106,7 @@ def test_lpips_in_two_files_makes_the_file_that_is_loaded(tmp_path: Path) -> Non
     assert np.all(params["head"]["3"]["weight"] == 3)
 
 
-def test_lines_of_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_safetensors(tmp_path / "in.safetensors", GENIE, {})
     assert "no such file" in refused(capsys, "tokenizer", tmp_path / "none.ckpt", tmp_path / "own")
     assert "--heads" in refused(capsys, "genie", tmp_path / "in.safetensors", tmp_path / "own")

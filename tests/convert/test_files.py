@@ -13,7 +13,7 @@ from rsjax.convert.files import PICKLED, ConvertError, Tensors, read_tensors, wr
 
 
 class Evil:
-    """Runs a command in whatever loads it."""
+    """Runs a command in the process that unpickles it."""
 
     def __init__(self, marker: Path) -> None:
         self.marker = marker
@@ -22,7 +22,7 @@ class Evil:
         return os.system, (f"touch {self.marker}",)
 
 
-def test_safetensors_come_back_as_they_were_written(tmp_path: Path) -> None:
+def test_reading_inverts_writing(tmp_path: Path) -> None:
     rng, path = np.random.default_rng(0), tmp_path / "new" / "x.safetensors"
     whole = rng.normal(size=(3, 4, 5)).astype(np.float32)
     tensors: Tensors = {"a.weight": whole.transpose(2, 0, 1), "b": whole[:, 1:3, ::2], "n": np.array(7, np.int64)}
@@ -37,7 +37,7 @@ def test_safetensors_come_back_as_they_were_written(tmp_path: Path) -> None:
 
 
 class FakeTensor:
-    """Like torch's: one that wants a gradient does not turn into an array."""
+    """Behaves like torch's: a tensor that requires a gradient refuses numpy()."""
 
     dtype = "float32"
 
@@ -55,7 +55,7 @@ class FakeTensor:
 
 @pytest.fixture
 def fake_torch(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """In PyTorch's place, so that what is asked of it is tested without it too. Tests give it its ``load``."""
+    """Replaces PyTorch, so that its calls are tested without it. Tests set ``load``."""
     fake = ModuleType("torch")
     monkeypatch.setattr(fake, "Tensor", FakeTensor, raising=False)
     monkeypatch.setattr(fake, "bfloat16", "bfloat16", raising=False)
@@ -64,7 +64,7 @@ def fake_torch(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.mark.parametrize("suffix", PICKLED)
-def test_pytorch_is_asked_for_tensors_alone(
+def test_pytorch_loads_weights_only(
     tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     asked: list[tuple[Any, dict[str, Any]]] = []
@@ -83,7 +83,7 @@ def test_pytorch_is_asked_for_tensors_alone(
     np.testing.assert_array_equal(tensors["a"], np.arange(3.0))
 
 
-def test_what_pytorch_refuses_is_refused_with_the_cure(
+def test_an_error_of_pytorch_becomes_one_line_with_a_cure(
     tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load(*_: Any, **__: Any) -> Any:
@@ -98,7 +98,7 @@ def test_what_pytorch_refuses_is_refused_with_the_cure(
 
 
 @pytest.mark.parametrize("suffix", PICKLED)
-def test_a_pickle_that_would_run_a_command_is_refused_and_does_not_run(tmp_path: Path, suffix: str) -> None:
+def test_a_malicious_pickle_is_refused_and_does_not_run(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("torch")
     path, marker = tmp_path / f"x{suffix}", tmp_path / "ran"
     path.write_bytes(pickle.dumps({"state_dict": {"a": Evil(marker)}}, protocol=2))
@@ -110,7 +110,7 @@ def test_a_pickle_that_would_run_a_command_is_refused_and_does_not_run(tmp_path:
     assert marker.exists()  # it would have
 
 
-def test_a_pickle_under_the_other_name_does_not_run_either(tmp_path: Path) -> None:
+def test_a_pickle_named_safetensors_does_not_run(tmp_path: Path) -> None:
     path, marker = tmp_path / "x.safetensors", tmp_path / "ran"
     path.write_bytes(pickle.dumps(Evil(marker)))
     with pytest.raises(ConvertError, match="not a safetensors file"):
@@ -118,7 +118,7 @@ def test_a_pickle_under_the_other_name_does_not_run_either(tmp_path: Path) -> No
     assert not marker.exists()
 
 
-def test_without_pytorch_its_files_are_refused_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pytorch_its_files_are_refused_with_a_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "x.ckpt"
     path.write_bytes(b"anything")
     monkeypatch.setitem(sys.modules, "torch", None)
@@ -126,11 +126,11 @@ def test_without_pytorch_its_files_are_refused_with_the_cure(tmp_path: Path, mon
         read_tensors(path)
 
 
-def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path) -> None:
+def test_errors_name_a_missing_or_unknown_file(tmp_path: Path) -> None:
     with pytest.raises(ConvertError, match="nowhere.safetensors: no such file"):
         read_tensors(tmp_path / "nowhere.safetensors")
     (tmp_path / "x.npz").write_bytes(b"")
-    with pytest.raises(ConvertError, match="not a kind of file"):
+    with pytest.raises(ConvertError, match="unknown kind of file"):
         read_tensors(tmp_path / "x.npz")
 
 
@@ -151,5 +151,5 @@ def test_pytorchs_tensors_are_read_bare_or_as_a_state_dict(tmp_path: Path) -> No
         np.testing.assert_array_equal(read["half"], np.array([0.1, 3.0], ml_dtypes.bfloat16).astype(np.float32))
     for other in ([state], {"state_dict": [1]}, {"state_dict": {"a": 3}}):
         torch.save(other, tmp_path / "other.pt")
-        with pytest.raises(ConvertError, match="other.pt: neither holds tensors by name"):
+        with pytest.raises(ConvertError, match="other.pt: holds no tensors by name"):
             read_tensors(tmp_path / "other.pt")

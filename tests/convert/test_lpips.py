@@ -37,7 +37,7 @@ def expected(net: str) -> set[str]:
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_torchvisions_backbone_and_the_published_heads_make_the_file(net: str) -> None:
+def test_backbone_and_heads_are_merged(net: str) -> None:
     classifier = {"classifier.6.weight": zeros(1000, 4096), "classifier.6.bias": zeros(1000)}
     found, tensors = from_public("files", backbone(net) | classifier | heads(net))
     assert found == net
@@ -46,7 +46,7 @@ def test_torchvisions_backbone_and_the_published_heads_make_the_file(net: str) -
         assert np.all(tensors[f"head.{k}.weight"] == k)
 
 
-def test_a_tokenizers_training_checkpoint_holds_them_too() -> None:
+def test_lpips_is_extracted_from_a_tokenizers_checkpoint() -> None:
     inside = "loss.perceptual_loss."
     rest = {
         f"{inside}scaling_layer.shift": zeros(1, 3, 1, 1),
@@ -59,8 +59,8 @@ def test_a_tokenizers_training_checkpoint_holds_them_too() -> None:
     assert (net, tensors.keys()) == ("vgg16", expected("vgg16"))
 
 
-def test_a_backbone_alone_is_refused_with_the_cure() -> None:
-    with pytest.raises(ConvertError, match="file: the backbone alone, vgg16; .*--heads-file"):
+def test_a_backbone_alone_is_refused_with_a_cure() -> None:
+    with pytest.raises(ConvertError, match="file: only the backbone, vgg16; .*--heads-file"):
         from_public("file", backbone("vgg16"))
 
 
@@ -77,12 +77,12 @@ def test_heads_of_the_other_network_are_refused() -> None:
 
 
 def test_another_network_is_refused() -> None:
-    with pytest.raises(ConvertError, match="no network that LPIPS uses"):
+    with pytest.raises(ConvertError, match="are not those of alexnet or vgg16"):
         from_public("file", heads("vgg16") | {"features.1.weight": zeros(96, 3, 7, 7)})
 
 
-def test_what_stands_there_twice_or_is_unknown_is_refused() -> None:
-    with pytest.raises(ConvertError, match="backbone.0.weight is there twice"):
+def test_duplicate_and_unknown_tensors_are_refused() -> None:
+    with pytest.raises(ConvertError, match="backbone.0.weight occurs twice"):
         from_public("file", backbone("alexnet") | heads("alexnet") | {"net.slice1.0.weight": zeros(64, 3, 11, 11)})
-    with pytest.raises(ConvertError, match="left over: odd.weight"):
+    with pytest.raises(ConvertError, match="unexpected: odd.weight"):
         from_public("file", backbone("alexnet") | heads("alexnet") | {"odd.weight": zeros(1)})

@@ -24,7 +24,7 @@ def tensors(generation: str, seed: int = 0) -> Tensors:
 
 
 def training_file(generation: str) -> tuple[Tensors, Tensors, Tensors]:
-    """A whole training checkpoint, its raw weights and their average."""
+    """Returns a whole training checkpoint, its raw weights and their moving average."""
     raw, ema = tensors(generation, 0), tensors(generation, 1)
     rest = {
         "loss.discriminator.main.0.weight": (64, 3, 4, 4),
@@ -66,10 +66,10 @@ def test_both_published_sizes_have_the_published_names_and_shapes(
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_the_converted_tokenizer_computes_what_the_published_one_does(generation: str) -> None:
     public = tensors(generation)
-    converted = from_public("file", public)
-    net = TokenizerNet(public, len(MULT), converted.config.res_blocks)
+    config, params, _ = from_public("file", public)
+    net = TokenizerNet(public, len(MULT), config.res_blocks)
     pixels = np.random.default_rng(0).integers(0, 256, (2, 16, 12, 3), np.uint8)
-    images, latents = jax.jit(Tokenizer(converted.config).apply)({"params": converted.params}, to_unit(pixels))
+    images, latents = jax.jit(Tokenizer(config).apply)({"params": params}, to_unit(pixels))
     expected = net.encode(pixels.transpose(0, 3, 1, 2) / 127.5 - 1)
     np.testing.assert_allclose(latents, expected.transpose(0, 2, 3, 1), rtol=2e-4, atol=2e-4)
     decoded = net.decode(np.where(expected > 0, 1.0, -1.0)).transpose(0, 2, 3, 1)
@@ -83,24 +83,20 @@ def test_the_converted_tokenizer_computes_what_the_published_one_does(generation
 
 @pytest.mark.parametrize("generation", GENERATIONS)
 @pytest.mark.parametrize("weights", ["raw", "ema"])
-def test_of_a_training_checkpoint_the_asked_weights_are_taken_and_the_rest_is_counted(
-    generation: str, weights: Weights
-) -> None:
+def test_a_training_checkpoint_yields_the_chosen_weights_and_counts_the_rest(generation: str, weights: Weights) -> None:
     everything, raw, ema = training_file(generation)
-    converted = from_public("file", everything, weights)
+    config, params, ignored = from_public("file", everything, weights)
     wanted = {"raw": raw, "ema": ema}[weights]
-    assert equal(to_tensors(converted.params, table(converted.config)), wanted)
-    assert converted.left_aside["loss.discriminator"] == 2
-    assert converted.left_aside["loss.perceptual_loss"] == 1
-    assert sum(converted.left_aside.values()) == len(everything) - len(wanted)
+    assert equal(to_tensors(params, table(config)), wanted)
+    assert ignored["loss.discriminator"] == 2
+    assert ignored["loss.perceptual_loss"] == 1
+    assert ignored.total() == len(everything) - len(wanted)
 
 
 def test_half_precision_is_widened_exactly() -> None:
     half = {name: x.astype(np.float16) for name, x in tensors("older").items()}
-    converted = from_public("file", half)
-    assert equal(
-        to_tensors(converted.params, table(converted.config)), {n: x.astype(np.float32) for n, x in half.items()}
-    )
+    config, params, _ = from_public("file", half)
+    assert equal(to_tensors(params, table(config)), {name: x.astype(np.float32) for name, x in half.items()})
 
 
 @pytest.mark.parametrize("weights", ["raw", "ema"])
@@ -115,8 +111,8 @@ def test_all_misfits_are_named_in_one_error(weights: Weights) -> None:
     message = str(caught.value)
     assert message.startswith("some.ckpt: ")
     assert "missing: decoder.norm_out.bias" in message
-    assert f"left over: {spell('decoder.extra.weight')}" in message
-    assert "misshapen: encoder.mid_block.0.conv1.weight is (64, 64, 1, 1), not (64, 64, 3, 3)" in message
+    assert f"unexpected: {spell('decoder.extra.weight')}" in message
+    assert "of another shape: encoder.mid_block.0.conv1.weight is (64, 64, 1, 1), not (64, 64, 3, 3)" in message
 
 
 def test_a_file_without_an_average_says_so() -> None:
@@ -130,7 +126,7 @@ def test_tensors_of_something_else_are_refused(other: dict[str, Any]) -> None:
         from_public("some.ckpt", other)
 
 
-def test_a_given_configuration_is_the_one_that_is_built() -> None:
+def test_a_configuration_overrides_inference() -> None:
     public = tensors("older")
     config = replace(infer_config("file", public, "raw"), norm_groups=8, image_size=32)
-    assert from_public("file", public, config=config).config == config
+    assert from_public("file", public, config=config)[0] == config

@@ -6,7 +6,7 @@ from rsjax.report.figures import ClipFigure
 
 @pytest.fixture
 def make_clip():
-    """A clip of a bright square that moves right over a dark ground, with everything that a clip can have."""
+    """Makes a clip of a bright square that moves right over a dark background, with every optional field."""
 
     def make(frames=6, size=32, **changes):
         rgb = np.full((frames, size, size, 3), 40, np.uint8)

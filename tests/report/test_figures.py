@@ -39,7 +39,7 @@ def test_animation_has_every_frame_and_row(make_clip):
             np.testing.assert_array_equal(sheets[t, 46 : 46 + 192 : 6, x : x + 192 : 6], frames[t])
 
 
-def test_rows_that_are_missing_vanish(make_clip):
+def test_missing_rows_are_left_out(make_clip):
     bare = make_clip(reconstruction=None, other_actions=None, true_depth=None, predicted_depth=None)
     assert [label for label, _ in bare.rows()] == ["truth", "prediction"]
     assert filmstrip(bare).shape[0] < filmstrip(make_clip()).shape[0]
@@ -55,7 +55,7 @@ def test_both_depths_share_the_true_range(make_clip):
     assert (rows["predicted depth"][0, 10, 6] != rows["true depth"][0, 10, 6]).any()
 
 
-def test_keypoints_draw_trails_only_where_seen(make_clip):
+def test_keypoints_draw_trails_only_where_visible(make_clip):
     seen = np.ones((8, 6), bool)
     hidden = seen.copy()
     hidden[0, 3:] = False
@@ -72,7 +72,7 @@ def test_keypoints_draw_trails_only_where_seen(make_clip):
         keypoints(make_clip(tracks=None))
 
 
-def test_arrays_that_do_not_fit_are_named(make_clip):
+def test_errors_name_arrays_of_the_wrong_shape(make_clip):
     with pytest.raises(ValueError, match=r"prediction of clip 'episode <7>' has shape \(1, 32, 32, 3\)"):
         make_clip(prediction=np.zeros((1, 32, 32, 3), np.uint8))
     with pytest.raises(ValueError, match="true_depth"):

@@ -26,7 +26,7 @@ _VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
 class _Page(HTMLParser):
-    """Checks that tags nest, and gathers text, table rows and whatever an element would load."""
+    """Checks that tags nest; collects text, table rows and everything that an element would load."""
 
     def __init__(self, path):
         super().__init__()
@@ -88,7 +88,7 @@ def test_a_full_page_stands_alone(tmp_path, make_clip):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_numbers_stand_in_their_rows(tmp_path, make_clip):
+def test_tables_show_each_number_in_its_row(tmp_path, make_clip):
     write_report(tmp_path / "r.html", _full(make_clip))
     page = _Page(tmp_path / "r.html")
     header = ["held-out clips", "PSNR, dB ↑", "SSIM ↑", "depth AbsRel ↓", "ΔPSNR, another clip's actions, dB ↑"]
@@ -106,7 +106,7 @@ def test_numbers_stand_in_their_rows(tmp_path, make_clip):
     assert "episode <0>" in page.text
 
 
-def test_missing_parts_vanish(tmp_path, make_clip):
+def test_missing_parts_are_left_out(tmp_path, make_clip):
     write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")
     assert ["held-out clips", "PSNR, dB ↑"] in page.cells
@@ -128,7 +128,7 @@ def test_a_failed_page_leaves_the_old_one(tmp_path, make_clip):
     assert path.read_text() == "old"
 
 
-def test_targets_are_judged_where_they_were_measured():
+def test_only_measured_targets_are_judged():
     verdicts = {v.target.name: v for v in judge(_METRICS)}
     assert len(verdicts) == 6
     assert [v.met for v in verdicts.values()] == [True, True, False, False, True, True]

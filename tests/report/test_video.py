@@ -55,7 +55,7 @@ def test_gif_loops_in_order(tmp_path):
             assert image.info["duration"] == (1000 if t == 4 else 250)
 
 
-def test_uris_decode_to_what_went_in():
+def test_uris_decode_to_their_images():
     image = np.random.default_rng(0).integers(0, 256, (9, 11, 3)).astype(np.uint8)
     np.testing.assert_array_equal(np.asarray(_decode(png_uri(image))), image)
     assert png_uri(image).startswith("data:image/png;base64,")
