@@ -15,7 +15,7 @@ PROG = "python -m experiments.doctor"
 
 @dataclass(frozen=True)
 class Options:
-    """Goes through a data set of any format, or a store of clips, and tells what is wrong with which episode.
+    """Checks every episode of a data set of any format, or of a store of clips, and prints its findings.
 
     Exits with 0 where nothing is wrong, with 1 where something is, and with 2 where the data set cannot be listed.
     """
@@ -23,23 +23,23 @@ class Options:
     what: tyro.conf.Positional[str] = tyro.MISSING
     """A store of clips, or a format: agibot, lerobot, robomimic, libero, rlds, bair, folder, sim."""
     path: tyro.conf.Positional[Path | None] = None
-    """Where the data set of that format is."""
+    """Path of the data set of that format."""
     option: tuple[str, ...] = ()
     """The format's own settings, such as keys=bridge or split=train; lists as JSON."""
     frames: int = 5
     """Pictures of each camera that are decoded, evenly spread over the episode; 0: all."""
     gap: float = 1.5
-    """A time between two frames that is too long, relative to 1 / fps."""
+    """Longest time between two frames, relative to 1 / fps."""
     unusual: float = 20.0
-    """An action, or a step of the state, that is too large, relative to the usual."""
+    """Largest action, or step of the state, relative to the usual."""
     ignore: tuple[str, ...] = ()
-    """Kinds of findings that are all right, such as no-task."""
+    """Kinds of findings to leave out, such as no-task."""
     lines: int = 50
-    """Findings that are printed; 0: all."""
+    """Findings to print; 0: all."""
     workers: int = 1
-    """Processes that look at episodes; -1: one per core."""
+    """Processes; -1: one per core."""
     fix: Path | None = None
-    """Writes a manifest here that leaves out every episode with a finding, with the reasons."""
+    """Writes a list here, for experiments.ingest --manifest, that leaves out every episode with a finding."""
 
 
 @main_errors()
@@ -57,49 +57,45 @@ def main() -> None:
 
     from experiments.ingest import source_options
     from rsjax.ingest.checks import KINDS, Thresholds
-    from rsjax.ingest.doctor import examine, open_any
+    from rsjax.ingest.doctor import diagnose, open_any
     from rsjax.ingest.jobs.pool import count_workers
     from rsjax.ingest.selection import write_selection
 
-    console = Console()
+    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     source = open_any(options.what, options.path, **source_options(options.option))
-    with console.status("looking at episodes") as status:
+    with console.status("checking episodes") as status:
         limits = Thresholds(options.frames, options.gap, options.unusual)
-        tell = lambda done: status.update(f"looking at episodes: {done}")  # noqa: E731
-        report = examine(source, limits, options.ignore, tell, count_workers(options.workers))
-    shown = report.findings[: options.lines or None]
-    for finding in shown:
-        line = f"{finding.episode}: {finding.kind}: {finding.detail}"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    if len(shown) < len(report.findings):
-        console.print(f"… and {len(report.findings) - len(shown)} more; --lines 0 prints all", highlight=False)
-    for name, told in report.mended[: max(0, options.lines - len(shown)) if options.lines else None]:
-        console.print(f"{name}: mended: {told}", markup=False, highlight=False, soft_wrap=True)
-    table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
-    for kind, count in report.counts().items():
-        table.add_row(kind, str(count), KINDS[kind])
-    if report.findings:
-        console.print(table)
-    found, bad = len(report.refs), report.bad()
-    common = [kind for kind, count in report.counts().items() if count == found]
+        show = lambda done: status.update(f"checking episodes: {done}")  # noqa: E731
+        diagnosis = diagnose(source, limits, options.ignore, show, count_workers(options.workers))
+    findings, counts, most = diagnosis.findings, diagnosis.counts(), options.lines or sys.maxsize
+    for finding in findings[:most]:
+        console.print(f"{finding.episode}: {finding.kind}: {finding.detail}")
+    if len(findings) > most:
+        console.print(f"… and {len(findings) - most} more; --lines 0 prints all")
+    for name, notes in diagnosis.mended[: max(0, most - len(findings))]:
+        console.print(f"{name}: mended: {notes}")
+    if findings:
+        table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
+        for kind, count in counts.items():
+            table.add_row(kind, str(count), KINDS[kind])
+        console.print(table, soft_wrap=False)
+    total, bad = len(diagnosis.refs), diagnosis.bad()
+    common = [kind for kind, count in counts.items() if count == total]
     for kind in common:
-        console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}", highlight=False)
-    console.print(f"{found} episodes: {found - bad} without a finding, {bad} with", highlight=False)
-    if report.mended:
-        console.print(f"mended when they were read, which is no finding: {len(report.mended)}", highlight=False)
+        console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")
+    console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
+    if diagnosis.mended:
+        console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
     if options.fix is not None:
         about = f"{source.name} {options.path or options.what}"
-        kept, out = write_selection(options.fix, about, report.refs, report.reasons())
-        line = f"{options.fix}: keeps {kept}, leaves out {out}" + ("" if kept else _nothing_left(common))
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    if report.findings:
+        kept, out = write_selection(options.fix, about, diagnosis.refs, diagnosis.reasons())
+        line = f"{options.fix}: keeps {kept}, leaves out {out}"
+        if not kept:
+            cure = " ".join(common) or "the kinds that are as they should be"
+            line += f"; nothing is left to ingest: --ignore {cure}, and write it again"
+        console.print(line)
+    if findings:
         raise SystemExit(1)
-
-
-def _nothing_left(common: list[str]) -> str:
-    """What to do about a manifest by which nothing is ingested, of kinds that all episodes have."""
-    cure = f"--ignore {' '.join(common)}" if common else "--ignore the kinds that are as they should be"
-    return f"; nothing is left to ingest: {cure}, and write it again"
 
 
 if __name__ == "__main__":

@@ -22,8 +22,6 @@ from rsjax.ingest.annotators.protocols import (
     SemanticsAnnotator,
     ShotDetector,
     Tracker,
-    parameters,
-    prepare,
 )
 from rsjax.ingest.annotators.semantics import OwnSemantics
 from rsjax.ingest.annotators.shots import HistogramShots
@@ -67,10 +65,10 @@ class AnnotatorStage:
     version: int = 1
 
     def params(self) -> dict[str, Any]:
-        return {"camera": self.camera} | parameters(self.annotator)
+        return {"camera": self.camera} | self.annotator.params()
 
     def open(self) -> Work:
-        prepare(self.annotator)
+        self.annotator.load()
         return self._work
 
     def _work(self, episode: Episode, inputs: Inputs) -> Records:
@@ -103,7 +101,7 @@ def make_stages(annotators: Annotators, config: ClipConfig, cpus: float = 1.0, g
     return (*stages, ClipStage(config, tuple(stage.name for stage in stages), cpus=cpus))
 
 
-def _is_network(annotator: Annotator | None) -> bool:
+def _is_network(annotator: object) -> bool:
     return hasattr(annotator, "device")
 
 
@@ -138,8 +136,6 @@ def _depth(estimate: DepthEstimator, episode: Episode, camera: str, inputs: Inpu
     if camera in episode.depth:  # what was measured counts before what would be estimated
         return {"unit": "metres", "recorded": True}
     found = estimate(episode, camera)
-    if found is None:
-        return {"unit": None}
     for first in range(0, len(found.maps), CHUNK):
         maps = found.maps.read(range(first, min(first + CHUNK, len(found.maps))))
         # Half precision has three decimal digits, more than the 766 levels that the colour map keeps.

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from experiments import doctor as command
 from rsjax.config import ConfigError
 from rsjax.ingest.checks import KINDS, Thresholds, quaternions
-from rsjax.ingest.doctor import examine, open_any
+from rsjax.ingest.doctor import diagnose, open_any
 from rsjax.ingest.episode import Episode, EpisodeError, Segment, SourceError
 from rsjax.ingest.formats import open_source
 from rsjax.ingest.selection import select, write_selection
@@ -47,15 +47,10 @@ CASES: list[tuple[str, str, Change]] = [
         "front: a.mp4: frame 11",
         lambda e: {"cameras": {**e.cameras, "front": Pictures(pictures(9), [11])}},
     ),
-    ("length", "camera front: 9 rows, timestamps 12", lambda e: {"cameras": {**e.cameras, "front": _short()}}),
-    ("length", "states: 9 rows", lambda e: {"states": np.zeros((9, 7), np.float32)}),
-    (
-        "not-finite",
-        "actions: 1 values, the first in frame 4",
-        lambda e: {"actions": changed(e.actions, (4, 2), np.nan)},
-    ),
-    ("not-finite", "states: 7 values", lambda e: {"states": changed(e.states, 3, np.inf)}),
-    ("time", "does not increase at frame 4", lambda e: {"timestamps": changed(e.timestamps, 4, 0.1)}),
+    ("length", "front has 9 rows, timestamps 12", lambda e: {"cameras": {"front": Pictures(pictures(9)[:9])}}),
+    ("length", "has 1 frame", lambda e: _first_frame(e)),
+    ("not-finite", "actions of frame 4", lambda e: {"actions": changed(e.actions, (4, 2), np.nan)}),
+    ("time", "not increase at frame 4", lambda e: {"timestamps": changed(e.timestamps, 4, 0.1)}),
     ("time", "1.2 s before frame 6", lambda e: {"timestamps": e.timestamps + np.where(np.arange(COUNT) > 5, 1, 0)}),
     ("time", "frames are 0.2 s apart .median., fps is 30", lambda e: {"fps": 30.0}),
     ("action", "all are zero", lambda e: {"actions": np.zeros_like(e.actions)}),
@@ -81,8 +76,9 @@ def _still() -> np.ndarray:
     return np.repeat(pictures(9)[:1], COUNT, 0)
 
 
-def _short() -> Pictures:
-    return Pictures(pictures(9)[:9])
+def _first_frame(e: Episode) -> dict[str, Any]:
+    rows = {name: getattr(e, name)[:1] for name in ("timestamps", "actions", "states")}
+    return {**rows, "cameras": {"front": Pictures(pictures(9)[:1]), "hand": Pictures(pictures(8)[:1])}, "depth": {}}
 
 
 def _depth(last: float) -> np.ndarray:
@@ -90,18 +86,18 @@ def _depth(last: float) -> np.ndarray:
 
 
 def test_a_sound_data_set_has_no_findings() -> None:
-    report = examine(source(), Thresholds())
-    assert not report.findings and len(report.refs) == 6
+    diagnosis = diagnose(source(), Thresholds())
+    assert not diagnosis.findings and len(diagnosis.refs) == 6
 
 
 @pytest.mark.parametrize(("kind", "detail", "change"), CASES, ids=[detail[:30] for _, detail, _ in CASES])
-def test_what_is_wrong_is_found_where_it_is(kind: str, detail: str, change: Change) -> None:
+def test_a_problem_is_found_where_it_is(kind: str, detail: str, change: Change) -> None:
     odd = episode(ODD)
-    report = examine(source(replace(odd, **change(odd))), Thresholds())
-    found = [finding for finding in report.findings if finding.kind == kind]
+    diagnosis = diagnose(source(replace(odd, **change(odd))), Thresholds())
+    found = [finding for finding in diagnosis.findings if finding.kind == kind]
     assert any(re.search(detail, finding.detail) for finding in found)
-    assert {finding.episode for finding in report.findings} <= {f"episode-{ODD}", "episode-2"}
-    assert "episode-2" not in report.reasons() or detail.startswith("another")
+    assert {finding.episode for finding in diagnosis.findings} <= {f"episode-{ODD}", "episode-2"}
+    assert "episode-2" not in diagnosis.reasons() or detail.startswith("another")
 
 
 def test_every_kind_is_tried() -> None:
@@ -110,23 +106,23 @@ def test_every_kind_is_tried() -> None:
 
 @pytest.mark.parametrize("error", [EpisodeError("a.h5: truncated"), ZeroDivisionError("a surprise")])
 def test_an_episode_that_cannot_be_read_does_not_hide_the_others(error: Exception) -> None:
-    report = examine(source(error, replace(episode(7), task="")), Thresholds())
-    assert [(finding.episode, finding.kind) for finding in report.findings] == [
+    diagnosis = diagnose(source(error, replace(episode(7), task="")), Thresholds())
+    assert [(finding.episode, finding.kind) for finding in diagnosis.findings] == [
         ("episode-6", "unreadable"),
         ("episode-7", "no-task"),
     ]
-    assert str(error) in report.findings[0].detail
+    assert str(error) in diagnosis.findings[0].detail
 
 
-def test_all_pictures_are_decoded_when_asked() -> None:
+def test_all_pictures_can_be_decoded() -> None:
     odd = replace(episode(ODD), cameras={"front": Pictures(pictures(9), [5]), "hand": Pictures(pictures(8))})
-    assert not examine(source(odd), Thresholds(frames=2)).findings
-    assert examine(source(odd), Thresholds(frames=0)).counts() == {"undecodable": 1}
+    assert not diagnose(source(odd), Thresholds(frames=2)).findings
+    assert diagnose(source(odd), Thresholds(frames=0)).counts() == {"undecodable": 1}
 
 
 def test_several_processes_find_the_same() -> None:
     data_set = source(EpisodeError("a.h5: truncated"), replace(episode(7), task=""), episode(2), fine=4)
-    assert examine(data_set, Thresholds(), workers=2) == examine(data_set, Thresholds())
+    assert diagnose(data_set, Thresholds(), workers=2) == diagnose(data_set, Thresholds())
 
 
 @pytest.mark.parametrize("limits", [{"frames": -1}, {"gap": 0.5}, {"unusual": 1}])
@@ -135,16 +131,16 @@ def test_impossible_limits_are_refused(limits: dict[str, Any]) -> None:
         Thresholds(**limits)
 
 
-def test_ignored_kinds_are_not_told() -> None:
+def test_ignored_kinds_are_left_out() -> None:
     odd = replace(episode(ODD), task="")
-    assert not examine(source(odd), Thresholds(), ["no-task"]).findings
+    assert not diagnose(source(odd), Thresholds(), ["no-task"]).findings
     with pytest.raises(SourceError, match="no kind 'no-tsk' to ignore; did you mean 'no-task'"):
-        examine(source(odd), Thresholds(), ["no-tsk"])
+        diagnose(source(odd), Thresholds(), ["no-tsk"])
 
 
-def test_a_data_set_without_episodes_is_told() -> None:
+def test_a_data_set_without_episodes_is_refused() -> None:
     with pytest.raises(SourceError, match="toy: the data set has no episodes"):
-        examine(ToySource(()), Thresholds())
+        diagnose(ToySource(()), Thresholds())
 
 
 @settings(deadline=None, max_examples=50)
@@ -162,34 +158,35 @@ def test_a_gripper_after_zeros_is_no_quaternion() -> None:
     rows[:, 6] = [-1, -1, 1, 1, -1, 1]
     assert quaternions(rows) == []
     odd = episode(ODD)
-    held = replace(odd, actions=changed(odd.actions, (slice(None), slice(4, 8)), 0.5), meta={"actions": {"held": [7]}})
-    held.actions[6:, 4:] *= -1
-    assert "quaternion-flip" not in examine(source(held), Thresholds()).counts()
-    assert "quaternion-flip" in examine(source(replace(held, meta={})), Thresholds()).counts()
+    gripper = replace(
+        odd, actions=changed(odd.actions, (slice(None), slice(4, 8)), 0.5), meta={"actions": {"held": [7]}}
+    )
+    gripper.actions[6:, 4:] *= -1
+    assert "quaternion-flip" not in diagnose(source(gripper), Thresholds()).counts()
+    assert "quaternion-flip" in diagnose(source(replace(gripper, meta={})), Thresholds()).counts()
 
 
-@pytest.mark.parametrize("kind", ["length", "time", "not-finite", "undecodable", "camera"])
-def test_what_a_reader_refuses_is_told_by_its_kind(kind: str) -> None:
-    report = examine(source(EpisodeError("a.h5:\n\nwrong", kind)), Thresholds())
-    assert [(finding.kind, finding.detail) for finding in report.findings] == [(kind, "a.h5: wrong")]
+def test_a_readers_error_is_a_finding_of_its_kind_in_one_line() -> None:
+    diagnosis = diagnose(source(EpisodeError("a.h5:\n\nwrong", "undecodable")), Thresholds())
+    assert [(finding.kind, finding.detail) for finding in diagnosis.findings] == [("undecodable", "a.h5: wrong")]
 
 
-def test_what_a_reader_mended_is_told_and_no_finding() -> None:
+def test_what_a_reader_mended_is_noted_and_no_finding() -> None:
     notes = {"empty": ["state/waist"], "scattered": {"end": 3}, "depth_left_out": "7 maps for 8 frames"}
-    report = examine(source(replace(episode(ODD), meta={"notes": notes})), Thresholds())
-    assert not report.findings
-    assert report.mended == (
+    diagnosis = diagnose(source(replace(episode(ODD), meta={"notes": notes})), Thresholds())
+    assert not diagnosis.findings
+    assert diagnosis.mended == (
         ("episode-6", "empty: state/waist; scattered: end 3; depth left out: 7 maps for 8 frames"),
     )
 
 
 def test_episodes_of_one_name_are_all_counted_and_left_out(tmp_path: Path) -> None:
-    report = examine(source(replace(episode(7), id="episode-2")), Thresholds())
-    assert report.counts() == {"duplicate": 2} and report.bad() == 2
-    assert write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons()) == (5, 2)
+    diagnosis = diagnose(source(replace(episode(7), id="episode-2")), Thresholds())
+    assert diagnosis.counts() == {"duplicate": 2} and diagnosis.bad() == 2
+    assert write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons()) == (5, 2)
 
 
-def test_damaged_files_are_told_by_kind_and_left_out(tmp_path: Path) -> None:
+def test_damaged_files_are_findings_and_left_out(tmp_path: Path) -> None:
     data_set = tmp_path / "set"
     for name in ("one", "cut", "nan", "other", "short", "still", "twin"):
         write_episode(data_set, name)
@@ -203,23 +200,23 @@ def test_damaged_files_are_told_by_kind_and_left_out(tmp_path: Path) -> None:
     (data_set / "still" / "actions.csv").write_text("timestamp,x\n" + "0,1\n" * 8)
     (data_set / "dataset.json").write_text('{"task": "go"}')
     read = open_source("folder", data_set)
-    report = examine(read, Thresholds())
-    assert {finding.episode: finding.kind for finding in report.findings} == {
+    diagnosis = diagnose(read, Thresholds())
+    assert {finding.episode: finding.kind for finding in diagnosis.findings} == {
         "cut": "undecodable",
         "nan": "not-finite",
         "short": "length",
         "still": "time",
         "twin": "duplicate",
     }
-    assert write_selection(tmp_path / "m.json", "set", report.refs, report.reasons()) == (2, 5)
+    assert write_selection(tmp_path / "m.json", "set", diagnosis.refs, diagnosis.reasons()) == (2, 5)
     chosen = select(read, tmp_path / "m.json")
     good = [ref.id for ref in chosen.episodes() if "left_out" not in ref.location]
-    assert good == ["one", "other"] and len(list(chosen.episodes())) == len(report.refs) == 7
+    assert good == ["one", "other"] and len(list(chosen.episodes())) == len(diagnosis.refs) == 7
 
 
-def test_a_manifest_made_with_other_options_is_told(tmp_path: Path) -> None:
-    report = examine(source(), Thresholds())
-    write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons())
+def test_a_manifest_made_with_other_options_is_refused(tmp_path: Path) -> None:
+    diagnosis = diagnose(source(), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons())
     others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
     with pytest.raises(SourceError, match=r"m.json: the data set was read with other options then"):
         select(others, tmp_path / "m.json")
@@ -227,8 +224,8 @@ def test_a_manifest_made_with_other_options_is_told(tmp_path: Path) -> None:
 
 def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: Path) -> None:
     data_set = source(replace(episode(6), task=""), episode(7))
-    report = examine(data_set, Thresholds())
-    assert write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons()) == (7, 1)
+    diagnosis = diagnose(data_set, Thresholds())
+    assert write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons()) == (7, 1)
     chosen = select(data_set, tmp_path / "m.json")
     refs = list(chosen.episodes())
     assert [ref.id for ref in refs] == [f"episode-{number}" for number in range(8)]
@@ -241,8 +238,8 @@ def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: 
 
 def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
     bad = replace(episode(6), task="")
-    report = examine(source(bad), Thresholds())
-    write_selection(tmp_path / "m.json", "toy", report.refs, report.reasons())
+    diagnosis = diagnose(source(bad), Thresholds())
+    write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons())
     mended = select(source(replace(bad, task="lift", fingerprint="0" * 16)), tmp_path / "m.json")
     assert [mended.read(ref).task for ref in mended.episodes()][6] == "lift"
 
@@ -255,7 +252,7 @@ def test_another_file_is_no_manifest(tmp_path: Path, content: str) -> None:
             select(source(), tmp_path / "m.json")
 
 
-def test_the_manifest_of_another_data_set_is_told(tmp_path: Path) -> None:
+def test_the_manifest_of_another_data_set_is_refused(tmp_path: Path) -> None:
     write_selection(tmp_path / "m.json", "toy", (("other", "0" * 16),), {})
     with pytest.raises(SourceError, match="m.json: names no episode of this data set"):
         select(source(), tmp_path / "m.json")
@@ -269,7 +266,7 @@ def test_the_manifest_of_another_data_set_is_told(tmp_path: Path) -> None:
         ("rlsd", Path("."), "unknown format 'rlsd'; did you mean 'rlds'"),
     ],
 )
-def test_what_is_neither_store_nor_format_is_told(what: str, path: Path | None, said: str) -> None:
+def test_neither_store_nor_format_is_refused(what: str, path: Path | None, said: str) -> None:
     with pytest.raises(SourceError, match=said):
         open_any(what, path)
 
@@ -283,7 +280,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
     return 0
 
 
-def test_the_command_tells_by_its_status(
+def test_the_commands_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task=""), b"\xff"])
@@ -317,6 +314,6 @@ def test_a_fix_that_keeps_nothing_says_what_to_do(
     assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
 
 
-def test_a_list_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_list_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="m.json: not there"):
         select(source(), tmp_path / "m.json")

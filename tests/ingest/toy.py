@@ -11,9 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rsjax.data.codec import Record
-from rsjax.ingest.annotators.protocols import AnnotationError, ArrayDepths, DepthMaps, Tracked
+from rsjax.ingest.annotators.protocols import AnnotationError, Annotator, DepthMaps, Tracked
 from rsjax.ingest.episode import Depths, Episode, EpisodeError, EpisodeRef, Frames, Segment
 from rsjax.ingest.jobs.work_items import Inputs, Job, Summary, Work
+from tests.ingest.videos import ArrayDepths
 
 FPS = 10.0
 
@@ -150,11 +151,10 @@ def runs(folder: Path) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Relative:
+class Relative(Annotator):
     """A depth network that says 3 of everything, without a unit; where ``there`` is False it cannot be loaded."""
 
     name: ClassVar[str] = "relative"
-    version: ClassVar[int] = 1
     there: bool = True
     device: str = "cpu"
 
@@ -168,11 +168,10 @@ class Relative:
 
 
 @dataclass(frozen=True)
-class ByDepth:
+class ByDepth(Annotator):
     """A tracking network of one point, whose x is the depth of each frame / 10."""
 
     name: ClassVar[str] = "by-depth"
-    version: ClassVar[int] = 1
     device: str = "cpu"
 
     def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:

@@ -1,4 +1,4 @@
-"""An in-memory data set whose episodes are all right, until a test changes one."""
+"""An in-memory data set of sound episodes, until a test changes one."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, fingerprint
+from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, checked, fingerprint
 
 COUNT = 12
 
@@ -69,7 +69,7 @@ class ToySource:
         content = self.contents[ref.location["number"]]
         if isinstance(content, Exception):
             raise content
-        return content
+        return checked(content, content.id)
 
 
 def source(*odd: Episode | Exception, fine: int = 6) -> ToySource:

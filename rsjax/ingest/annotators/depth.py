@@ -1,8 +1,8 @@
-"""Stage "depth". Without weights: what the simulator or a depth camera recorded, and otherwise nothing.
+"""Stage "depth": recorded depth with its holes filled, and the form that networks' depth takes.
 
-Depth that networks estimate from pictures alone is mostly relative: 1/depth up to an unknown scale and shift. It is
+Depth that a network estimates from pictures is mostly relative: 1/depth up to an unknown scale and shift. It is
 stretched per video so that the nearest point is 1 and the farthest ``RELATIVE_FAR``, without a unit. The "inverse"
-colour map over [1, RELATIVE_FAR] then has even steps in what the network said, and ``DepthMaps.extent`` undoes the
+colour map over [1, RELATIVE_FAR] then has even steps in the network's output, and ``DepthMaps.extent`` undoes the
 stretching.
 """
 
@@ -12,42 +12,35 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
-from rsjax.ingest.annotators.protocols import CHUNK, ArrayDepths, DepthMaps
-from rsjax.ingest.episode import Depths, Episode, EpisodeError
+from rsjax.ingest.annotators.protocols import CHUNK, DepthMaps
+from rsjax.ingest.episode import Depths, EpisodeError
 
 RELATIVE_FAR = 10.0
-_NEAR_SHARE = 1 / RELATIVE_FAR  # of the nearest point's 1/depth, at the farthest
+_NEAR_SHARE = 1 / RELATIVE_FAR  # 1/depth of the farthest point, relative to the nearest
 
 
 @dataclass(frozen=True)
 class RecordedDepth:
-    """The episode's own depth, in metres; None where the camera has none.
+    """Settings of the episode's own depth, in metres. It needs no stage: clips read it as they are cut.
 
     Attributes:
-        most_holes: greatest share of a frame that may be unmeasured; it is filled from the nearest measured pixel.
+        most_holes: greatest share of a frame that may be unmeasured.
     """
 
     name: ClassVar[str] = "recorded"
-    version: ClassVar[int] = 1
     most_holes: float = 0.5
-
-    def __call__(self, episode: Episode, camera: str) -> DepthMaps | None:
-        if camera not in episode.depth:
-            return None
-        maps = FilledDepths(episode.depth[camera], self.most_holes, f"episode {episode.id}: depth of {camera}")
-        return DepthMaps(maps, "metres", _extent(maps))
 
 
 @dataclass(frozen=True)
 class FilledDepths:
-    """Depth maps without holes, filled as they are read.
+    """Recorded depth maps whose holes are filled, from the nearest measured pixel, as they are read.
 
     Attributes:
-        maps: as they were recorded, 0 (or not finite) where nothing was measured.
+        maps: as recorded; 0 or not finite where nothing was measured.
         most_holes: see :class:`RecordedDepth`.
-        where: what messages call them.
+        where: the maps' name in messages.
     """
 
     maps: Depths
@@ -58,11 +51,10 @@ class FilledDepths:
         return len(self.maps)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """Raises :class:`EpisodeError` where too much of a frame was not measured."""
+        """Reads these maps; raises :class:`EpisodeError` where too much of a frame is unmeasured."""
         maps = self.maps.read(indices)
         holes = ~(np.isfinite(maps) & (maps > 0))
-        shares = holes.mean((1, 2))
-        for index, share in zip(indices, shares, strict=True):
+        for index, share in zip(indices, holes.mean((1, 2)), strict=True):
             if share > self.most_holes or share == 1:
                 raise EpisodeError(
                     f"{self.where}, frame {index}: {share:.0%} of it was not measured, more than most_holes "
@@ -71,8 +63,8 @@ class FilledDepths:
         return np.stack([fill_holes(one, hole) if hole.any() else one for one, hole in zip(maps, holes, strict=True)])
 
 
-def fill_holes(depth: Float32[np.ndarray, "H W"], holes: np.ndarray) -> Float32[np.ndarray, "H W"]:
-    """Each hole (``holes`` is True) becomes what the nearest measured pixel holds, of which there is one at least."""
+def fill_holes(depth: Float32[np.ndarray, "H W"], holes: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    """Gives each hole (``holes`` is True) the depth of the nearest measured pixel, of which there is at least one."""
     _, nearest = cv2.distanceTransformWithLabels(
         holes.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -84,25 +76,25 @@ def fill_holes(depth: Float32[np.ndarray, "H W"], holes: np.ndarray) -> Float32[
 
 @dataclass(frozen=True)
 class ConvertedDepths:
-    """A network's maps, converted as they are read: the whole video is held once."""
+    """A network's maps, converted as they are read, so that memory holds the video once."""
 
-    given: Float32[np.ndarray, "N H W"]
+    maps: Float32[np.ndarray, "N H W"]
     convert: Callable[[Float32[np.ndarray, "n H W"]], Float32[np.ndarray, "n H W"]]
 
     def __len__(self) -> int:
-        return len(self.given)
+        return len(self.maps)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        return self.convert(self.given[np.asarray(indices, int)])
+        return self.convert(self.maps[np.asarray(indices, int)])
 
 
 def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
-    """A whole video's 1/depth, up to scale and shift, as :class:`DepthMaps` of unit "relative".
+    """Stretches a whole video's 1/depth, known up to scale and shift, to :class:`DepthMaps` of unit "relative".
 
     Raises:
         ValueError: a value is not finite.
     """
-    low, high = _extent(ArrayDepths(inverse))
+    low, high = _extent(inverse)
 
     def stretch(part: Float32[np.ndarray, "n H W"]) -> Float32[np.ndarray, "n H W"]:
         position = (part - low) / (high - low) if high > low else np.zeros_like(part)
@@ -112,29 +104,29 @@ def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
 
 
 def inverse_of(maps: DepthMaps, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-    """The 1/depth that :func:`relative_depth` was given."""
+    """Undoes :func:`relative_depth`: returns the network's 1/depth."""
     low, high = maps.extent
     position = (1 / maps.maps.read(indices) - _NEAR_SHARE) / (1 - _NEAR_SHARE)
     return (low + position * (high - low)).astype(np.float32)
 
 
 def metric_depth(depth: Float32[np.ndarray, "N H W"]) -> DepthMaps:
-    """A network's depth in metres as :class:`DepthMaps`; less than a millimetre, also behind the camera, becomes one.
+    """Wraps a network's depth in metres; values below a millimetre, also behind the camera, become a millimetre.
 
     Raises:
         ValueError: a value is not finite.
     """
-    low, high = _extent(ArrayDepths(depth))
+    low, high = _extent(depth)
     least = np.float32(1e-3)
     maps = ConvertedDepths(depth, lambda part: np.maximum(part, least))
     return DepthMaps(maps, "metres", (max(low, float(least)), max(high, float(least))))
 
 
-def _extent(maps: Depths) -> tuple[float, float]:
-    """Least and greatest value; :class:`ValueError` where one is not finite."""
+def _extent(maps: Float32[np.ndarray, "N H W"]) -> tuple[float, float]:
+    """Returns the least and greatest value; raises :class:`ValueError` where one is not finite."""
     low, high = np.inf, -np.inf
     for start in range(0, len(maps), CHUNK):
-        chunk = maps.read(range(start, min(start + CHUNK, len(maps))))
+        chunk = maps[start : start + CHUNK]
         if not np.isfinite(chunk).all():
             raise ValueError("depth is not finite everywhere")
         low, high = min(low, float(chunk.min())), max(high, float(chunk.max()))

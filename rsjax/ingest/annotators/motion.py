@@ -1,6 +1,6 @@
 """Stage "motion": how much moves in each frame. Without weights: dense inverse search (DIS) optical flow.
 
-Motion of the camera counts as well as that of things. What is filtered by it is said in :mod:`rsjax.ingest.windows`.
+The camera's own motion counts too. :mod:`rsjax.ingest.windows` filters by these values.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.config import require
-from rsjax.ingest.annotators.protocols import FlowEstimator, Motion, in_chunks
+from rsjax.ingest.annotators.protocols import Annotator, FlowEstimator, Motion, Pictures, in_chunks
 from rsjax.ingest.episode import Frames
 
-WIDTH = 256  # pixels of the picture that motion is told in; wider ones are made smaller before it is measured
+WIDTH = 256  # of the picture that motion is scaled to; wider pictures are shrunk before it is measured
 _LEAST = 32  # pixels of a side, below which DIS has no pyramid
 
 
 @dataclass(frozen=True)
-class DISFlow:
+class DISFlow(Annotator):
     """OpenCV's DIS flow on grey pictures.
 
     Attributes:
@@ -28,15 +28,12 @@ class DISFlow:
     """
 
     name: ClassVar[str] = "dis"
-    version: ClassVar[int] = 1
     preset: int = 1
 
     def __post_init__(self) -> None:
         require(self.preset in (0, 1, 2), f"dis: preset is {self.preset}; choose 0, 1 or 2")
 
-    def __call__(
-        self, before: UInt8[np.ndarray, "T H W 3"], after: UInt8[np.ndarray, "T H W 3"]
-    ) -> Float32[np.ndarray, "T H W 2"]:
+    def __call__(self, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
         method = _dis(self.preset)
         pairs = zip(_grey(before), _grey(after), strict=True)
         return np.stack([method.calc(earlier, later, None) for earlier, later in pairs])
@@ -47,12 +44,12 @@ def _dis(preset: int) -> Any:
     return cv2.DISOpticalFlow.create(preset)
 
 
-def _grey(pictures: UInt8[np.ndarray, "T H W 3"]) -> list[UInt8[np.ndarray, "H W"]]:
+def _grey(pictures: Pictures) -> list[UInt8[np.ndarray, "H W"]]:
     return [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
 
 
 def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: FlowEstimator) -> Motion:
-    """The motion that leads into each frame.
+    """Measures the motion that leads into each frame.
 
     Args:
         frames: of one camera.
@@ -74,7 +71,7 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
     return Motion(mean, high)
 
 
-def _resized(pictures: UInt8[np.ndarray, "T H W 3"]) -> UInt8[np.ndarray, "T h w 3"]:
+def _resized(pictures: Pictures) -> UInt8[np.ndarray, "T h w 3"]:
     height, width = pictures.shape[1:3]
     scale = max(min(1.0, WIDTH / width), _LEAST / min(height, width))
     if scale == 1:

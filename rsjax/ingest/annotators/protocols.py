@@ -1,16 +1,13 @@
-"""What the five stages take and give: the protocols that defaults and networks share, with units.
+"""The interface of the five annotation stages: what their methods take and return, and the base class of all methods.
 
-Every annotator is a frozen dataclass: its fields are its parameters, ``version`` is raised when the same parameters
-give another output, and it can be sent to other processes, as networks are loaded by the first call.
-
-Axes: N frames of an episode, T of some part of it, H×W pixels, P points.
+Axes: N frames of an episode, T frames of a part of it, H×W pixels, P points.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -19,25 +16,56 @@ from rsjax.config import require
 from rsjax.errors import UserError
 from rsjax.ingest.episode import Depths, Episode, Frames, fingerprint
 
-DEPTH_UNITS = Literal["metres", "relative"]
-CHUNK = 32  # frames in memory at a time, where a stage can do with few
-_WHERE = ("device",)  # fields that say where something runs, not what comes out
+DepthUnit = Literal["metres", "relative"]
+Pictures = UInt8[np.ndarray, "T H W 3"]
+CHUNK = 32  # frames in memory at a time, where a stage needs no more
 
 
 class AnnotationError(UserError):
     """An annotator cannot run at all, or not on this episode. The message names what is missing and the cure."""
 
 
-class Annotator(Protocol):
-    """What all stages have in common.
+@dataclass(frozen=True)
+class Annotator:
+    """Base class of every method. Its fields are its parameters; whole numbers among them are checked.
+
+    Instances can be pickled: a network loads at its first call, in the process that calls it.
 
     Attributes:
-        name: of the method, a file name.
-        version: of its output.
+        name: the method's, unique and a valid file name.
+        version: rises when the same parameters give another output.
+        least: least value of a whole-number field, where that is not 1.
     """
 
     name: ClassVar[str]
-    version: ClassVar[int]
+    version: ClassVar[int] = 1
+    least: ClassVar[dict[str, int]] = {}
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, least = getattr(self, field.name), self.least.get(field.name, 1)
+            message = f"{self.name}: {field.name} is {value}; it must be at least {least}"
+            require(field.type is not int or value >= least, message)
+
+    def load(self) -> Any:
+        """Loads the network now instead of at the first call; methods without one do nothing.
+
+        Raises:
+            AnnotationError: it cannot run here: a package, a file or a device is missing.
+        """
+
+    def params(self) -> dict[str, Any]:
+        """Returns all that the output depends on, JSON-ready: files by content, not by path, and no device."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "device"}
+        by_content = {name: _digest(value) if isinstance(value, Path) else value for name, value in values.items()}
+        return {"name": self.name, "version": self.version} | by_content
+
+
+def _digest(path: Path) -> str:
+    if not path.is_dir():
+        return fingerprint([path])
+    kept = (file for file in path.rglob("*") if file.is_file() and not {".git", "__pycache__"} & {*file.parts})
+    return fingerprint(sorted(kept))
 
 
 @dataclass(frozen=True)
@@ -45,57 +73,22 @@ class Tracked:
     """Points followed through a part of an episode.
 
     Attributes:
-        points: x (right) and y (down), 0 and 1 the image's outer edges, as in :class:`rsjax.clip.Clip`. Where a point
-            is not visible, the place where it was last (or first) seen, or where a network believes it to be.
-        visible: whether it was seen there. A point is seen in one frame at least.
+        points: x (right) and y (down); 0 and 1 are the image's outer edges, as in :class:`rsjax.clip.Clip`. A point
+            that is not visible keeps its last (or first) visible position, or the one that a network predicts.
+        visible: each point is visible in at least one frame.
     """
 
     points: Float32[np.ndarray, "P T 2"]
     visible: Bool[np.ndarray, "P T"]
 
 
-class Tracker(Annotator, Protocol):
-    """Stage "tracks"."""
-
-    def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
-        """Points all over the pictures; new ones are begun where none is left.
-
-        Args:
-            frames: of one shot.
-            depth: the same frames' maps, for the trackers that need them.
-
-        Raises:
-            AnnotationError: it cannot run.
-            EpisodeError: a frame cannot be read.
-        """
-        ...
-
-
-class ShotDetector(Annotator, Protocol):
-    """Stage "shots"."""
-
-    def __call__(self, frames: Frames) -> list[tuple[int, int]]:
-        """First frame of each shot and the one after its last, in order; together they are all frames."""
-        ...
-
-
-class FlowEstimator(Annotator, Protocol):
-    """What stage "motion" measures with."""
-
-    def __call__(
-        self, before: UInt8[np.ndarray, "T H W 3"], after: UInt8[np.ndarray, "T H W 3"]
-    ) -> Float32[np.ndarray, "T H W 2"]:
-        """How far right and down each pixel of ``before`` is in ``after``, in pixels."""
-        ...
-
-
 @dataclass(frozen=True)
 class Motion:
-    """How much moves, in pixels per second of a picture that is 256 pixels wide. Row t is from frame t-1; row 0 is 0.
+    """Optical flow in pixels per second, scaled to a picture 256 pixels wide. Row t is from frame t-1; row 0 is 0.
 
     Attributes:
         mean: over all pixels.
-        high: that which 5 % of the pixels exceed: a small thing that moves shows here and hardly in the mean.
+        high: 95th percentile; a small moving object shows here and hardly in the mean.
     """
 
     mean: Float32[np.ndarray, " N"]
@@ -108,22 +101,14 @@ class DepthMaps:
 
     Attributes:
         maps: > 0 along the optical axis; see ``unit``.
-        unit: "metres", or "relative": 1 for the video's nearest point and ``depth.RELATIVE_FAR`` for its
-            farthest, evenly spaced in 1/depth; true up to an unknown scale and shift of 1/depth.
-        extent: the video's least and greatest value as the method gave it (metres; 1/depth where relative).
+        unit: "metres", or "relative": 1 for the video's nearest point and ``depth.RELATIVE_FAR`` for its farthest,
+            evenly spaced in 1/depth; correct up to an unknown scale and shift of 1/depth.
+        extent: the video's least and greatest value in the network's own output (metres; 1/depth where relative).
     """
 
     maps: Depths
-    unit: DEPTH_UNITS
+    unit: DepthUnit
     extent: tuple[float, float]
-
-
-class DepthEstimator(Annotator, Protocol):
-    """Stage "depth"."""
-
-    def __call__(self, episode: Episode, camera: str) -> DepthMaps | None:
-        """One camera's depth; None where this method has none to give, and the clips stay without."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -131,13 +116,13 @@ class Semantic:
     """What happens in one part of an episode.
 
     Attributes:
-        start: its first frame.
-        end: the frame after its last.
-        text: what is done; "" where nothing says it.
-        skill: the data set's word for it, or "".
-        key_frames: frames of the episode in which it is decided, increasing; none where nothing points to one.
-        text_by: "segment", "task", "" (nobody) or the network's name.
-        key_by: "gripper", "motion", "" (nobody) or the network's name.
+        start: first frame.
+        end: the frame after the last.
+        text: the action; "" where unknown.
+        skill: one word for the kind of action, or "".
+        key_frames: frames of the episode in which the action is decided, increasing; may be empty.
+        text_by: origin of the text: "segment", "task", "" (none) or the network's name.
+        key_by: origin of the key frames: "gripper", "motion", "" (none) or the network's name.
     """
 
     start: int
@@ -154,8 +139,8 @@ class Semantics:
     """What an episode is about.
 
     Attributes:
-        task: of the whole; "" where nobody says it.
-        scene: where it plays; "" where nobody says it.
+        task: of the whole episode; "" where unknown.
+        scene: description of the place; "" where unknown.
         parts: in order.
     """
 
@@ -164,90 +149,27 @@ class Semantics:
     parts: tuple[Semantic, ...]
 
 
-class SemanticsAnnotator(Annotator, Protocol):
-    """Stage "semantics"."""
+# What each stage calls. Any of them raises AnnotationError where it cannot run, and EpisodeError for unreadable frames.
 
-    def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
-        """What the episode is about.
-
-        Args:
-            camera: whose pictures a network looks at.
-            motion: ``Motion.high`` of that camera, for key frames; None: not measured.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class ArrayFrames:
-    """Pictures in memory, as :class:`rsjax.ingest.episode.Frames`."""
-
-    pictures: UInt8[np.ndarray, "N H W 3"]
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        return self.pictures[np.asarray(indices, int)]
+# "shots": the first frame of each shot and the one after its last, in order, covering all frames.
+ShotDetector = Callable[[Frames], list[tuple[int, int]]]
+# "motion": how far right and down each pixel of the first pictures has moved in the second ones, in pixels.
+FlowEstimator = Callable[[Pictures, Pictures], Float32[np.ndarray, "T H W 2"]]
+# "depth": the depth of an episode's camera, by name.
+DepthEstimator = Callable[[Episode, str], DepthMaps]
+# "tracks": points all over the frames of one shot, with new ones where none is left; some methods need the depth.
+Tracker = Callable[[Frames, Depths | None], Tracked]
+# "semantics": of an episode; a network looks at the camera; key frames use the camera's ``Motion.high``, if measured.
+SemanticsAnnotator = Callable[[Episode, str, Float[np.ndarray, " N"] | None], Semantics]
 
 
-@dataclass(frozen=True)
-class ArrayDepths:
-    """Depth maps in memory, as :class:`rsjax.ingest.episode.Depths`."""
-
-    maps: Float32[np.ndarray, "N H W"]
-
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        return self.maps[np.asarray(indices, int)]
-
-
-def in_chunks(
-    frames: Frames, overlap: int = 0, size: int = CHUNK
-) -> Iterator[tuple[int, UInt8[np.ndarray, "n H W 3"]]]:
-    """All frames, a few at a time: the first one's number and the pictures.
+def in_chunks(frames: Frames, overlap: int = 0, size: int = CHUNK) -> Iterator[tuple[int, Pictures]]:
+    """Yields all frames, a few at a time: the first one's number, and the pictures.
 
     Args:
-        overlap: how many pictures each chunk shares with the one before, < ``size``.
+        overlap: pictures that each chunk shares with the one before, < ``size``.
     """
     for start in range(0, max(len(frames) - overlap, 1), size - overlap):
         indices = range(start, min(start + size, len(frames)))
         if indices:
             yield start, frames.read(indices)
-
-
-def require_counts(annotator: Annotator, *names: str) -> None:
-    """Asks of these fields to be at least 1; :class:`rsjax.config.ConfigError` says which one is not."""
-    for name in names:
-        value = getattr(annotator, name)
-        require(value >= 1, f"{annotator.name}: {name} is {value}; it must be at least 1")
-
-
-def prepare(annotator: Annotator) -> None:
-    """Loads a network now instead of at its first call; the methods without one need nothing.
-
-    Raises:
-        AnnotationError: it cannot run here: a package, a file or a device is missing.
-    """
-    load = getattr(annotator, "load", None)
-    if load is not None:
-        load()
-
-
-def parameters(annotator: Annotator) -> dict[str, Any]:
-    """All that an annotator's output depends on, JSON-ready: files by what is in them, not by where they lie."""
-    fields = {field.name: getattr(annotator, field.name) for field in dataclasses.fields(annotator)}  # type: ignore[arg-type]
-    values = {name: _by_content(value) for name, value in fields.items() if name not in _WHERE}
-    return {"name": annotator.name, "version": annotator.version} | values
-
-
-def _by_content(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return parameters(value)  # type: ignore[arg-type]
-    if not isinstance(value, Path):
-        return value
-    if not value.is_dir():
-        return fingerprint([value])
-    kept = (path for path in value.rglob("*") if path.is_file() and not {".git", "__pycache__"} & {*path.parts})
-    return fingerprint(sorted(kept))

@@ -1,6 +1,6 @@
 """Stage "shots": where a video was cut. Without weights: a jump of the colour histogram.
 
-Finds hard cuts alone. A teleoperated episode has none, so one that is found is worth a look.
+It detects hard cuts only. A teleoperated episode has none, so a detected cut deserves a look.
 """
 
 from dataclasses import dataclass
@@ -10,52 +10,57 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.ingest.annotators.protocols import in_chunks, require_counts
+from rsjax.ingest.annotators.protocols import Annotator, in_chunks
 from rsjax.ingest.episode import Frames
 
 _BINS = (16, 4, 4)  # hue, saturation, value
-_SIDE = 96  # pixels of the longer side that histograms are made of
+_SIDE = 96  # pixels; pictures are shrunk to this longer side for their histograms
 
 
 @dataclass(frozen=True)
-class HistogramShots:
-    """A cut is where the HSV histogram changes by more than ``threshold``, and much more than around it.
+class HistogramShots(Annotator):
+    """Cuts where the HSV histogram changes by more than ``threshold``, and much more than around it.
 
     Attributes:
         threshold: share of the pixels that change their bin, 0–1.
         prominence: how many times the greatest change of the ``around`` steps on either side it has to be.
         around: steps.
-        shortest: frames; a cut nearer than this to the one before is left out (a flash makes two).
+        shortest: frames; a cut nearer than this to the previous one is dropped (a flash makes two).
     """
 
     name: ClassVar[str] = "hsv-histogram"
-    version: ClassVar[int] = 1
     threshold: float = 0.4
     prominence: float = 2.0
     around: int = 3
     shortest: int = 8
 
-    def __post_init__(self) -> None:
-        require_counts(self, "around", "shortest")
-
     def __call__(self, frames: Frames) -> list[tuple[int, int]]:
         changes = histogram_changes(frames)
-        cuts: list[int] = []
+        cuts = []
         for t in np.flatnonzero(changes > self.threshold).tolist():
             beside = np.concatenate([changes[max(1, t - self.around) : t], changes[t + 1 : t + 1 + self.around]])
-            sharp = changes[t] >= self.prominence * beside.max(initial=0.0)
-            if sharp and t - (cuts[-1] if cuts else 0) >= self.shortest:
+            if changes[t] >= self.prominence * beside.max(initial=0.0):
                 cuts.append(t)
-        return spans_between(cuts, len(frames))
+        return spans_between(cuts, len(frames), self.shortest)
 
 
-def spans_between(cuts: list[int], count: int) -> list[tuple[int, int]]:
-    """The shots that begin at frame 0 and at each of the cuts (increasing, between 1 and ``count`` - 1)."""
-    return list(zip([0, *cuts], [*cuts, count], strict=True))
+def spans_between(cuts: list[int], count: int, shortest: int = 1) -> list[tuple[int, int]]:
+    """Returns the shots that begin at frame 0 and at each cut.
+
+    Args:
+        cuts: increasing, between 1 and ``count`` - 1.
+        count: frames of the video.
+        shortest: frames; a cut nearer than this to the beginning of its shot is dropped.
+    """
+    starts = [0]
+    for cut in cuts:
+        if cut - starts[-1] >= shortest:
+            starts.append(cut)
+    return list(zip(starts, [*starts[1:], count], strict=True))
 
 
 def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
-    """Half the L1 distance of each frame's HSV histogram from the one before, 0–1; 0 for the first."""
+    """Returns half the L1 distance of each frame's HSV histogram from the previous one's, 0–1; 0 for the first."""
     changes, last = np.zeros(len(frames), np.float32), None
     for start, pictures in in_chunks(frames):
         for t, picture in enumerate(pictures, start):

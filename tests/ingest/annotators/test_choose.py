@@ -20,14 +20,14 @@ def test_a_word_is_a_method_and_its_fields() -> None:
     assert choose("shots", "none") is None
 
 
-def test_files_are_named_from_the_root_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_paths_become_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/me")
     network = choose("tracks", "bootstapir:checkout=~/tapnet,weights=here/b.pt")
     assert (network.checkout, network.weights) == (Path("/home/me/tapnet"), tmp_path / "here" / "b.pt")
 
 
-def test_recorded_depth_is_read_unless_there_is_to_be_none() -> None:
+def test_recorded_depth_is_read_unless_depth_is_off() -> None:
     assert choose_recorded("recorded") == choose_recorded("depth-anything:model=/a") == RecordedDepth()
     assert choose_recorded("recorded:most_holes=0.8") == RecordedDepth(0.8)
     assert choose_recorded("none") is None
@@ -60,9 +60,9 @@ def test_every_method_is_there_under_its_own_name() -> None:
         ("tracks", "bootstapir:checkout=/a", r"weights missing; write bootstapir:weights=VALUE"),
         ("motion", "raft:weights=/a,size=big", r"size is 'big'; choose small or large"),
         ("depth", "video-depth-anything:checkout=/a,weights=/b,metric=yes", r"metric is 'yes'; write True or False"),
-        ("semantics", "internvl:model=/a,own=x", r"own cannot be set"),
+        ("semantics", "internvl:model=/a,own=x", r"no field 'own=x'"),
     ],
 )
-def test_what_cannot_be_is_told(stage: str, word: str, match: str) -> None:
+def test_an_error_names_stage_method_and_field(stage: str, word: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         choose(stage, word)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from rsjax.ingest.annotators.motion import DISFlow, measure_motion
-from rsjax.ingest.annotators.protocols import CHUNK, ArrayFrames
-from tests.ingest.videos import sliding
+from rsjax.ingest.annotators.protocols import CHUNK
+from tests.ingest.videos import ArrayFrames, sliding
 
 
 def test_flow_is_in_pixels_right_and_down():

@@ -10,24 +10,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
-from rsjax.ingest.annotators.depth import RecordedDepth
 from rsjax.ingest.annotators.motion import DISFlow
 from rsjax.ingest.annotators.networks.depth import DepthAnything, VideoDepthAnything
 from rsjax.ingest.annotators.networks.motion import RaftFlow
 from rsjax.ingest.annotators.networks.semantics import InternVL
 from rsjax.ingest.annotators.networks.shots import TransNetShots
 from rsjax.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
-from rsjax.ingest.annotators.protocols import ArrayFrames, in_chunks, parameters
+from rsjax.ingest.annotators.protocols import Annotator, in_chunks
 from rsjax.ingest.annotators.semantics import OwnSemantics
 from rsjax.ingest.annotators.shots import HistogramShots
 from rsjax.ingest.annotators.tracks import LucasKanade
+from tests.ingest.videos import ArrayFrames
 
 HERE = Path(__file__)
 ALL = [
     LucasKanade(),
     HistogramShots(),
     DISFlow(),
-    RecordedDepth(),
     OwnSemantics(),
     SpatialTracker(HERE.parent, HERE),
     BootsTapir(HERE.parent, HERE),
@@ -40,20 +39,19 @@ ALL = [
 
 
 @dataclass(frozen=True)
-class Weighted:
+class Weighted(Annotator):
     name: ClassVar[str] = "weighted"
-    version: ClassVar[int] = 1
     weights: Path
     strength: float = 1.0
     device: str = "cpu"
 
 
 @pytest.mark.parametrize("annotator", ALL, ids=lambda annotator: annotator.name)
-def test_every_annotator_travels_and_has_parameters_that_json_holds(annotator):
+def test_every_annotator_can_be_pickled_and_its_parameters_written_as_json(annotator):
     assert pickle.loads(pickle.dumps(annotator)) == annotator
-    told = parameters(annotator)
-    assert json.loads(json.dumps(told)) == told
-    assert told["name"] == annotator.name and told["version"] == annotator.version
+    params = annotator.params()
+    assert json.loads(json.dumps(params)) == params
+    assert params["name"] == annotator.name and params["version"] == annotator.version
 
 
 def test_names_differ():
@@ -66,19 +64,19 @@ def test_weights_count_by_content_and_the_device_not_at_all(tmp_path):
     for folder in "ab":
         (tmp_path / folder / "w.pt").write_bytes(b"weights")
     one = Weighted(tmp_path / "a" / "w.pt")
-    assert parameters(one) == parameters(Weighted(tmp_path / "b" / "w.pt", device="cuda"))
-    assert parameters(one) != parameters(replace(one, strength=2.0))
-    before = parameters(one)
+    assert one.params() == Weighted(tmp_path / "b" / "w.pt", device="cuda").params()
+    assert one.params() != replace(one, strength=2.0).params()
+    before = one.params()
     (tmp_path / "a" / "w.pt").write_bytes(b"other weights")
-    assert parameters(one) != before
+    assert one.params() != before
 
 
 def test_a_folder_counts_by_all_its_files(tmp_path):
     folder = Weighted(tmp_path)
     (tmp_path / "config.json").write_text("{}")
-    before = parameters(folder)
+    before = folder.params()
     (tmp_path / "model.safetensors").write_bytes(b"x")
-    assert parameters(folder) != before
+    assert folder.params() != before
 
 
 @given(st.integers(0, 40), st.integers(2, 9), st.integers(0, 1))
@@ -86,8 +84,8 @@ def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap
     pictures = np.arange(count, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 1, 1, 3), np.uint8)
     chunks = [(start, part[:, 0, 0, 0].tolist()) for start, part in in_chunks(ArrayFrames(pictures), overlap, size)]
     assert all(part == list(range(start, start + len(part))) and len(part) <= size for start, part in chunks)
-    held = [t for i, (_, part) in enumerate(chunks) for t in part[overlap if i else 0 :]]
-    assert held == list(range(count))
+    covered = [t for i, (_, part) in enumerate(chunks) for t in part[overlap if i else 0 :]]
+    assert covered == list(range(count))
 
 
 @pytest.mark.parametrize(

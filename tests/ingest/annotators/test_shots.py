@@ -3,9 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.ingest.annotators.protocols import ArrayFrames
 from rsjax.ingest.annotators.shots import HistogramShots, histogram_changes, spans_between
-from tests.ingest.videos import sliding
+from tests.ingest.videos import ArrayFrames, sliding
 
 
 def scene(count, color):

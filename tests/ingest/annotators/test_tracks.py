@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.ingest.annotators.protocols import ArrayFrames, Tracked
+from rsjax.ingest.annotators.protocols import Tracked
 from rsjax.ingest.annotators.tracks import LucasKanade, grid_points, track_in_spans, window_tracks
-from tests.ingest.videos import sliding, texture
+from tests.ingest.videos import ArrayFrames, sliding, texture
 
 
 @pytest.mark.parametrize("step", [(0, 0), (2, 0), (0, -3), (-1, 2)])

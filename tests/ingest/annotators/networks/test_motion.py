@@ -17,14 +17,14 @@ def raft(tmp_path_factory):
     return RaftFlow(file, updates=2, batch=2)
 
 
-def test_flow_has_the_pictures_size_whatever_the_network_takes(raft):
+def test_flow_has_the_pictures_size(raft):
     frames = sliding(4, (1, 0), (50, 70)).pictures
     field = raft(frames[:-1], frames[1:])
     assert field.shape == (3, 50, 70, 2) and field.dtype == np.float32 and np.isfinite(field).all()
     np.testing.assert_allclose(raft(frames[2:3], frames[3:]), field[2:], atol=1e-3)
 
 
-def test_pictures_are_handed_over_from_minus_1_to_1_and_flow_comes_back_in_their_pixels(raft, monkeypatch):
+def test_the_network_sees_minus_1_to_1_and_flow_is_in_the_pictures_pixels(raft, monkeypatch):
     class Network:
         def __call__(self, before, after, num_flow_updates):
             assert before.shape[1] == 3 and before.shape[2] % 8 == before.shape[3] % 8 == 0
@@ -33,7 +33,7 @@ def test_pictures_are_handed_over_from_minus_1_to_1_and_flow_comes_back_in_their
             flow = torch.ones(len(before), 2, *before.shape[2:])
             return [torch.zeros_like(flow), flow * torch.tensor([16.0, 8.0])[:, None, None]]
 
-    monkeypatch.setattr("rsjax.ingest.annotators.networks.motion._load", lambda *_: Network())
+    monkeypatch.setattr(RaftFlow, "load", lambda self: Network())
     frames = sliding(2, (1, 0), (32, 64)).pictures  # becomes 128 × 128
     np.testing.assert_allclose(raft(frames[:1], frames[1:]), np.broadcast_to([8.0, 2.0], (1, 32, 64, 2)), rtol=1e-6)
 

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.ingest.annotators.networks import semantics
-from rsjax.ingest.annotators.networks.semantics import AnswerError, InternVL, asked, complete, parse_answer
+from rsjax.ingest.annotators.networks.semantics import AnswerError, InternVL, complete, parse_answer, valid_answer
 from rsjax.ingest.annotators.protocols import AnnotationError
 from rsjax.ingest.annotators.semantics import OwnSemantics
 from rsjax.ingest.episode import EpisodeError, Segment
@@ -78,7 +77,7 @@ def test_whatever_json_comes_is_an_answer_or_an_answer_error(value):
 
 def test_a_refused_answer_is_asked_for_again_with_what_was_wrong():
     ask = saying("no", json.dumps(GOOD | {"key_picture": 9}), json.dumps(GOOD))
-    assert asked(list(FRAMES.pictures[:3]), ask, 3, "e0").key_picture == 1
+    assert valid_answer(list(FRAMES.pictures[:3]), ask, 3, "e0").key_picture == 1
     assert [question.partition("refused: ")[2] for _, question in ask.seen] == [
         "",
         "it is not JSON",
@@ -88,7 +87,7 @@ def test_a_refused_answer_is_asked_for_again_with_what_was_wrong():
 
 def test_without_a_valid_answer_there_is_none():
     with pytest.raises(AnnotationError, match="e0: no valid answer in 2 tries, the last one: it is not JSON"):
-        asked(list(FRAMES.pictures[:3]), saying("no", "no"), 2, "e0")
+        valid_answer(list(FRAMES.pictures[:3]), saying("no", "no"), 2, "e0")
 
 
 def test_only_parts_without_text_are_asked_about_and_key_pictures_become_frames(tmp_path):
@@ -132,7 +131,7 @@ def test_the_real_network_sees_every_picture_and_its_words_are_checked(tmp_path,
 
     given = episode(FRAMES, "", PARTS)
     settings = InternVL(save_small(tmp_path), pictures=3, tries=2, new_tokens=4)
-    model, _ = semantics._load(tmp_path, "cpu")
+    model, _ = settings.load()
     shapes, generate = [], model.generate
     monkeypatch.setattr(model, "generate", lambda **x: shapes.append(x["pixel_values"].shape) or generate(**x))
     with pytest.raises(AnnotationError, match="episode e0: no valid answer in 2 tries"):

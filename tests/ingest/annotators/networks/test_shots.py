@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from rsjax.ingest.annotators.networks.shots import TransNetShots, transition_probabilities
-from rsjax.ingest.annotators.protocols import ArrayFrames
 from rsjax.ingest.annotators.shots import HistogramShots
-from tests.ingest.videos import sliding
+from tests.ingest.videos import ArrayFrames, sliding
 
 torch = pytest.importorskip("torch")
 
 
 class Stub:
-    """Says of each frame what its top left pixel says; asserts what a TransNetV2 asserts."""
+    """Classifies each frame by its top left pixel; asserts what a TransNetV2 asserts."""
 
     def __init__(self):
         self.windows = 0
@@ -49,7 +48,7 @@ def test_windows_cover_every_frame_once(count):
 
 
 def test_a_transition_belongs_to_the_shot_before_it(monkeypatch):
-    monkeypatch.setattr("rsjax.ingest.annotators.networks.shots._load", lambda device: Stub())
+    monkeypatch.setattr(TransNetShots, "load", lambda self: Stub())
     frames = ArrayFrames(marked(120, (30, 33), (80, 81), (84, 85), (119, 120)))
     assert TransNetShots()(frames) == [(0, 33), (33, 81), (81, 120)]
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rsjax.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
-from rsjax.ingest.annotators.protocols import AnnotationError, ArrayDepths
+from rsjax.ingest.annotators.protocols import AnnotationError
 from tests.ingest.annotators.networks.checkouts import check_out
-from tests.ingest.videos import sliding
+from tests.ingest.videos import ArrayDepths, sliding
 
 torch = pytest.importorskip("torch")
 FRAMES = sliding(9, (2, -1), (48, 64))

@@ -1,13 +1,10 @@
-import sys
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from rsjax.clip import Clip
 from rsjax.data.store import encode_clip, write_store
-from rsjax.ingest import accuracy
 from rsjax.ingest.annotators.tracks import LucasKanade, grid_points
+from tests.ingest.annotators import track_accuracy as accuracy
 from tests.ingest.videos import sliding
 
 
@@ -73,29 +70,8 @@ def test_colours_keep_depth_to_half_a_level(scale):
     assert 0 < mean < greatest <= level / 2 * 1.01
 
 
-def test_the_command_prints_both(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_both(tmp_path, capsys):
     write_store(tmp_path / "s", "clips", {"test": [encode_clip(sliding_clip((2, 0)))]}, {"depth_range": [0.5, 2.5]})
-    monkeypatch.setattr(sys, "argv", ["accuracy", str(tmp_path / "s")])
-    accuracy.main()
-    told = capsys.readouterr().out
-    assert "whole clips, moving points: median 0." in told and "depth colours, inverse" in told
-
-
-@pytest.mark.parametrize("manifest", [{"depth_range": None}, {"depth_range": [1.0, 10.0], "depth_unit": "relative"}])
-def test_colours_are_measured_of_metres_alone(tmp_path, monkeypatch, capsys, manifest):
-    clip = sliding_clip((2, 0))
-    bare = replace(clip, depth=None) if manifest["depth_range"] is None else clip
-    write_store(tmp_path / "s", "clips", {"test": [encode_clip(bare)]}, manifest)
-    monkeypatch.setattr(sys, "argv", ["accuracy", str(tmp_path / "s")])
-    accuracy.main()
-    told = capsys.readouterr().out
-    assert "single steps, moving points: median 0." in told and "no depth in metres" in told
-
-
-def test_a_split_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys):
-    write_store(tmp_path / "s", "clips", {"train": [], "test": [encode_clip(sliding_clip((2, 0)))]}, {})
-    for split, wrong in (("more", "no split 'more'; it has train, test"), ("train", "has no clips")):
-        monkeypatch.setattr(sys, "argv", ["accuracy", str(tmp_path / "s"), "--split", split])
-        with pytest.raises(SystemExit) as left:
-            accuracy.one_line(accuracy.main)
-        assert left.value.code == 2 and wrong in capsys.readouterr().err
+    accuracy.main([str(tmp_path / "s")])
+    printed = capsys.readouterr().out
+    assert "whole clips, moving points: median 0." in printed and "depth colours, inverse" in printed

@@ -1,32 +1,33 @@
-"""How well cuts are found, measured where it is known that there is one: between the episodes of a data set.
+"""Measures how well cuts are detected where there certainly is one, between the episodes of a data set.
 
-python -m rsjax.ingest.shot_accuracy rlds ../shared/data/bridge --camera image_0 --method transnetv2
+python -m tests.ingest.annotators.shot_accuracy rlds ../shared/data/bridge --camera image_0 --method transnetv2
 """
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt8
 
+from experiments.cli import main_errors
 from rsjax.errors import UserError
-from rsjax.ingest.accuracy import one_line
 from rsjax.ingest.annotators.choose import METHODS, choose
-from rsjax.ingest.annotators.protocols import ArrayFrames, ShotDetector
+from rsjax.ingest.annotators.protocols import ShotDetector
 from rsjax.ingest.formats import FORMATS, open_source
+from tests.ingest.videos import ArrayFrames
 
 
 @dataclass(frozen=True)
 class ShotAccuracy:
-    """Of the cuts between episodes that follow each other in one video.
+    """Counts over one video that joins the episodes.
 
     Attributes:
-        cuts: how many there are.
-        exact: of them found to the frame.
-        near: of them found to a frame beside it, those to the frame included.
-        false: cuts found elsewhere.
-        inside: cuts found in the episodes one by one, each of which is one shot.
+        cuts: between episodes.
+        exact: of them detected to the frame.
+        near: of them detected to the frame or one beside it.
+        false: cuts detected elsewhere.
+        inside: cuts detected in the episodes one by one, each of which is one shot.
     """
 
     cuts: int
@@ -37,12 +38,7 @@ class ShotAccuracy:
 
 
 def shot_accuracy(detect: ShotDetector, episodes: Sequence[UInt8[np.ndarray, "n H W 3"]]) -> ShotAccuracy:
-    """Joins the episodes' pictures, all of one size, and looks for the cuts.
-
-    Args:
-        detect: the method.
-        episodes: at least one, in memory.
-    """
+    """Joins the episodes' pictures, all of one size, and compares the detected cuts with the true ones."""
     cuts = set(np.cumsum([len(pictures) for pictures in episodes])[:-1].tolist())
     found = {start for start, _ in detect(ArrayFrames(np.concatenate(list(episodes))))} - {0}
     around = {cut: {cut - 1, cut, cut + 1} & found for cut in cuts}
@@ -56,7 +52,7 @@ def shot_accuracy(detect: ShotDetector, episodes: Sequence[UInt8[np.ndarray, "n 
 
 
 def pictures_of(kind: str, path: str, camera: str) -> list[UInt8[np.ndarray, "n H W 3"]]:
-    """All pictures of one camera, episode by episode, of those that have it in the size of the first.
+    """Reads one camera's pictures of every episode that has them in the size of the first.
 
     Raises:
         UserError: the data set cannot be read, or no episode has the camera.
@@ -69,19 +65,18 @@ def pictures_of(kind: str, path: str, camera: str) -> list[UInt8[np.ndarray, "n 
     return [pictures for pictures in found if pictures.shape[1:] == found[0].shape[1:]]
 
 
-def main(argv: Iterable[str] | None = None) -> None:
-    """Prints the measurement for one method."""
+@main_errors()
+def main(argv: Sequence[str] | None = None) -> None:
+    """Prints the measurement of one method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("format", choices=FORMATS)
     parser.add_argument("path")
     parser.add_argument("--camera", required=True)
-    parser.add_argument("--method", default="hsv-histogram", help=f"of {', '.join(METHODS['shots'])}")
-    options = parser.parse_args(None if argv is None else list(argv))
+    parser.add_argument("--method", default="hsv-histogram", help=f"one of {', '.join(METHODS['shots'])}")
+    options = parser.parse_args(argv)
     method = choose("shots", options.method)
-    if method is None:
-        raise UserError(f"--method {options.method}: nothing to measure; choose one of {', '.join(METHODS['shots'])}")
     print(shot_accuracy(method, pictures_of(options.format, options.path, options.camera)))
 
 
 if __name__ == "__main__":
-    one_line(main)
+    main()
