@@ -1,4 +1,4 @@
-"""Progress: how often lines appear, and that their rates and times left are true."""
+"""Progress: how often lines appear, and whether their rates and times left are right."""
 
 import io
 
@@ -19,7 +19,7 @@ class Clock:
 
 
 class Counted:
-    """A scalar that counts how often it is turned into a number."""
+    """A scalar that counts its conversions to a number."""
 
     reads = 0
 
@@ -31,7 +31,7 @@ class Counted:
 def run(
     steps: list[tuple[float, int]], total: int, start: int = 0, terminal: bool = False, settle: int = 0
 ) -> list[str]:
-    """The lines shown when (seconds, done) updates come in turn."""
+    """Returns the lines after a series of (seconds since the last, done) updates."""
     shown, clock = io.StringIO(), Clock()
     console = Console(file=shown, force_terminal=terminal, width=200)
     with Progress("train", total, "steps", start, console, clock, settle=settle) as progress:
@@ -49,7 +49,7 @@ def test_a_line_gives_done_rate_time_left_and_scalars() -> None:
     ]
 
 
-def test_the_rate_counts_only_what_this_run_did() -> None:
+def test_the_rate_counts_only_units_of_this_run() -> None:
     assert run([(10.0, 320)], total=400, start=300)[0] == "  train: 320/400 steps, 2 steps/s, 40 s left, loss=0.25"
 
 
@@ -59,7 +59,7 @@ def test_the_rate_forgets_a_slow_first_step() -> None:
     assert ", 1 steps/s, " in lines[-2]
 
 
-def test_what_comes_of_starting_up_is_in_no_rate() -> None:
+def test_no_rate_includes_the_start_up() -> None:
     lines = run([(12.0, 1), (12.0, 2), (5.0, 12), (5.0, 22)], total=42, settle=2)
     assert lines[:2] == ["  train: 1/42 steps, loss=0.25", "  train: 2/42 steps, loss=0.25"]
     assert lines[2] == "  train: 22/42 steps, 2 steps/s, 10 s left, loss=0.25"
@@ -78,7 +78,7 @@ def test_plain_lines_are_at_least_ten_seconds_apart(waits: list[float]) -> None:
     assert len(lines) - 1 <= now / PLAIN_SECONDS + 1e-6
 
 
-def test_scalars_are_read_only_when_they_are_shown() -> None:
+def test_scalars_are_converted_only_when_shown() -> None:
     clock, value = Clock(), Counted()
     with Progress("train", 100, "steps", console=Console(file=io.StringIO()), clock=clock) as progress:
         for done in range(1, 41):
@@ -93,14 +93,14 @@ def test_a_terminal_shows_a_bar_and_ends_with_the_same_summary() -> None:
     assert lines[-1].endswith("  train: 40 steps in 20 s (2 steps/s)")
 
 
-def test_an_error_passes_and_is_not_called_finished() -> None:
+def test_after_an_error_there_is_no_summary() -> None:
     shown = io.StringIO()
     with pytest.raises(RuntimeError, match="boom"), Progress("train", 4, "steps", console=Console(file=shown)):
         raise RuntimeError("boom")
     assert shown.getvalue() == ""
 
 
-def test_headlines_are_printed_as_they_are() -> None:
+def test_headlines_are_printed_verbatim() -> None:
     shown = io.StringIO()
     stage(2, 6, "tokenizer", "up to date, skipped", Console(file=shown))
     assert shown.getvalue() == "[2/6] tokenizer: up to date, skipped\n"
@@ -114,7 +114,7 @@ def test_duration(seconds: float, words: str) -> None:
     assert duration(seconds) == words
 
 
-def test_a_second_rate_counts_what_a_unit_consists_of() -> None:
+def test_a_second_rate_counts_the_parts_of_a_unit() -> None:
     shown, clock = io.StringIO(), Clock()
     with Progress("train", 400, "steps", console=Console(file=shown), clock=clock, per_unit=("tokens", 8192)) as bar:
         clock.now += 20.0

@@ -8,7 +8,7 @@ import pytest
 from rsjax.runtime import HUGE_PAGES
 
 ROOT = Path(__file__).parents[1]
-# Says what it is and counts its starts in a file.
+# Prints its tunables and arguments, and appends its process id to a file at each start.
 PROGRAM = """
 import os, sys
 open(sys.argv[1], "a").write(f"{os.getpid()} ")
@@ -17,11 +17,11 @@ tune_process()
 print(os.environ.get("GLIBC_TUNABLES"), *sys.argv[2:], sep="\\n")
 """
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only on Linux is there anything to tune")
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="tuning is only for Linux")
 
 
 def run(starts: Path, tunables: str | None, *arguments: str) -> tuple[list[str], list[str]]:
-    """Lines that the program printed, and the process id of each of its starts."""
+    """Returns the lines that the program printed and the process id of each of its starts."""
     environment = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
     environment |= {"GLIBC_TUNABLES": tunables} if tunables is not None else {}
     line = [sys.executable, "-X", "dev", "-c", PROGRAM, str(starts), *arguments]
@@ -34,7 +34,7 @@ def run(starts: Path, tunables: str | None, *arguments: str) -> tuple[list[str],
     ("before", "after"),
     [(None, HUGE_PAGES), ("glibc.malloc.check=1", f"glibc.malloc.check=1:{HUGE_PAGES}")],
 )
-def test_starts_once_more_as_the_same_process_with_the_same_arguments(
+def test_restarts_once_as_the_same_process_with_the_same_arguments(
     tmp_path: Path, before: str | None, after: str
 ) -> None:
     lines, starts = run(tmp_path / "starts", before, "--flag", "two words", "")
@@ -43,7 +43,7 @@ def test_starts_once_more_as_the_same_process_with_the_same_arguments(
     assert len(set(starts)) == 1
 
 
-def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
+def test_a_tunable_that_the_user_set_stays(tmp_path: Path) -> None:
     lines, starts = run(tmp_path / "starts", "glibc.malloc.hugetlb=0", "a")
     assert lines == ["glibc.malloc.hugetlb=0", "a"]
     assert len(starts) == 1

@@ -18,7 +18,7 @@ from tests.training.toy import Regression, train
 
 LOOP = LoopConfig(steps=2, batch_size=2, log_every=1, checkpoint_every=1, placement="jit")
 
-# Orbax leaves other reads under way when one fails; their errors come up when they are collected.
+# When one read fails, orbax leaves others running; their errors are raised when they are garbage-collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
@@ -45,7 +45,7 @@ def truncate_largest(directory: Path) -> None:
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
 
 
-def test_all_of_a_state_comes_back(tmp_path: Path) -> None:
+def test_a_whole_state_is_restored(tmp_path: Path) -> None:
     state = create_state(Regression(), replace(LOOP, ema=0.5)).replace(step=jax.numpy.int32(7))  # type: ignore[attr-defined]
     checkpoints = Checkpoints(tmp_path)
     assert checkpoints.latest() is None
@@ -66,7 +66,7 @@ def test_a_checkpoint_of_another_architecture_is_named(trained: Path, change: di
     assert "\n" not in str(raised.value)
 
 
-def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(
+def test_training_resumes_from_the_checkpoint_before_a_damaged_one(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = train(LOOP, trained)
@@ -76,7 +76,7 @@ def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(
     assert {path.name for path in (trained / "checkpoints").iterdir()} == {"1", "2", "bad-2"}
 
 
-def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_and_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     state = create_state(Regression(), LOOP)
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     usage = module.shutil.disk_usage(tmp_path)
@@ -93,7 +93,7 @@ def test_a_full_disk_is_named_and_nothing_is_begun(tmp_path: Path, monkeypatch: 
     save_weights(tmp_path / "weights", {"w": np.zeros(4, np.float32)})
 
 
-def test_weights_alone_come_back_and_may_be_written_again(tmp_path: Path) -> None:
+def test_weights_alone_are_restored_and_may_be_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "weights"
     for seed in (1, 2):
         weights = Regression().init(jax.random.key(seed))

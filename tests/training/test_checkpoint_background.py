@@ -28,20 +28,22 @@ def assert_newest(directory: Path, step: int, size: int = 1000) -> None:
 
 
 @pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+def may_finish(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """No checkpoint is finished before this event is set."""
-    release, finish = threading.Event(), module.write_checksums
+    event, finish = threading.Event(), module.write_checksums
 
     def wait_and_finish(*arguments: Any) -> None:
-        assert release.wait(60)
+        assert event.wait(60)
         finish(*arguments)
 
     monkeypatch.setattr(module, "write_checksums", wait_and_finish)
-    yield release
-    release.set()
+    yield event
+    event.set()
 
 
-def test_training_goes_on_and_overwrites_the_state_while_it_is_written(tmp_path: Path, held: threading.Event) -> None:
+def test_training_continues_and_overwrites_the_state_while_it_is_written(
+    tmp_path: Path, may_finish: threading.Event
+) -> None:
     train = jax.jit(lambda state: jax.tree.map(lambda x: 3 * x + 1, state), donate_argnums=0)
     now = {"w": jnp.arange(2.0**20), "b": {"n": jnp.int32(5), "x": jnp.ones((3, 2**16))}}
     saved = jax.tree.map(lambda x: np.array(x, copy=True), now)
@@ -51,7 +53,7 @@ def test_training_goes_on_and_overwrites_the_state_while_it_is_written(tmp_path:
         now = train(now)
     jax.block_until_ready(now)
     assert not (tmp_path / "1").exists()
-    held.set()
+    may_finish.set()
     checkpoints.wait()
     assert (tmp_path / "1").exists()
     restored, _ = checkpoints.restore(now)
@@ -59,12 +61,12 @@ def test_training_goes_on_and_overwrites_the_state_while_it_is_written(tmp_path:
     jax.tree.map(np.testing.assert_array_equal, restored, saved)
 
 
-def test_host_arrays_may_change_while_they_are_written(tmp_path: Path, held: threading.Event) -> None:
+def test_host_arrays_may_change_while_they_are_written(tmp_path: Path, may_finish: threading.Event) -> None:
     now = {"w": np.arange(1000.0, dtype=np.float32)}
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, now, {})
     now["w"][:] = 0
-    held.set()
+    may_finish.set()
     restored, _ = checkpoints.restore(now)
     checkpoints.close()
     np.testing.assert_array_equal(restored["w"], np.arange(1000.0))

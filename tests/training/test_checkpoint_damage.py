@@ -44,7 +44,7 @@ WAYS: tuple[Callable[[Path, float], None], ...] = (truncate, flip, delete)
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("checkpoints")
     checkpoints = Checkpoints(directory)
     for step in STEPS:
@@ -54,8 +54,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(written: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(written, tmp_path / "copy"))
+def copy(intact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(intact, tmp_path / "copy"))
 
 
 def files(checkpoint: Path) -> list[Path]:
@@ -64,46 +64,46 @@ def files(checkpoint: Path) -> list[Path]:
 
 def restored(directory: Path) -> tuple[int, str]:
     """Restores the newest step, which has to be as it was saved. Returns it and the output."""
-    checkpoints, said = Checkpoints(directory), io.StringIO()
-    with contextlib.redirect_stdout(said):
+    checkpoints, output = Checkpoints(directory), io.StringIO()
+    with contextlib.redirect_stdout(output):
         got, data = checkpoints.restore(state(0))
     checkpoints.close()
     jax.tree.map(np.testing.assert_array_equal, got, state(data["next"]))
-    return data["next"], said.getvalue()
+    return data["next"], output.getvalue()
 
 
 @given(which=st.floats(0, 0.999), way=st.sampled_from(WAYS), share=st.floats(0, 0.999))
 @settings(max_examples=25, deadline=None)
-def test_damage_is_harmless_or_the_checkpoint_before_is_used(
-    written: Path, which: float, way: Callable[[Path, float], None], share: float
+def test_damage_is_harmless_or_the_older_checkpoint_is_used(
+    intact: Path, which: float, way: Callable[[Path, float], None], share: float
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        directory = Path(shutil.copytree(written, Path(folder) / "copy"))
+        directory = Path(shutil.copytree(intact, Path(folder) / "copy"))
         damaged = files(directory / "2")[int(which * len(files(directory / "2")))]
         way(damaged, share)
-        step, said = restored(directory)
+        step, output = restored(directory)
         if step == 2:
             # Orbax's notes at the top are not read; a bit of the checksums' JSON may not matter.
             assert damaged.parent == directory / "2"
-            assert said == ""
+            assert output == ""
         else:
             assert step == 1
-            assert f"checkpoint 2 is damaged ({damaged.relative_to(directory / '2')}: " in said
-            assert f"resuming from that of step 1; kept as {directory}/bad-2" in said
-            assert said.count("\n") == 1
+            assert f"checkpoint 2 is damaged ({damaged.relative_to(directory / '2')}: " in output
+            assert f"resuming from that of step 1; kept as {directory}/bad-2" in output
+            assert output.count("\n") == 1
 
 
-def test_damage_of_any_file_in_a_folder_is_detected(written: Path, copy: Path) -> None:
-    inner = [path for path in files(written / "2") if path.parent != written / "2"]
+def test_damage_of_any_file_in_a_folder_is_detected(intact: Path, copy: Path) -> None:
+    inner = [path for path in files(intact / "2") if path.parent != intact / "2"]
     assert len(inner) > 5
     assert find_fault(copy / "2") is None
     for path in inner:
         for way in WAYS:
             for share in (0.0, 0.5, 0.999):
-                there = copy / path.relative_to(written)
-                way(there, share)
-                assert str(path.relative_to(written / "2")) in str(find_fault(copy / "2"))
-                shutil.copy(path, there)
+                target = copy / path.relative_to(intact)
+                way(target, share)
+                assert str(path.relative_to(intact / "2")) in str(find_fault(copy / "2"))
+                shutil.copy(path, target)
 
 
 def test_every_flipped_bit_of_the_checksums_is_detected_or_harmless(copy: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_checkpoint_of_an_earlier_version_is_still_checked(copy: Path) -> None
 
 def test_after_a_fall_back_the_same_step_can_be_saved_again(copy: Path) -> None:
     delete(copy / "2" / "data" / "metadata", 0)
-    (copy / "bad-2").mkdir()  # of an earlier time
+    (copy / "bad-2").mkdir()  # of an earlier resume
     checkpoints = Checkpoints(copy)
     assert checkpoints.restore(state(0))[1] == {"next": 1}
     assert checkpoints.steps() == [1]
@@ -140,7 +140,7 @@ def test_after_a_fall_back_the_same_step_can_be_saved_again(copy: Path) -> None:
     assert find_fault(copy / "bad-2") == "data/metadata: No such file or directory"
 
 
-def test_where_all_are_damaged_it_stops_each_time_and_moves_nothing(copy: Path) -> None:
+def test_if_all_are_damaged_it_stops_each_time_and_moves_nothing(copy: Path) -> None:
     for step in STEPS:
         truncate(copy / str(step) / "data" / "metadata", 0.5)
     for _ in range(2):
@@ -154,14 +154,14 @@ def test_where_all_are_damaged_it_stops_each_time_and_moves_nothing(copy: Path) 
     assert sorted(path.name for path in copy.iterdir()) == ["1", "2"]
 
 
-def test_without_a_checkpoint_there_is_nothing_to_restore(tmp_path: Path) -> None:
+def test_without_a_checkpoint_restore_fails(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path)
     with pytest.raises(CheckpointError, match=rf"{tmp_path}: no checkpoint can be read \(there is none\)"):
         checkpoints.restore(state(0))
     checkpoints.close()
 
 
-def test_another_architecture_is_no_damage(copy: Path) -> None:
+def test_another_architecture_is_not_damage(copy: Path) -> None:
     checkpoints = Checkpoints(copy)
     for other in (state(0) | {"w": jnp.zeros(3)}, {"w": jnp.zeros(1000)}, state(0) | {"more": jnp.zeros(1)}):
         with pytest.raises(CheckpointError, match=rf"{copy}/2: does not fit this configuration .*, the configuration"):

@@ -23,20 +23,20 @@ def write(directory: Path, start: int, steps: range) -> None:
 
 
 def events(path: Path) -> list[Event]:
-    """A TensorBoard file's events, read by its format: length, its checksum, event, its checksum."""
-    data, found = path.read_bytes(), []
+    """Reads a TensorBoard file's events by its format: length, its checksum, event, its checksum."""
+    data, read = path.read_bytes(), []
     while data:
         (size,), head = struct.unpack("<Q", data[:8]), data[:8]
         body = data[12 : 12 + size]
         assert struct.unpack("<I", data[8:12])[0] == masked_crc32c(head)
         assert struct.unpack("<I", data[12 + size : 16 + size])[0] == masked_crc32c(body)
-        found.append(Event.FromString(body))
+        read.append(Event.FromString(body))
         data = data[16 + size :]
-    return found
+    return read
 
 
-def on_board(directory: Path) -> list[tuple[int, dict[str, Any]]]:
-    """What TensorBoard shows: files in the order of their names, each start taking back what it does again."""
+def in_tensorboard(directory: Path) -> list[tuple[int, dict[str, Any]]]:
+    """Returns what TensorBoard shows: it reads files in the order of their names; each start hides repeated steps."""
     shown: list[tuple[int, dict[str, Any]]] = []
     for path in sorted((directory / "tensorboard").iterdir()):
         for event in events(path):
@@ -47,19 +47,19 @@ def on_board(directory: Path) -> list[tuple[int, dict[str, Any]]]:
     return shown
 
 
-def test_what_was_logged_is_read(tmp_path: Path) -> None:
+def test_logged_rows_are_read(tmp_path: Path) -> None:
     assert read_log(tmp_path) == []
     write(tmp_path, 0, range(1, 4))
     assert read_log(tmp_path) == [{"step": step, "loss": 1 / step} for step in range(1, 4)]
 
 
-def test_a_resumed_log_drops_what_will_be_done_again(tmp_path: Path) -> None:
+def test_a_resumed_log_drops_steps_that_will_be_repeated(tmp_path: Path) -> None:
     write(tmp_path, 0, range(1, 8))
     write(tmp_path, 4, range(5, 7))
     assert [row["step"] for row in read_log(tmp_path)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_torn_last_line_is_left_out_and_cured_on_resume(tmp_path: Path) -> None:
+def test_a_torn_last_line_is_left_out_and_repaired_on_resume(tmp_path: Path) -> None:
     write(tmp_path, 0, range(1, 4))
     path = tmp_path / NAME
     path.write_bytes(path.read_bytes()[:-9])
@@ -70,13 +70,13 @@ def test_a_torn_last_line_is_left_out_and_cured_on_resume(tmp_path: Path) -> Non
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(1, 4)), min_size=1, max_size=4))
 @settings(max_examples=20, deadline=None)
-def test_tensorboard_shows_what_the_log_holds(
+def test_tensorboard_shows_the_same_as_the_log(
     tmp_path_factory: pytest.TempPathFactory, starts: list[tuple[int, int]]
 ) -> None:
     directory = tmp_path_factory.mktemp("log")
     for start, count in starts:
         write(directory, start, range(start + 1, start + 1 + count))
-    shown = [(step, values["loss"].simple_value) for step, values in on_board(directory)]
+    shown = [(step, values["loss"].simple_value) for step, values in in_tensorboard(directory)]
     assert shown == [(row["step"], np.float32(row["loss"])) for row in read_log(directory)]
 
 
@@ -84,12 +84,12 @@ def test_scalars_and_pictures_are_in_tensorboards_file_before_the_log_is_closed(
     with ScalarLog(tmp_path, 0) as log:
         log.write(3, {"loss": 0.5, "held_out/psnr": 21.25})
         log.image(3, "clip_000", PICTURE)
-        (scalars, picture) = (values for _, values in on_board(tmp_path))
+        (scalars, picture) = (values for _, values in in_tensorboard(tmp_path))
     assert {tag: value.simple_value for tag, value in scalars.items()} == {"loss": 0.5, "held_out/psnr": 21.25}
     assert (picture["clip_000"].image.height, picture["clip_000"].image.width) == PICTURE.shape[:2]
 
 
-def test_a_picture_is_kept_as_it_is_under_its_step(tmp_path: Path) -> None:
+def test_an_image_is_saved_unchanged_under_its_step(tmp_path: Path) -> None:
     with ScalarLog(tmp_path, 0) as log:
         log.image(20, "clip_000", PICTURE)
     (path,) = (tmp_path / "pictures").iterdir()
@@ -97,13 +97,13 @@ def test_a_picture_is_kept_as_it_is_under_its_step(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(Image.open(path)), PICTURE)
 
 
-def test_what_measures_the_machine_is_not_in_the_curve(tmp_path: Path) -> None:
+def test_machine_measurements_are_not_in_the_curve(tmp_path: Path) -> None:
     with ScalarLog(tmp_path, 0) as log:
         log.write(1, {"loss": 0.5} | dict.fromkeys(MEASURED, 1.0))
     assert read_curve(tmp_path) == [{"step": 1, "loss": 0.5}]
 
 
-def test_a_full_disk_is_told_at_the_step_that_it_cuts_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_at_its_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step = 0
 
     def training() -> None:

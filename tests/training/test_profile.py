@@ -55,7 +55,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
         (0, 20, 0, []),
     ],
 )
-def test_so_many_steps_are_traced_after_the_first_ones(
+def test_count_steps_are_traced_after_the_first_ones(
     recorder: Recorder, tmp_path: Path, start: int, last: int, count: int, traced: list[int]
 ) -> None:
     recorder.run(Profile.after(tmp_path, start, last, count), start + 1, last)
@@ -71,7 +71,7 @@ def test_an_error_passes_and_ends_the_trace(recorder: Recorder, tmp_path: Path) 
     assert not recorder.running
 
 
-def test_trouble_with_the_trace_does_not_hide_the_error(
+def test_an_error_of_the_trace_does_not_hide_the_one_under_way(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def full() -> None:
@@ -88,7 +88,7 @@ def test_only_the_lead_process_traces(recorder: Recorder, monkeypatch: pytest.Mo
     assert not recorder.starts
 
 
-def test_a_real_trace_holds_the_steps_asked_for_and_its_place_is_told(
+def test_a_real_trace_has_the_requested_steps_and_its_path_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     step_fn, x = jax.jit(lambda x: jnp.sin(x @ x)), jnp.ones((8, 8))
@@ -98,8 +98,8 @@ def test_a_real_trace_holds_the_steps_asked_for_and_its_place_is_told(
             with jax.profiler.StepTraceAnnotation("train", step_num=step):
                 x = step_fn(x)
     (path,) = tmp_path.rglob("perfetto_trace.json.gz")
-    told = capsys.readouterr().out
-    assert str(path) in told and "https://ui.perfetto.dev" in told
+    printed = capsys.readouterr().out
+    assert str(path) in printed and "https://ui.perfetto.dev" in printed
     events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     named = [event for event in events if event.get("name") == "train"]
     assert {int(event["args"]["step_num"]) for event in named} == {2, 3}
@@ -114,7 +114,7 @@ def test_memory_is_that_of_the_fullest_device(monkeypatch: pytest.MonkeyPatch) -
     assert memory_scalars().items() >= {"device_gib": 1.5, "device_peak_gib": 3.0}.items()
 
 
-def test_memory_of_a_device_that_does_not_tell_is_the_process_and_grows_by_what_is_taken(
+def test_memory_of_a_device_without_counts_is_the_process_and_grows_by_an_allocation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(memory.jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: None)])

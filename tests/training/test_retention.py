@@ -38,19 +38,19 @@ def state(step: int) -> dict[str, Any]:
     return {"w": jnp.full(3, float(step))}
 
 
-def test_the_best_is_kept_and_known_again_after_a_restart(tmp_path: Path) -> None:
-    left = {1: [1], 2: [2], 3: [2, 3], 4: [2, 4], 5: [2, 4, 5], 6: [4, 6]}
+def test_the_best_is_kept_also_after_a_restart(tmp_path: Path) -> None:
+    expected = {1: [1], 2: [2], 3: [2, 3], 4: [2, 4], 5: [2, 4, 5], 6: [4, 6]}
     metrics = {1: 0.7, 2: 0.5, 3: None, 4: float("nan"), 5: 0.6, 6: 0.1}
-    for step in left:
+    for step in expected:
         checkpoints = Checkpoints(tmp_path, keep_last=1, keep_every=4, keep_best=True)
         checkpoints.save(step, state(step), {}, metrics[step])
-        assert checkpoints.steps() == left[step]
+        assert checkpoints.steps() == expected[step]
         assert checkpoints.latest() == step
         checkpoints.close()
-        assert sorted(int(path.name) for path in tmp_path.iterdir()) == left[step]
+        assert sorted(int(path.name) for path in tmp_path.iterdir()) == expected[step]
 
 
-def test_a_step_that_was_saved_stays_as_it_was(tmp_path: Path) -> None:
+def test_a_saved_step_is_not_overwritten(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, state(1), {"next": 1})
     checkpoints.save(1, state(2), {"next": 2})

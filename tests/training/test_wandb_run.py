@@ -1,4 +1,4 @@
-"""Weights & Biases: what it is given, over interruptions and failures, by a module that records calls."""
+"""Weights & Biases, through interruptions and failures, with a module that records calls."""
 
 import importlib
 import importlib.util
@@ -35,7 +35,7 @@ class Run:
 
 
 class Stub(SimpleNamespace):
-    """The part of ``wandb`` that is used."""
+    """The used part of ``wandb``."""
 
     def __init__(self) -> None:
         super().__init__(runs=[], Image=lambda image: ("image", image.shape), Settings=lambda **values: values)
@@ -61,7 +61,7 @@ def stage(tmp_path: Path) -> Path:
     return directory
 
 
-def test_it_gets_the_runs_configuration_scalars_and_pictures(wandb: Stub, stage: Path) -> None:
+def test_it_gets_the_runs_configuration_scalars_and_images(wandb: Stub, stage: Path) -> None:
     with ScalarLog(stage, 0, wandb="robots") as log:
         log.write(1, {"loss": 0.5})
         log.image(1, "clip_000", np.zeros((4, 6, 3), np.uint8))
@@ -73,7 +73,7 @@ def test_it_gets_the_runs_configuration_scalars_and_pictures(wandb: Stub, stage:
     assert run.exit_code == 0
 
 
-def test_a_resumed_run_goes_on_in_the_same_one_and_another_project_or_a_new_beginning_does_not(
+def test_a_resumed_run_continues_the_same_one_but_another_project_or_a_fresh_start_does_not(
     wandb: Stub, stage: Path
 ) -> None:
     for start, project, resume in ((0, "robots", True), (4, "robots", True), (4, "arms", True), (0, "arms", False)):
@@ -85,7 +85,7 @@ def test_a_resumed_run_goes_on_in_the_same_one_and_another_project_or_a_new_begi
     assert {run.options["resume"] for run in wandb.runs} == {"allow"}
 
 
-def test_without_a_project_it_is_not_touched(wandb: Stub, stage: Path) -> None:
+def test_without_a_project_it_is_not_used(wandb: Stub, stage: Path) -> None:
     with ScalarLog(stage, 0) as log:
         log.write(1, {"loss": 0.5})
     assert not wandb.runs and not (stage / "wandb.json").exists()
@@ -97,7 +97,7 @@ def test_a_failed_training_is_shown_as_one(wandb: Stub, stage: Path) -> None:
     assert wandb.runs[0].exit_code == 1
 
 
-def test_when_it_breaks_training_goes_on_and_that_is_told_once(
+def test_when_it_fails_training_continues_and_a_note_says_so_once(
     wandb: Stub, stage: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with ScalarLog(stage, 0, wandb="robots") as log:
@@ -105,23 +105,23 @@ def test_when_it_breaks_training_goes_on_and_that_is_told_once(
         for step in (1, 2):
             log.write(step, {"loss": 0.5})
     assert [row["step"] for row in read_log(stage)] == [1, 2]
-    told = capsys.readouterr().out
-    assert told.count("Weights & Biases is off until the next start (the service is gone); training continues") == 1
+    printed = capsys.readouterr().out
+    assert printed.count("Weights & Biases is off until the next start (the service is gone); training continues") == 1
 
 
-def test_when_it_cannot_start_the_cure_is_one_line(wandb: Stub, stage: Path) -> None:
+def test_when_it_cannot_start_the_error_is_one_line_with_the_cure(wandb: Stub, stage: Path) -> None:
     def refuses(**_: Any) -> None:
         raise ValueError("api_key not configured (no-tty).\nSee the manual")
 
     wandb.init = refuses  # type: ignore[assignment, method-assign]
-    with pytest.raises(WandbError, match=r"cannot start \(api_key not configured.*WANDB_MODE=offline") as told:
+    with pytest.raises(WandbError, match=r"cannot start \(api_key not configured.*WANDB_MODE=offline") as raised:
         ScalarLog(stage, 0, wandb="robots")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("found", [None, SimpleNamespace()], ids=["nothing", "its own directory of files"])
-def test_where_it_is_not_installed_the_install_line_is_told(monkeypatch: pytest.MonkeyPatch, found: Any) -> None:
-    monkeypatch.setitem(sys.modules, "wandb", found)
+@pytest.mark.parametrize("module", [None, SimpleNamespace()], ids=["nothing", "its own directory of files"])
+def test_without_the_package_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch, module: Any) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", module)
     with pytest.raises(WandbError, match=r"pip install 'rsjax\[wandb\]'"):
         find_wandb()
 
