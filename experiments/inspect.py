@@ -1,4 +1,4 @@
-"""What is in a store of clips or tokens. ``python -m experiments.inspect STORE``"""
+"""Shows the contents of a store of clips or tokens. ``python -m experiments.inspect STORE``"""
 
 import sys
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ class Options:
     """Options of this command."""
 
     records: int = 200
-    """How many records are read, spread evenly; counts, tasks and difficulties are of all."""
+    """How many records to read, spread evenly; counts, tasks and difficulties are of all."""
     sheet: Path | None = None
-    """Where the sheet of pictures is written; STORE-sheet.png beside the store if not given."""
+    """File for the sheet of pictures; STORE-sheet.png beside the store if not given."""
     clips: int = 12
-    """Of the sheet, and of the viewer."""
+    """How many clips to show on the sheet and in the viewer."""
     rerun: bool = False
-    """Open clips with RGB, depth and tracks in the Rerun viewer (pip install 'rsjax[rerun]')."""
+    """Open the clips with RGB, depth and tracks in the Rerun viewer (pip install 'rsjax[rerun]')."""
     rerun_file: Path | None = None
-    """Write them here for the viewer instead; `rerun FILE` opens them."""
+    """Write the clips to this file instead; `rerun FILE` opens it."""
 
 
 @main_errors()
 def main() -> None:
-    """Prints, and writes a sheet of pictures."""
+    """Prints the contents and writes a sheet of pictures."""
     argv = sys.argv[1:]
     if not argv or (argv[0].startswith("-") and not {"-h", "--help"} & {*argv}):
         raise ConfigError(f"name a store first; usage: {PROG} STORE [--sheet FILE] [--rerun | --rerun-file FILE]")
@@ -39,14 +39,14 @@ def main() -> None:
     assert place is not None
     from PIL import Image
 
-    from rsjax.data.inspect import contact_sheet, look, render
-    from rsjax.data.rerun_view import rerun_view
     from rsjax.data.store import open_store
     from rsjax.files import disk_guard
+    from rsjax.report.contents import contact_sheet, describe
+    from rsjax.report.rerun_view import rerun_view
 
     store = open_store(place)
-    contents = look(store, options.records)
-    print(*[f"store     {place.absolute()} ({store.manifest.get('kind')})", *render(contents)], sep="\n")
+    lines, damaged = describe(store, options.records)
+    print(f"store     {place.absolute()} ({store.manifest.get('kind')})", *lines, sep="\n")
     if store.manifest.get("kind") == "clips":
         sheet = (options.sheet or place.absolute().with_name(f"{place.absolute().name}-sheet.png")).absolute()
         with disk_guard(sheet):
@@ -56,8 +56,8 @@ def main() -> None:
         for message in rerun_view(store, options.clips, options.rerun_file):
             print(f"left out: {message}")
     if options.rerun_file:
-        print(f"for the viewer: {options.rerun_file.absolute()}")
-    if contents.damaged:
+        print(f"viewer file: {options.rerun_file.absolute()}")
+    if damaged:
         raise SystemExit(1)
 
 

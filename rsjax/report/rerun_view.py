@@ -1,4 +1,4 @@
-"""Clips in the Rerun viewer: pictures, depth, tracks and actions over frames. Needs the extra ``rsjax[rerun]``."""
+"""Clips for the Rerun viewer: pictures, depth, tracks and actions by frame. Needs the extra ``rsjax[rerun]``."""
 
 import os
 import sys
@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 from rsjax.data.codec import Record
-from rsjax.data.inspect import sampled
-from rsjax.data.store import Store, StoreError
+from rsjax.data.store import Store
 from rsjax.errors import UserError, first_line
+from rsjax.report.contents import clips_of
 
 TIMELINE = "frame"
 
 
 def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[str]:
-    """Opens some clips in the viewer, or writes them for it: ``rerun FILE.rrd`` opens those.
+    """Opens some clips in the viewer, or writes them to a file that ``rerun FILE.rrd`` opens.
 
     Clip n is the entity ``clip_00n``: below it ``camera``, ``camera/tracks`` (the visible points, in pixels),
-    ``depth`` (where there is any; in metres if its provenance says so), ``actions``, and once ``task``.
+    ``depth`` (if it has any; in metres if its provenance says so), ``actions``, and once ``task``.
 
     Args:
-        store: of clips.
-        clips: how many, spread evenly over the store.
+        store: a store of clips.
+        clips: how many clips, spread evenly over the store.
         file: written instead of opening the viewer.
 
     Returns:
@@ -42,35 +42,31 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     damaged, shown = list[str](), 0
     recording = rerun.RecordingStream("rsjax")
     with _reported(file):
-        for _, _, record in sampled(store, clips, damaged):
-            if record["rgb"].ndim != 4:
-                raise StoreError(f"{store.path}: holds tokens, not pictures; open the store of clips that they are of")
+        for _, _, record in clips_of(store, clips, damaged):
             if not shown:
                 _spawn(recording) if file is None else recording.save(file)
             _log_clip(rerun, recording, f"clip_{shown:03d}", record)
             shown += 1
         recording.flush()
         recording.disconnect()
-    if not shown:
-        raise StoreError(f"{store.path}: no clip can be read{f' ({damaged[0]})' if damaged else ''}; make it again")
     return damaged
 
 
 @contextmanager
 def _reported(file: Path | None) -> Iterator[None]:
-    """What Rerun raises where its viewer or its file fails it, as a :class:`UserError`."""
+    """Turns the errors of Rerun's viewer and of its file into a :class:`UserError`."""
     try:
         yield
     except (OSError, RuntimeError) as error:
-        told = first_line(error)
+        reason = first_line(error)
         if file is None:
             cure = "it needs a screen; write a file for one elsewhere with --rerun-file"
-            raise UserError(f"the Rerun viewer does not answer ({told}); {cure}") from error
-        raise UserError(f"{file}: cannot be written ({told}); choose another place") from error
+            raise UserError(f"the Rerun viewer does not answer ({reason}); {cure}") from error
+        raise UserError(f"{file}: cannot be written ({reason}); choose another place") from error
 
 
 def _spawn(recording: Any) -> None:
-    """Rerun looks for its viewer on the path; beside this Python it is also where no environment was activated."""
+    """Opens the viewer; searches for it on the path and beside this Python, whose environment may be inactive."""
     before = os.environ.get("PATH", "")
     os.environ["PATH"] = os.pathsep.join(filter(None, (before, str(Path(sys.executable).parent))))
     try:
@@ -89,6 +85,6 @@ def _log_clip(rerun: Any, recording: Any, name: str, record: Record) -> None:
             depth = rerun.DepthImage(record["depth"][frame], meter=1.0 if metres else None)
             recording.log(f"{name}/depth", depth)
         seen = np.flatnonzero(record["visible"][:, frame])
-        places = record["tracks"][seen, frame] * (rgb.shape[1], rgb.shape[0])
-        recording.log(f"{name}/camera/tracks", rerun.Points2D(places, keypoint_ids=seen.astype(np.uint16)))
+        pixels = record["tracks"][seen, frame] * (rgb.shape[1], rgb.shape[0])
+        recording.log(f"{name}/camera/tracks", rerun.Points2D(pixels, keypoint_ids=seen.astype(np.uint16)))
         recording.log(f"{name}/actions", rerun.Scalars(record["actions"][frame]))

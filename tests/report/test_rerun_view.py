@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsjax.data.rerun_view import TIMELINE, rerun_view
 from rsjax.data.store import StoreError, open_store, write_store
 from rsjax.errors import UserError
+from rsjax.report.rerun_view import TIMELINE, rerun_view
 from tests.data.clips import clip, clip_store
 
 

@@ -5,33 +5,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.data.inspect import contact_sheet, histogram, look, motion_of, render, sampled
 from rsjax.data.store import StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokens_key
+from rsjax.report.contents import contact_sheet, describe, histogram, motion_of, sampled
 from tests.data.clips import clip, clip_store
 
 CAPTION = 16  # pixels above each clip
 
 
-def test_counts_words_and_shapes_are_those_of_the_store(tmp_path: Path) -> None:
-    store = clip_store(tmp_path / "a", 0, 7, [1.0, 2.0])
-    contents = look(store)
-    assert contents.splits == {"train": 7, "test": 2}
-    assert contents.words == {
-        "task": {"task 0": 4, "task 1": 3, "task 2": 2},
-        "difficulty": {"simple": 5, "difficult": 4},
-    }
-    assert contents.lengths == {4: 9} and contents.depth == (9, 9) and not contents.damaged
-    assert contents.shapes["rgb"] == "uint8 (4, 8, 8, 3)"
-    np.testing.assert_allclose(contents.motion, 100 * 0.01 * np.sqrt(2), rtol=1e-5)
-    assert contents.actions is not None and contents.actions[0] == 3
-    told = "\n".join(render(contents))
-    assert "train 7, test 2" in told and "'simple' 5×, 'difficult' 4×" in told and "4 frames 9×" in told
+def test_counts_labels_and_shapes_are_those_of_the_store(tmp_path: Path) -> None:
+    lines, damaged = describe(clip_store(tmp_path / "a", 0, 7, [1.0, 2.0]))
+    assert not damaged
+    assert {
+        "splits    train 7, test 2",
+        "task      'task 0' 4×, 'task 1' 3×, 'task 2' 2×",
+        "difficulty 'simple' 5×, 'difficult' 4×",
+        "rgb       uint8 (4, 8, 8, 3)",
+        "depth     in 9 of 9 records read",
+        "lengths   4 frames 9×",
+    } <= {*lines}
+    (actions,) = [line for line in lines if "dimensions" in line]
+    assert actions.startswith("actions   3 dimensions, ")
+    (tracks,) = [line for line in lines if "% of a side per frame" in line]
+    assert tracks.startswith("tracks    ") and tracks.endswith("median 1.41")  # 0.01 right and down
 
 
 def test_only_so_many_records_are_read(tmp_path: Path) -> None:
-    contents = look(clip_store(tmp_path / "a"), most=3)
-    assert len(contents.motion) == 3 and contents.splits["train"] == 6
+    lines, _ = describe(clip_store(tmp_path / "a"), most=3)
+    assert {"depth     in 0 of 3 records read", "splits    train 6, test 2"} <= {*lines}
 
 
 def test_motion_counts_only_what_is_seen_twice() -> None:
@@ -49,8 +50,8 @@ def test_a_damaged_record_is_told_and_the_others_are_shown(tmp_path: Path) -> No
     payload = bytearray(shard.read_bytes())
     payload[len(payload) // 2 :] = bytes(len(payload) - len(payload) // 2)
     shard.write_bytes(payload)
-    contents = look(store)
-    assert contents.damaged and "test-00000" in contents.damaged[0]
+    lines, damaged = describe(store)
+    assert "test-00000" in damaged[0] and f"damaged   {damaged[0]}" in lines
     assert len(contact_sheet(store)) > 0
 
 
@@ -66,7 +67,7 @@ def test_what_the_manifest_and_the_clips_say_of_their_origin_is_told(tmp_path: P
     clip_store(tmp_path / "b" / FOLDER / "abc", count=3, kind="tokens")
     tokens = tmp_path / "b" / FOLDER / "set"
     write_store(tokens, "tokens", {"train": records}, {"key": tokens_key("b", "set")})
-    told = render(look(open_store(tmp_path / "b")))
+    told, _ = describe(open_store(tmp_path / "b"))
     for line in (
         "tokens    set: train 3",
         "episodes  train 2, test 0",
@@ -87,7 +88,8 @@ def test_a_merged_store_tells_what_was_left_out_of_its_parts(tmp_path: Path) -> 
     write_store(
         tmp_path / "b", "clips", {"train": records}, {"filtered": {"x": "still"}, "quarantine": {"y": "", "z": ""}}
     )
-    assert look(open_store(tmp_path / "b")).left_out == {"episodes without a clip": 1, "episodes quarantined": 2}
+    lines, _ = describe(open_store(tmp_path / "b"))
+    assert "left out  episodes without a clip 1, episodes quarantined 2" in lines
 
 
 @pytest.mark.parametrize("depth_range", [None, [1.0, 2.0]])

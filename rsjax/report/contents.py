@@ -1,0 +1,215 @@
+"""The contents of a store: counts, shapes and histograms as text, and clips as a sheet of pictures.
+
+Axes: T frames, H×W pixels, n pictures.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rsjax.data.codec import Record
+from rsjax.data.depth_color import depth_to_color
+from rsjax.data.store import NO_ARRAY, Store, StoreError
+from rsjax.data.token_sets import token_sets
+
+BARS = " ▁▂▃▄▅▆▇█"
+GAP = 4  # pixels between pictures
+CAPTION = 16  # pixels high
+BACKGROUND = 30
+MOST_DIMENSIONS = 32  # of actions whose means are listed one by one
+MOST_WORDS = 10  # of a column's labels
+TRACK_UNIT = "% of a side per frame"
+MOTION_UNIT = "px/s of a 256-pixel-wide picture (as --windows.least-motion)"
+
+
+def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
+    """Describes a store of clips or of tokens.
+
+    Args:
+        most: how many records are read, spread evenly over the splits; counts and labels are of all.
+
+    Returns:
+        Lines of text, and the messages of damaged records, which the lines include.
+    """
+    damaged: list[str] = []
+    lengths, cameras, rates = Counter[int](), Counter[str](), Counter[str]()
+    tracks, speeds, actions, deep = list[float](), list[float](), list[np.ndarray](), 0
+    for _, _, record in sampled(store, most, damaged):
+        provenance = record["provenance"]
+        lengths[len(record["actions"])] += 1
+        tracks.append(motion_of(record))
+        speeds += [provenance["motion"]] if "motion" in provenance else []
+        cameras.update([provenance["camera"]] if "camera" in provenance else [])
+        rates.update(_rate(provenance))
+        actions.append(record["actions"][1:])
+        deep += record.get("depth") is not None
+    manifest = store.manifest
+    episodes = {split: len(ids) for split, ids in manifest.get("episodes", {}).items()}
+    units = [
+        f"{mean:.3g}±{std:.2g}"
+        for mean, std in zip(manifest.get("action_mean", []), manifest.get("action_std", []), strict=False)
+    ]
+    lines = [("splits", _counted(store.counts()))]
+    lines += [("tokens", f"{key}: {_counted(tokens.counts())}") for key, tokens in token_sets(store).items()]
+    lines += [
+        ("episodes", _counted(episodes)),
+        ("left out", _counted(left_out(manifest))),
+        ("cameras", _counted(cameras)),
+    ]
+    lines += [("rate", f"{rate} {count}×") for rate, count in rates.items()]
+    lines += [(name, shape) for name, shape in ({} if damaged else store.shapes()).items() if shape != NO_ARRAY]
+    lines += [
+        ("actions", _ranges(actions)),
+        ("mean±std", ", ".join(units) if len(units) <= MOST_DIMENSIONS else ""),
+        ("depth", f"in {deep} of {len(tracks)} records read"),
+        ("lengths", ", ".join(f"{length} frames {count}×" for length, count in sorted(lengths.items()))),
+        ("tracks", histogram(tracks, TRACK_UNIT)),
+        ("motion", histogram(speeds, MOTION_UNIT) if speeds else ""),
+    ]
+    lines += [(column, _ranked(words)) for column, words in _words(store).items()]
+    lines += [("damaged", message) for message in damaged]
+    return [f"{name:<9} {text}" for name, text in lines if text], damaged
+
+
+def left_out(manifest: Mapping[str, Any]) -> dict[str, int]:
+    """Returns how much is not in a store, by reason; of a merged store, which has no counts, only its episodes."""
+    counts = manifest.get("counts", {})
+    reasons = {
+        "episodes without a clip": counts.get("without", len(manifest.get("filtered", {}))),
+        "episodes quarantined": counts.get("quarantined", len(manifest.get("quarantine", {}))),
+        **{f"windows {reason}": count for reason, count in counts.get("windows", {}).items() if reason != "kept"},
+        "depths": counts.get("depth_left_out", 0),
+    }
+    return {reason: count for reason, count in reasons.items() if count}
+
+
+def motion_of(record: Record) -> float:
+    """Returns the mean distance that tracks move to the next frame where they are visible in both, in % of a side."""
+    steps = np.linalg.norm(np.diff(record["tracks"], axis=1), axis=-1)
+    seen = record["visible"][:, 1:] & record["visible"][:, :-1]
+    return float(100 * steps[seen].mean()) if seen.any() else 0.0
+
+
+def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:
+    """Returns a line such as ``0 ▁▃█▂ 4.2 % of a side per frame, median 1.3``."""
+    if not values:
+        return "not measured"
+    heights, edges = np.histogram(values, bins)
+    levels = np.ceil(heights / max(heights.max(), 1) * (len(BARS) - 1)).astype(int)
+    bars = "".join(BARS[level] for level in levels)
+    return f"{edges[0]:.3g} {bars} {edges[-1]:.3g} {unit}, median {np.median(values):.3g}"
+
+
+def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a picture with ``frames`` frames of some clips, a row for each clip and one below it for its depth.
+
+    The clips are spread evenly over the store. Above each stands its split, its number there and its task.
+
+    Raises:
+        StoreError: the store holds tokens, or no clip can be read.
+    """
+    rows: list[np.ndarray] = []
+    for split, number, record in clips_of(store, clips, []):
+        times = np.linspace(0, len(record["rgb"]) - 1, frames).round().astype(int)
+        pictures = _row(record["rgb"][times], side)
+        rows += [_caption(f"{split} {number}: {record['task']}", pictures.shape[1]), pictures]
+        if record.get("depth") is not None:
+            depth = record["depth"]
+            near, far = float(depth.min()), float(depth.max())
+            colors = depth_to_color(depth[times], near, max(far, near * 1.001), "inverse")
+            rows.append(_row(colors.astype(np.uint8), side))
+    return np.concatenate(rows)
+
+
+def clips_of(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
+    """Yields clips with pictures, as :func:`sampled` does.
+
+    Raises:
+        StoreError: the store holds tokens, or no clip can be read.
+    """
+    none = True
+    for split, number, record in sampled(store, most, damaged):
+        if record["rgb"].ndim != 4:
+            raise StoreError(f"{store.path}: holds tokens, not pictures; open the store of clips that they are of")
+        none = False
+        yield split, number, record
+    if none:
+        raise StoreError(f"{store.path}: no clip can be read{f' ({damaged[0]})' if damaged else ''}; make it again")
+
+
+def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
+    """Yields split, number and record of records spread evenly over all splits.
+
+    Args:
+        most: how many.
+        damaged: gets the messages of records that cannot be read.
+    """
+    sources = [store.source(split) for split in store.splits]
+    ends = np.cumsum([len(source) for source in sources])
+    total = int(ends[-1]) if sources else 0
+    for place in np.unique(np.linspace(0, total - 1, min(most, total)).round().astype(int)).tolist():
+        part = int(np.searchsorted(ends, place, side="right"))
+        number = place - int(ends[part]) + len(sources[part])
+        try:
+            yield store.splits[part], number, sources[part][number]
+        except StoreError as error:
+            damaged.append(str(error))
+
+
+def _rate(provenance: Mapping[str, Any]) -> list[str]:
+    """Returns how a record's frames lie in its recording, in words, if its provenance says so."""
+    fps, frames = provenance.get("fps"), provenance.get("frames", [])
+    if not fps or len(frames) < 2:
+        return []
+    step = (frames[-1] - frames[0]) / (len(frames) - 1)
+    return [f"{fps:.4g} fps, every {f'{step:.3g} frames' if step != 1 else 'frame'} ({fps / step:.3g} Hz)"]
+
+
+def _ranges(actions: Sequence[np.ndarray]) -> str:
+    """Returns dimensions, least, greatest and mean value of the actions of some clips."""
+    rows = [one for one in actions if one.size]
+    if not rows:
+        return ""
+    low, high = min(one.min() for one in rows), max(one.max() for one in rows)
+    mean = sum(float(one.sum()) for one in rows) / sum(one.size for one in rows)
+    return f"{rows[0].shape[-1]} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}"
+
+
+def _words(store: Store) -> dict[str, Counter[str]]:
+    """Returns the number of records by label, by column; the splits together."""
+    words: dict[str, Counter[str]] = {}
+    for name in filter(store.labelled, store.splits):
+        for column, counts in store.labels(name).counts().items():
+            words.setdefault(column, Counter()).update(counts)
+    return words
+
+
+def _ranked(words: Counter[str]) -> str:
+    more = len(words) - MOST_WORDS
+    return ", ".join(f"{word!r} {count}×" for word, count in words.most_common(MOST_WORDS)) + (
+        f", {more} more" if more > 0 else ""
+    )
+
+
+def _row(pictures: UInt8[np.ndarray, "n H W 3"], side: int) -> UInt8[np.ndarray, "h w 3"]:
+    height = max(1, round(side * pictures.shape[1] / pictures.shape[2]))
+    small = [cv2.resize(picture, (side, height), interpolation=cv2.INTER_AREA) for picture in pictures]
+    framed = [np.pad(one, ((0, GAP), (0, GAP), (0, 0)), constant_values=BACKGROUND) for one in small]
+    return np.concatenate(framed, axis=1)
+
+
+def _caption(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a line of small text, cut off at the width; question marks stand for letters that OpenCV lacks."""
+    strip = np.full((CAPTION, width, 3), BACKGROUND, np.uint8)
+    shown = " ".join(text.split()).encode("ascii", "replace").decode()
+    cv2.putText(strip, shown, (GAP, CAPTION - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (230, 230, 230), 1, cv2.LINE_AA)
+    return strip
+
+
+def _counted(numbers: Mapping[str, int]) -> str:
+    """Returns text such as ``train 7, test 2``."""
+    return ", ".join(f"{name} {number}" for name, number in numbers.items())
