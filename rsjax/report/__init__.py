@@ -1,1 +1,1 @@
-"""What a run looks like: videos, figures, and one self-contained HTML page."""
+"""Presents a run: videos, figures, and one self-contained HTML page."""

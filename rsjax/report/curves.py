@@ -1,4 +1,4 @@
-"""Training curves as inline SVG."""
+"""Draws training curves as inline SVG."""
 
 import html
 import io
@@ -13,20 +13,20 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 _COLUMNS = 4
-_INK = "#010203"  # stands for the page's own text colour until the drawing is done
+_INK = "#010203"  # placeholder for the page's text colour
 _LINE = "#3b7dd8"
 
 
 def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
-    """Small charts, one per scalar of a log, as one <svg> element that takes the page's font and text colour.
+    """Draws a small chart per scalar of a log, as one <svg> element that inherits the page's font and text colour.
 
     Args:
-        log: one dict per logged step, each with "step"; other numbers are drawn, other values ignored. A scalar may be
-            missing at some steps. Values that are not finite leave a gap.
-        name: keeps element ids of several drawings on a page apart.
+        log: one dict per logged step, with "step"; its other numbers are drawn, other values are ignored. A scalar may
+            be missing at some steps. Values that are not finite leave a gap.
+        name: makes the element ids of several drawings on a page distinct.
 
     Raises:
-        ValueError: no step of the log has a number to draw.
+        ValueError: the log contains no scalar.
     """
     names = list(dict.fromkeys(key for line in log for key, value in line.items() if _is_scalar(key, value)))
     names.sort(key=lambda key: (key != "loss", "loss" not in key))

@@ -1,4 +1,4 @@
-"""One generated clip as pictures: a filmstrip, an animation, and its keypoints."""
+"""Draws a generated clip: a filmstrip, an animation, and its keypoints."""
 
 from dataclasses import dataclass
 
@@ -8,39 +8,40 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from rsjax.report.video import Resample, depth_to_colors, resize
+from rsjax.report.video import depth_to_colors, resize
 
-_BACKGROUND = (24, 26, 30)  # one dark sheet for every picture, so that light and dark pages both suit it
+_BACKGROUND = (24, 26, 30)  # dark, which suits light and dark pages alike
 _TEXT = (222, 225, 230)
 _FAINT = (120, 126, 136)
 _GAP = 6
 _TRAILS = matplotlib.colormaps["plasma"]
 _FONT = font_manager.findfont("DejaVu Sans")
 
-_CELL_ANIMATION = 192  # pixels: about how large a frame is shown
+_CELL_ANIMATION = 192  # approximate side of a frame in pixels
 _CELL_FILMSTRIP = 128
+_FILMSTRIP_COLUMNS = 8
 _CELL_KEYPOINTS = 448
 
 
 @dataclass(frozen=True)
 class ClipFigure:
-    """One held-out clip and what was generated from its first frames. None leaves the row out.
+    """A test clip and the frames generated from its prompt. A field that is None has no row.
 
     Attributes:
-        title: what the reader is told about the clip.
+        title: the caption.
         truth: the recorded frames, 0–255.
-        prediction: generated from the first frames and the clip's own actions.
-        reconstruction: the truth through the tokenizer and back: the best that any prediction can look.
-        other_actions: generated from the same first frames and another clip's actions.
+        prediction: frames generated from the prompt and the clip's own actions.
+        reconstruction: the truth, encoded and decoded by the tokenizer: an upper bound on any prediction's quality.
+        other_actions: frames generated from the same prompt and another clip's actions.
         true_depth: metres.
-        predicted_depth: metres, of the depth branch.
+        predicted_depth: metres, from the depth branch.
         tracks: keypoints, x and y in 0–1 as in :class:`rsjax.clip.Clip`.
-        visible: likewise.
-        selected: which of the N₀ tracks are the top-K by motion.
-        prompt_frames: how many frames were given.
+        visible: as in :class:`rsjax.clip.Clip`.
+        selected: indices of the top-K tracks by motion.
+        prompt_frames: number of recorded frames that generation starts from.
 
     Raises:
-        ValueError: an array whose shape does not fit the truth's.
+        ValueError: the shape of an array does not fit the truth's.
     """
 
     title: str
@@ -60,16 +61,12 @@ class ClipFigure:
         for name in ("prediction", "reconstruction", "other_actions", "true_depth", "predicted_depth"):
             value, expected = getattr(self, name), shape[:3] if "depth" in name else shape
             if value is not None and value.shape != expected:
-                raise ValueError(
-                    f"{name} of clip {self.title!r} has shape {value.shape}; the truth asks for {expected}"
-                )
+                raise ValueError(f"{name} of clip {self.title!r} has shape {value.shape}; it must be {expected}")
         if self.tracks is not None and (self.visible is None or self.tracks.shape[:2] != self.visible.shape):
-            raise ValueError(
-                f"visible of clip {self.title!r} must have the shape {self.tracks.shape[:2]} of its tracks"
-            )
+            raise ValueError(f"visible of clip {self.title!r} must have its tracks' shape {self.tracks.shape[:2]}")
 
     def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest depth of the colours, in metres: the truth's 1st and 99th percentile if it is there."""
+        """Returns the depths in metres of the first and last colour: 1st and 99th percentile, of the truth if known."""
         depth = self.true_depth if self.true_depth is not None else self.predicted_depth
         if depth is None:
             raise ValueError(f"clip {self.title!r} has no depth")
@@ -77,7 +74,7 @@ class ClipFigure:
         return float(near), float(max(far, near + 1e-3))
 
     def rows(self) -> list[tuple[str, UInt8[np.ndarray, "T H W 3"]]]:
-        """The rows that exist, in the order of looking: label (up to two lines) and frames in colour."""
+        """Returns the label (up to two lines) and the RGB frames of each row."""
         colors = [
             ("truth", self.truth),
             ("prediction", self.prediction),
@@ -91,12 +88,12 @@ class ClipFigure:
         return rows
 
 
-def filmstrip(clip: ClipFigure, columns: int = 8, resample: Resample = "bicubic") -> UInt8[np.ndarray, "h w 3"]:
-    """A sheet with one row per kind of frame and ``columns`` frames spread evenly from the first to the last.
+def filmstrip(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws a sheet with a row per kind of frame and up to eight frames, evenly spaced from the first to the last.
 
     Cell (row i, column j) starts at pixel :func:`filmstrip_cell`.
     """
-    times = np.unique(np.linspace(0, len(clip.truth) - 1, columns).round().astype(int))
+    times = np.unique(np.linspace(0, len(clip.truth) - 1, _FILMSTRIP_COLUMNS).round().astype(int))
     rows = clip.rows()
     scale = _scale(clip, _CELL_FILMSTRIP)
     height, width = (side * scale for side in clip.truth.shape[1:3])
@@ -104,30 +101,30 @@ def filmstrip(clip: ClipFigure, columns: int = 8, resample: Resample = "bicubic"
     sheet, draw = _sheet(left, top)
     for j, t in enumerate(times):
         y, x = filmstrip_cell(clip, 0, j)
-        name = f"frame {t + 1}" + (", given" if t < clip.prompt_frames else "")
+        name = f"frame {t + 1}" + (", prompt" if t < clip.prompt_frames else "")
         draw.text((x + width // 2, y - 6), name, fill=_FAINT, font=_font(13), anchor="ms")
     for i, (label, frames) in enumerate(rows):
         y, x = filmstrip_cell(clip, i, 0)
         draw.text((x - 10, y + height // 2), label, fill=_TEXT, font=_font(14), anchor="rm", align="right")
-        for j, frame in enumerate(resize(frames[times], scale, resample)):
+        for j, frame in enumerate(resize(frames[times], scale)):
             y, x = filmstrip_cell(clip, i, j)
             sheet.paste(Image.fromarray(frame), (x, y))
     return np.asarray(sheet)
 
 
 def filmstrip_cell(clip: ClipFigure, row: int, column: int) -> tuple[int, int]:
-    """Top and left pixel of a filmstrip's frame."""
+    """Returns the top and left pixel of a frame in a filmstrip."""
     height, width = (side * _scale(clip, _CELL_FILMSTRIP) + _GAP for side in clip.truth.shape[1:3])
     return 30 + row * height, 156 + column * width
 
 
-def animation(clip: ClipFigure, resample: Resample = "bicubic") -> UInt8[np.ndarray, "T h w 3"]:
-    """All frames, every row of the filmstrip side by side under its label, with the time that has passed below."""
+def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
+    """Draws each frame of every row side by side, under the row's label and above a progress bar."""
     rows = clip.rows()
     scale = _scale(clip, _CELL_ANIMATION)
     height, width = (side * scale for side in clip.truth.shape[1:3])
     top, bottom = 46, 30
-    cells = [resize(frames, scale, resample) for _, frames in rows]
+    cells = [resize(frames, scale) for _, frames in rows]
     empty, draw = _sheet(_GAP + len(rows) * (width + _GAP), top + height + bottom)
     for i, (label, _) in enumerate(rows):
         x = _GAP + i * (width + _GAP)
@@ -140,7 +137,7 @@ def animation(clip: ClipFigure, resample: Resample = "bicubic") -> UInt8[np.ndar
             sheet.paste(Image.fromarray(frames[t]), (_GAP + i * (width + _GAP), top))
         draw = ImageDraw.Draw(sheet)
         y = top + height + bottom // 2
-        name = f"frame {t + 1} of {count}" + (", given" if t < clip.prompt_frames else "")
+        name = f"frame {t + 1} of {count}" + (", prompt" if t < clip.prompt_frames else "")
         draw.text((_GAP, y), name, fill=_FAINT, font=_font(13), anchor="lm")
         start, end = 170, sheet.width - _GAP
         draw.line((start, y, end, y), fill=(60, 64, 70), width=3)
@@ -150,18 +147,18 @@ def animation(clip: ClipFigure, resample: Resample = "bicubic") -> UInt8[np.ndar
 
 
 def keypoints(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
-    """The first frame with every track's start as a dot, and the selected tracks with the way they will go.
+    """Draws the first frame with a dot where each track starts, and the trails of the selected tracks.
 
-    Colour is how far a point moves over the steps at which it is visible at both ends, from blue for the least
-    of the selected points to orange for the most. Trails are drawn over those steps only.
+    Colour encodes how far a point moves over the steps at which it is visible at both ends, from blue for the least
+    of the selected points to orange for the most. Trails cover only those steps.
 
     Raises:
         ValueError: the clip has no tracks.
     """
     if clip.tracks is None or clip.visible is None:
         raise ValueError(f"clip {clip.title!r} has no tracks")
-    over = 2  # drawn at twice the size and reduced, for smooth lines
-    image = Image.fromarray(resize(clip.truth[:1], over * _scale(clip, _CELL_KEYPOINTS), "bicubic")[0])
+    over = 2  # draw at twice the size and reduce, for smooth lines
+    image = Image.fromarray(resize(clip.truth[:1], over * _scale(clip, _CELL_KEYPOINTS))[0])
     draw = ImageDraw.Draw(image)
     points = clip.tracks * np.array(image.size)
     steps = clip.visible[:, 1:] & clip.visible[:, :-1]
@@ -173,7 +170,7 @@ def keypoints(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
     least, most = motion[selected[[0, -1]]] if len(selected) else (0.0, 0.0)
     for n in selected:
         shade = (motion[n] - least) / max(most - least, 1e-9)
-        color = tuple(int(255 * c) for c in _TRAILS(0.78 * shade)[:3])  # beyond that lies a yellow too pale to see
+        color = tuple(int(255 * c) for c in _TRAILS(0.78 * shade)[:3])  # above 0.78 the yellow is too pale to see
         for t in np.flatnonzero(steps[n]):
             draw.line((*points[n, t], *points[n, t + 1]), fill=color, width=4)
         x, y = points[n, 0]

@@ -1,4 +1,4 @@
-"""One HTML page per run: everything inside it, nothing loaded from elsewhere, no script."""
+"""Writes a run's HTML report: one self-contained page without scripts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,37 +14,45 @@ from rsjax.report.figures import ClipFigure, animation, filmstrip, keypoints
 from rsjax.report.targets import judge
 from rsjax.report.video import animation_uri, webp_uri, write_file
 
-_HEADLINE_CLIPS = 2  # animations that stand above everything else
+_HEADLINE_CLIPS = 2  # clips whose animations head the page
 _FPS = 4.0
 
-_ROWS = (("", "prediction"), ("_repeat_first", "first frame repeated"), ("_tokenizer", "tokenizer's reconstruction"))
-_COLUMNS = (
-    ("psnr", "PSNR, dB ↑", 2),
-    ("ssim", "SSIM ↑", 3),
-    ("depth_absrel", "depth AbsRel ↓", 4),
-    ("depth_delta1", "depth δ₁ ↑", 3),
-    ("depth_delta2", "depth δ₂ ↑", 3),
-    ("delta_psnr", "ΔPSNR, another clip's actions, dB ↑", 2),
-    ("delta_psnr_uniform", "ΔPSNR, uniform actions, dB ↑", 2),
+Row = tuple[str, str]
+Column = tuple[str, str, int]
+
+# Rows are (suffix, label), columns are (metric, header, decimals); a column's {} stands for the row's suffix.
+_SCORE_ROWS = (
+    ("", "prediction"),
+    ("_repeat_first", "first frame repeated"),
+    ("_tokenizer", "tokenizer's reconstruction"),
 )
-_DELTA_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
-_DELTA_COLUMNS = (("_t4", "Δ₄, dB", 2),)
+_SCORE_COLUMNS = (
+    ("psnr{}", "PSNR, dB ↑", 2),
+    ("ssim{}", "SSIM ↑", 3),
+    ("depth_absrel{}", "depth AbsRel ↓", 4),
+    ("depth_delta1{}", "depth δ₁ ↑", 3),
+    ("depth_delta2{}", "depth δ₂ ↑", 3),
+    ("delta_psnr{}", "ΔPSNR, another clip's actions, dB ↑", 2),
+    ("delta_psnr_uniform{}", "ΔPSNR, uniform actions, dB ↑", 2),
+)
+_CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
+_CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a page is made of. Whatever is empty or missing leaves its part of the page out.
+    """The contents of a page. The page leaves out the sections of empty fields.
 
     Attributes:
         preset: the run's preset.
-        metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` are the 95 % interval of ``name``. Numbers
-            without a table of their own are listed under all numbers.
-        clips: held-out clips; the first ones stand at the top.
+        metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` bound the 95 % interval of ``name``. The page
+            lists all of them, and tabulates those of its columns.
+        clips: test clips; the first ones head the page.
         logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
         config: nested settings, JSON-ready.
         versions: library → version.
-        seconds: stage → how long it took.
-        command: what to type to make the run again.
+        seconds: stage → duration.
+        command: the command that reproduces the run.
         show_targets: judge the run by :data:`rsjax.report.targets.TARGETS`.
     """
 
@@ -60,19 +68,19 @@ class Report:
 
 
 def write_report(path: Path | str, report: Report) -> None:
-    """Write the page; it appears only when it is whole.
+    """Writes the page atomically.
 
     Raises:
         ValueError: a log without numbers.
-        OSError: the disk is full or the folder cannot be written.
+        OSError: the disk is full or the directory is not writable.
     """
     template = _environment().get_template("page.html.j2")
     html = template.render(
         report=report,
         headline=_HEADLINE_CLIPS,
         clips=[_clip_pictures(clip) for clip in report.clips],
-        scores=_table(report.metrics, _ROWS, _COLUMNS, lambda row, column: column + row),
-        control=_table(report.metrics, _DELTA_ROWS, _DELTA_COLUMNS, lambda row, column: f"delta_psnr{row}{column}"),
+        scores=_table(report.metrics, _SCORE_ROWS, _SCORE_COLUMNS),
+        control=_table(report.metrics, _CONTROL_ROWS, _CONTROL_COLUMNS),
         verdicts=judge(report.metrics) if report.show_targets else [],
         curves={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
@@ -103,16 +111,18 @@ def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
     }
 
 
-def _table(metrics: Mapping[str, float], rows: Any, columns: Any, key_of: Any) -> dict[str, Any] | None:
-    """Header and cells (value, interval) of those rows and columns of which anything was measured."""
-    columns = [c for c in columns if any(key_of(row, c[0]) in metrics for row, _ in rows)]
-    rows = [r for r in rows if any(key_of(r[0], column) in metrics for column, _, _ in columns)]
+def _table(metrics: Mapping[str, float], rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
+    """Returns the header and the cells (value, interval) of the rows and columns with at least one metric."""
+    columns = [column for column in columns if any(column[0].format(suffix) in metrics for suffix, _ in rows)]
+    rows = [row for row in rows if any(key.format(row[0]) in metrics for key, _, _ in columns)]
     if not columns:
         return None
-    cells = [[_cell(metrics, key_of(row, column), digits) for column, _, digits in columns] for row, _ in rows]
     return {
         "header": [header for _, header, _ in columns],
-        "rows": [{"label": label, "cells": line} for (_, label), line in zip(rows, cells, strict=True)],
+        "rows": [
+            {"label": label, "cells": [_cell(metrics, key.format(suffix), digits) for key, _, digits in columns]}
+            for suffix, label in rows
+        ],
     }
 
 
@@ -123,14 +133,13 @@ def _cell(metrics: Mapping[str, float], key: str, digits: int) -> dict[str, str]
     return {"value": "–" if value is None else f"{value:.{digits}f}", "interval": interval}
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, list[tuple[str, Any]]]:
-    """Section → (field, value): nested mappings become sections, the rest is gathered under "run"."""
-    sections: dict[str, list[tuple[str, Any]]] = {}
-    for name, value in config.items():
+def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tuple[str, Any]]]:
+    """Returns section → (field, value); a nested mapping becomes a section, named by its path."""
+    fields = [(key, value) for key, value in config.items() if not isinstance(value, Mapping)]
+    sections = {name: fields} if fields else {}
+    for key, value in config.items():
         if isinstance(value, Mapping):
-            sections[name] = list(value.items())
-        else:
-            sections.setdefault("run", []).append((name, value))
+            sections |= _settings(value, key if name == "run" else f"{name}.{key}")
     return sections
 
 

@@ -1,4 +1,4 @@
-"""What the ``tiny`` preset is held to on held-out episodes, judged from a run's flat metrics."""
+"""Quality targets of the ``tiny`` preset on test episodes, judged from a run's flat metrics."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Target:
-    """One promise: ``measure`` of the metrics is at least (or at most) ``bound``."""
+    """A lower (or upper) bound on a quantity computed from metrics."""
 
     name: str
     measure: Callable[[Mapping[str, float]], float]
@@ -17,7 +17,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A target beside what was measured; ``margin`` is negative by how much it was missed."""
+    """A target and its measurement. A negative ``margin`` is the amount by which the target was missed."""
 
     target: Target
     measured: float
@@ -34,11 +34,11 @@ class Verdict:
 
 TARGETS = (
     Target("tokenizer reconstruction, PSNR", lambda m: m["psnr_tokenizer"], 27.0),
-    Target("prediction above repeat-the-first-frame", lambda m: m["psnr"] - m["psnr_repeat_first"], 5.0),
+    Target("prediction above repeating the first frame", lambda m: m["psnr"] - m["psnr_repeat_first"], 5.0),
     Target("prediction below the tokenizer's reconstruction", lambda m: m["psnr_tokenizer"] - m["psnr"], 2.0, False),
     Target("ΔPSNR, another clip's actions", lambda m: m["delta_psnr"], 3.0),
     Target(
-        "depth AbsRel, as a share of repeat-the-first-frame's",
+        "depth AbsRel, relative to repeating the first frame",
         lambda m: m["depth_absrel"] / m["depth_absrel_repeat_first"],
         0.5,
         False,
@@ -49,11 +49,11 @@ TARGETS = (
 
 
 def judge(metrics: Mapping[str, float]) -> list[Verdict]:
-    """The verdicts on those targets whose metrics were measured."""
+    """Judges those targets whose metrics were measured."""
     verdicts = []
     for target in TARGETS:
         try:
             verdicts.append(Verdict(target, float(target.measure(metrics))))
         except KeyError:
-            continue  # not measured in this run: no depth branch, say
+            continue  # not measured: a model without a depth branch, for example
     return verdicts

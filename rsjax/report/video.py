@@ -1,4 +1,4 @@
-"""Frames to MP4, GIF, PNG and animated WebP files or data URIs, and depth to colours for the eye."""
+"""Encodes frames as MP4 and GIF files and WebP data URIs, and colours depth for viewing."""
 
 import base64
 import io
@@ -17,21 +17,19 @@ from rsjax.files import write_atomically
 Resample = Literal["nearest", "bicubic"]
 
 _FILTERS = {"nearest": Image.Resampling.NEAREST, "bicubic": Image.Resampling.BICUBIC}
-_HOLD = 4  # the last frame of a looping animation stays this many times longer
+_HOLD = 4  # the last frame of a looping animation lasts this many times longer
+_H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
 _TURBO = np.round(matplotlib.colormaps["turbo"](np.linspace(1, 0, 256))[:, :3] * 255).astype(np.uint8)
 
 
-def write_mp4(
-    path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1, crf: int = 16
-) -> None:
-    """Write an H.264 (yuv420p) video that browsers and players open.
+def write_mp4(path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
+    """Writes an H.264 (yuv420p) video that browsers and players can open.
 
     Args:
-        path: ends in .mp4; its folder is made if missing. The file appears only when it is whole.
-        frames: 0–255, RGB. Odd sides gain one repeated row or column, since yuv420p wants even ones.
-        fps: frames per second, > 0.
-        upscale: every pixel becomes a square of this side.
-        crf: H.264's constant rate factor: 0 is lossless, 23 its default.
+        path: ends in .mp4. The file is written atomically, with its parent directories.
+        frames: 0–255, RGB. Odd sides repeat their last row or column, since yuv420p needs even ones.
+        fps: frames per second, above 0.
+        upscale: side of the square that each pixel becomes.
 
     Raises:
         ValueError: frames of another shape or dtype, no frames, or a frame rate that is not positive.
@@ -42,7 +40,7 @@ def write_mp4(
     frames = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": str(crf)})
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=_H264)
         stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
@@ -51,40 +49,39 @@ def write_mp4(
 
 
 def write_gif(path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
-    """Write a GIF that loops and holds its last frame a little; arguments and errors as :func:`write_mp4`."""
+    """Writes a GIF that loops and shows its last frame longer. Arguments and errors as in :func:`write_mp4`."""
     _check(frames, fps)
     write_file(path, _encode_animation("GIF", resize(frames, upscale, "nearest"), fps))
 
 
 def write_file(path: Path | str, payload: bytes) -> None:
-    """Write a file that is whole or not there; missing parent folders are made."""
+    """Writes a file atomically, with its parent directories."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, payload)
 
 
-def png_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
-    """An RGB picture as a ``data:image/png`` URI, lossless."""
-    return _image_uri(image, "PNG", optimize=True)
+def webp_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
+    """Returns an RGB image as a lossy ``data:image/webp`` URI, about a tenth the size of a PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "WEBP", quality=90)
+    return _webp_uri(buffer.getvalue())
 
 
-def webp_uri(image: UInt8[np.ndarray, "H W 3"], quality: int = 90) -> str:
-    """An RGB picture as a ``data:image/webp`` URI, lossy: about a tenth of the PNG."""
-    return _image_uri(image, "WEBP", quality=quality)
-
-
-def animation_uri(frames: UInt8[np.ndarray, "T H W 3"], fps: float, quality: int = 85) -> str:
-    """Frames as a looping ``data:image/webp`` URI; the last frame is held a little.
+def animation_uri(frames: UInt8[np.ndarray, "T H W 3"], fps: float) -> str:
+    """Returns frames as a looping ``data:image/webp`` URI that shows the last frame longer.
 
     Raises:
         ValueError: as :func:`write_mp4`.
     """
     _check(frames, fps)
-    return _data_uri("image/webp", _encode_animation("WEBP", frames, fps, quality=quality, method=4))
+    return _webp_uri(_encode_animation("WEBP", frames, fps, quality=85, method=4))
 
 
-def resize(frames: UInt8[np.ndarray, "T H W 3"], scale: int, resample: Resample) -> UInt8[np.ndarray, "T sH sW 3"]:
-    """Frames enlarged by a whole number."""
+def resize(
+    frames: UInt8[np.ndarray, "T H W 3"], scale: int, resample: Resample = "bicubic"
+) -> UInt8[np.ndarray, "T sH sW 3"]:
+    """Enlarges frames by a whole factor."""
     if scale == 1:
         return frames
     height, width = (side * scale for side in frames.shape[1:3])
@@ -92,10 +89,10 @@ def resize(frames: UInt8[np.ndarray, "T H W 3"], scale: int, resample: Resample)
 
 
 def depth_to_colors(depth: Float[np.ndarray, "..."], near: float, far: float) -> UInt8[np.ndarray, "... 3"]:
-    """Depth in metres as colours: ``near`` and closer is red, ``far`` and farther is violet (the turbo map).
+    """Colours depth in metres with the turbo map: red at ``near`` and closer, violet at ``far`` and farther.
 
-    Even steps of colour are even steps of 1/depth, so that what lies close is told apart well. Unknown (not a number)
-    counts as far. For looking at only; the colours that the tokenizer sees are :mod:`rsjax.data.depth_color`'s.
+    Colour is linear in 1/depth, which resolves close depths best. NaN (unknown) counts as far. For viewing only: the
+    tokenizer sees the colours of :mod:`rsjax.data.depth_color`.
 
     Raises:
         ValueError: not 0 < ``near`` < ``far``.
@@ -122,11 +119,5 @@ def _encode_animation(kind: str, frames: UInt8[np.ndarray, "T H W 3"], fps: floa
     return buffer.getvalue()
 
 
-def _image_uri(image: UInt8[np.ndarray, "H W 3"], kind: str, **options: int) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, kind, **options)
-    return _data_uri(f"image/{kind.lower()}", buffer.getvalue())
-
-
-def _data_uri(mime: str, data: bytes) -> str:
-    return f"data:{mime};base64,{base64.b64encode(data).decode()}"
+def _webp_uri(data: bytes) -> str:
+    return f"data:image/webp;base64,{base64.b64encode(data).decode()}"

@@ -4,7 +4,7 @@ import pytest
 from rsjax.report.figures import ClipFigure
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_clip():
     """Makes a clip of a bright square that moves right over a dark background, with every optional field."""
 

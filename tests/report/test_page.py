@@ -62,8 +62,10 @@ class _Page(HTMLParser):
             self.cells[-1].append(data.strip())
 
 
-def _full(make_clip):
-    return Report(
+@pytest.fixture(scope="module")
+def full_page(tmp_path_factory, make_clip):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    report = Report(
         preset="tiny",
         metrics=_METRICS,
         clips=[make_clip(title=f"episode <{i}>") for i in range(3)],
@@ -73,25 +75,25 @@ def _full(make_clip):
         seconds={"collect": 75.0, "train": 3725.0},
         command="python -m experiments.train tiny",
     )
+    write_report(path, report)
+    return path
 
 
-def test_a_full_page_stands_alone(tmp_path, make_clip):
-    path = tmp_path / "report.html"
-    write_report(path, _full(make_clip))
-    page = _Page(path)
+def test_a_full_page_stands_alone(full_page):
+    page = _Page(full_page)
     assert len(page.images) == 3 * 3  # animation, filmstrip and keypoints of each clip
     assert all(uri.startswith("data:image/") for uri in page.images)
     assert all(uri.startswith("#") for uri in page.loads)
     assert not page.tags & {"script", "link", "iframe", "object"}
-    assert not re.search(r"(@import|url\()\s*['\"]?http", path.read_text())
-    assert path.read_text().index("<img") < path.read_text().index("<table")
-    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    html = full_page.read_text()
+    assert not re.search(r"(@import|url\()\s*['\"]?http", html)
+    assert html.index("<img") < html.index("<table")
+    assert [p.name for p in full_page.parent.iterdir()] == ["report.html"]
 
 
-def test_tables_show_each_number_in_its_row(tmp_path, make_clip):
-    write_report(tmp_path / "r.html", _full(make_clip))
-    page = _Page(tmp_path / "r.html")
-    header = ["held-out clips", "PSNR, dB ↑", "SSIM ↑", "depth AbsRel ↓", "ΔPSNR, another clip's actions, dB ↑"]
+def test_tables_show_each_number_in_its_row(full_page):
+    page = _Page(full_page)
+    header = ["test clips", "PSNR, dB ↑", "SSIM ↑", "depth AbsRel ↓", "ΔPSNR, another clip's actions, dB ↑"]
     assert header in page.cells
     assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "0.0213", "2.75"] in page.cells
     assert ["first frame repeated", "19.80", "–", "0.0555", "–"] in page.cells
@@ -109,8 +111,8 @@ def test_tables_show_each_number_in_its_row(tmp_path, make_clip):
 def test_missing_parts_are_left_out(tmp_path, make_clip):
     write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")
-    assert ["held-out clips", "PSNR, dB ↑"] in page.cells
-    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "To make it again"):
+    assert ["test clips", "PSNR, dB ↑"] in page.cells
+    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "Command to reproduce"):
         assert absent not in page.text
     clip = make_clip(true_depth=None, predicted_depth=None, tracks=None, visible=None, selected=None)
     write_report(tmp_path / "rgb.html", Report(preset="debug", metrics={}, clips=[clip]))

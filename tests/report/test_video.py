@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rsjax.report.video import animation_uri, depth_to_colors, png_uri, resize, webp_uri, write_gif, write_mp4
+from rsjax.report.video import animation_uri, depth_to_colors, resize, webp_uri, write_gif, write_mp4
 
 _COLORS = np.array([[200, 40, 40], [40, 180, 60], [40, 60, 200], [220, 220, 220], [20, 20, 20]], np.uint8)
 
@@ -56,9 +56,7 @@ def test_gif_loops_in_order(tmp_path):
 
 
 def test_uris_decode_to_their_images():
-    image = np.random.default_rng(0).integers(0, 256, (9, 11, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(np.asarray(_decode(png_uri(image))), image)
-    assert png_uri(image).startswith("data:image/png;base64,")
+    assert webp_uri(_flat_frames(16, 16)[1]).startswith("data:image/webp;base64,")
     np.testing.assert_allclose(np.asarray(_decode(webp_uri(_flat_frames(16, 16)[1])))[8, 8], _COLORS[1], atol=6)
     moving = _decode(animation_uri(_flat_frames(16, 16), fps=4))
     assert (moving.n_frames, moving.info["loop"]) == (5, 0)
