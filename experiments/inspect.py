@@ -3,6 +3,10 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
@@ -14,6 +18,8 @@ PROG = "python -m experiments.inspect"
 class Options:
     """Options of this command."""
 
+    store: Annotated[Positional[Path], arg(metavar="STORE")] = tyro.MISSING
+    """A store of clips or of tokens."""
     records: int = 200
     """How many records to read, spread evenly; counts, tasks and difficulties are of all."""
     sheet: Path | None = None
@@ -29,14 +35,10 @@ class Options:
 @main_errors()
 def main() -> None:
     """Prints the contents and writes a sheet of pictures."""
-    argv = sys.argv[1:]
-    if not argv or (argv[0].startswith("-") and not {"-h", "--help"} & {*argv}):
-        raise ConfigError(f"name a store first; usage: {PROG} STORE [--sheet FILE] [--rerun | --rerun-file FILE]")
-    place, argv = (None, argv) if argv[0].startswith("-") else (Path(argv[0]), argv[1:])
-    options = parse_options(argv, f"{PROG} STORE", "Counts, shapes, histograms, and a sheet of pictures.", Options())
+    options = parse_options(sys.argv[1:], PROG, "Shows counts, shapes, histograms and a sheet of pictures.", Options())
+    place = options.store
     if options.sheet and options.sheet.suffix.lower() not in (".png", ".jpg", ".webp"):
         raise ConfigError(f"--sheet is {options.sheet}; name a .png, .jpg or .webp file")
-    assert place is not None
     from PIL import Image
 
     from rsjax.data.store import open_store

@@ -1,13 +1,20 @@
-"""Stores into one, one into several, or into tokens. ``python -m experiments.store merge OUT A B``, ``… split A``"""
+"""Merges, splits and tokenizes stores. ``python -m experiments.store merge OUT A B``, ``… split A``"""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import Positional, arg
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
 from rsjax.runtime import tune_process
+
+if TYPE_CHECKING:
+    from rsjax.data.store import Store
 
 PROG = "python -m experiments.store"
 USAGE = (
@@ -17,70 +24,88 @@ USAGE = (
 
 
 @dataclass(frozen=True)
+class Merge:
+    """Options of ``merge``."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")] = tyro.MISSING
+    """Directory of the new store."""
+    stores: Annotated[Positional[tuple[Path, ...]], arg(metavar="STORE STORE …")] = ()
+    """Two stores or more."""
+
+
+@dataclass(frozen=True)
 class Split:
     """Options of ``split``."""
 
+    store: Annotated[Positional[Path], arg(metavar="STORE")] = tyro.MISSING
+    """A store of clips or of tokens."""
     into: Path = Path("parts")
-    """A folder, in which the new stores are made; parts, where you are, if not given."""
+    """Folder for the new stores."""
     by: str = "difficulty"
-    """A column of the labels (task, difficulty, scene, segment, skill): a store for each of its words."""
+    """Column of the labels (task, difficulty, scene, segment, skill); each of its words becomes a store."""
     parts: int = 0
-    """So many stores of as many records each, instead."""
+    """Split into this many stores of equal size instead."""
 
 
 @dataclass(frozen=True)
 class Tokenize:
     """Options of ``tokenize``."""
 
+    store: Annotated[Positional[Path], arg(metavar="STORE")] = tyro.MISSING
+    """A store of clips."""
     run: Path = Path("runs/tiny")
-    """A run directory, whose tokenizer makes the tokens of every clip; they lie beside the clips."""
+    """Run directory with the tokenizer."""
 
 
 @main_errors()
 def main() -> None:
-    """Does one of them, and says what was made."""
-    argv = sys.argv[1:]
-    if len(argv) < 2 and {"-h", "--help"} & {*argv}:
+    """Runs one of the actions and prints the stores that it made."""
+    word, *argv = sys.argv[1:] or [""]
+    if word in ("-h", "--help"):
         print(USAGE)
         return
-    what, places = (argv[0] if argv else ""), [Path(word) for word in argv[1:]]
-    if what == "merge" and len(places) >= 3:
-        from rsjax.data.merge import merge
-
-        made = [merge(places[1:], places[0])]
-    elif what == "split" and places:
-        rest = argv[1:] if places[0].name.startswith("-") else argv[2:]
-        made = split_store(places[0], parse_options(rest, f"{PROG} split STORE", "One store into several.", Split()))
-    elif what == "tokenize" and places:
-        tune_process()
-        rest = argv[1:] if places[0].name.startswith("-") else argv[2:]
-        options = parse_options(rest, f"{PROG} tokenize STORE", "Tokens of every clip, beside the clips.", Tokenize())
-        made = [tokenize(places[0], options.run)]
-    else:
+    if word not in ACTIONS:
         raise ConfigError(USAGE)
-    for store in made:
-        sizes = ", ".join(f"{name} {len(store.source(name))}" for name in store.splits)
-        print(f"{store.path.absolute()}: {sizes}")
+    options, description, action = ACTIONS[word]
+    for store in action(parse_options(argv, f"{PROG} {word}", description, options)):
+        print(f"{store.path.absolute()}: {', '.join(f'{name} {count}' for name, count in store.counts().items())}")
 
 
-def split_store(place: Path, options: Split) -> list[Any]:
-    """The parts."""
+def merge(options: Merge) -> "list[Store]":
+    """Returns the merged store."""
+    from rsjax.data.merge import merge
+
+    return [merge(options.stores, options.out)]
+
+
+def split(options: Split) -> "list[Store]":
+    """Returns the parts."""
     from rsjax.data.merge import by_label, into_parts, split
 
+    place, into = options.store, options.into
     if options.parts < 0:
         raise ConfigError(f"--parts is {options.parts}; it is how many stores to make")
-    even, into = options.parts, options.into
-    return list(split(place, into_parts(place, even, into) if even else by_label(place, options.by, into)).values())
+    parts = into_parts(place, options.parts, into) if options.parts else by_label(place, options.by, into)
+    return list(split(place, parts).values())
 
 
-def tokenize(place: Path, run: Path) -> Any:
-    """The store of tokens."""
+def tokenize(options: Tokenize) -> "list[Store]":
+    """Returns the store of tokens."""
+    tune_process()
     from rsjax.data.store import open_store
     from rsjax.pipeline.generator import load_config, load_tokenizer
     from rsjax.pipeline.tokens import tokenize_store
 
-    clips, config = open_store(place), load_config(run)
-    return open_store(tokenize_store(clips, config, load_tokenizer(config, run), place / "tokens"))
+    clips, config = open_store(options.store), load_config(options.run)
+    tokenizer = load_tokenizer(config, options.run)
+    return [open_store(tokenize_store(clips, config, tokenizer, options.store / "tokens"))]
+
+
+ACTIONS: dict[str, tuple[Any, str, Callable[[Any], "list[Store]"]]] = {
+    "merge": (Merge(), "Merges stores into one.", merge),
+    "split": (Split(), "Splits a store into several.", split),
+    "tokenize": (Tokenize(), "Tokenizes every clip of a store; the tokens are kept beside the clips.", tokenize),
+}
 
 
 if __name__ == "__main__":

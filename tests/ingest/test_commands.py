@@ -189,12 +189,14 @@ def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Comman
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
         (ingest, ["folder", ".", "--image-size", "1000000"], "--image-size is 1000000"),
         (ingest, ["folder", ".", "--points", "0"], "--points is 0"),
-        (inspect, [], "name a store first"),
+        (inspect, [], "missing store"),
         (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
         (inspect, ["nowhere"], "nowhere: not there; give a store"),
         (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
         (doctor, [], "usage: python -m experiments.doctor STORE, or python -m experiments.doctor SOURCE PATH"),
-        (store, ["merge", "a", "b"], "usage"),
+        (store, [], "usage"),
+        (store, ["merge", "a", "b"], "merging takes two stores or more"),
+        (store, ["split", "--by", "task"], "missing store"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(
