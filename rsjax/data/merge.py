@@ -36,6 +36,8 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
             tokenizer or depth range, or ``out`` exists or lies in one of them.
         FileError: ``out`` cannot be written.
     """
+    if len(paths) < 2:
+        raise StoreError("merging takes two stores or more")
     stores = [open_store(path) for path in paths]
     _check_mergeable(stores, out)
     key = content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores))
@@ -213,8 +215,6 @@ def _action_statistics(store: Store) -> Statistics:
 
 
 def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
-    if len(stores) < 2:
-        raise StoreError("merging takes two stores or more")
     if len({store.path.resolve() for store in stores}) < len(stores):
         raise StoreError("a store cannot be merged with itself; name each once")
     _check_free(out, stores)
