@@ -1,4 +1,4 @@
-"""A grid of runs and its table. ``python -m experiments.ablation tiny --grid model.depth=True,False --seeds 0 1 2``"""
+"""Runs a grid and compares it. ``python -m experiments.ablation tiny --grid model.depth=True,False --seeds 0 1 2``"""
 
 import os
 import shlex
@@ -9,10 +9,12 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse
-from rsjax.ablation.grid import DEFAULT_AXES, Choice, expand, parse_axes, task_number
+from rsjax.ablation.grid import DEFAULT_AXES, Choice, expand, parse_axes
+from rsjax.config import require
 from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.ablation"
+TASK = "SLURM_ARRAY_TASK_ID"
 
 
 @dataclass(frozen=True)
@@ -20,23 +22,23 @@ class Options:
     """Options of this command."""
 
     grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """FIELD=VALUE,VALUE…: a field to vary, once per field; depth on/off and keypoints on/off if none is given."""
+    """FIELD=VALUE,VALUE…: a field to vary; repeat it for more. Default: depth on/off and keypoints on/off."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the world model's training (train.seed); every combination is run with each."""
+    """Seeds of the world model's training (train.seed); every combination runs with each."""
     out: Path | None = None
-    """Where the grid is kept, a run directory per cell; runs/ablation-PRESET if not given."""
+    """Directory of the grid, with a run directory per cell. Default: runs/ablation-PRESET."""
     data_dir: Path = Path("data")
-    """Where simulated data sets are kept, to be shared by runs."""
+    """Directory of simulated data sets, which runs share."""
     only: tuple[str, ...] = ()
-    """Cells to run, by name or shell pattern ('model.depth=True,*'); all if not given."""
+    """Cells to run, by name or shell pattern ('model.depth=True,*'). Default: all."""
     skip: tuple[str, ...] = ()
-    """Cells to leave out, likewise."""
+    """Cells to leave out, by name or shell pattern."""
     cell: int | None = None
-    """Run the cell of this number alone, counted from 0; in a Slurm array job the task's number if not given."""
+    """Run only the cell of this number, counted from 0. Default in a Slurm array job: the task's number."""
     list: bool = False
-    """Name the cells with their numbers and how far they are, and run nothing."""
+    """Print the cells with their numbers and states, and run nothing."""
     table: bool = False
-    """Write and print the table of what is there, for all cells that the directory was ever asked for; run nothing."""
+    """Write and print the table of all cells in the directory as they are now, and run nothing."""
 
 
 @main_errors()
@@ -45,19 +47,22 @@ def main() -> None:
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
     out, data = options.out or Path("runs") / f"ablation-{config.name}", options.data_dir
-    cells = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
-    number = options.cell if options.cell is not None or options.list else task_number(os.environ)
+    grid = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
+    number = options.cell
+    if number is None and not options.list and (task := os.environ.get(TASK)):
+        require(task.isdigit(), f"{TASK} is {task!r}, not a cell's number; unset it, or choose with --cell")
+        number = int(task)
     choice = Choice(number, options.only, options.skip)
-    # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.ablation import output, runner
+    # Loads JAX, so only after the arguments have been checked.
+    from rsjax.ablation import sweep
 
     if options.table:
-        output.print_table(out, data)
+        sweep.print_table(out, data)
     elif options.list:
-        output.print_cells(config, cells, choice, out, data)
+        sweep.print_cells(grid, choice, out, data)
     else:
-        states = runner.run_grid(config, cells, choice, out, data, shlex.join([*PROG.split(), *sys.argv[1:]]))
-        output.print_table(out, data)
+        states = sweep.run_sweep(grid, choice, out, data, shlex.join([*PROG.split(), *sys.argv[1:]]))
+        sweep.print_table(out, data)
         if "failed" in states.values():
             raise SystemExit(1)
 

@@ -1,1 +1,1 @@
-"""Grids of runs: some fields of a configuration varied, every combination with several seeds, and one table."""
+"""Grids of runs: some fields of a configuration vary, every combination runs with several seeds, one table."""

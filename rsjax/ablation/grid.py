@@ -1,122 +1,172 @@
-"""What a grid consists of: axes, and a cell for every combination of their values with every seed."""
+"""The cells of a grid, one for every combination of values with every seed, and ``grid.json``, which lists them."""
 
+import dataclasses
+import fnmatch
 import hashlib
 import itertools
+import json
+import math
 import re
+import typing
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from fnmatch import fnmatchcase
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
 
-from rsjax.ablation.fields import GridError, Value, leaves, parse_value, with_values
-from rsjax.config import Config, ConfigError
-from rsjax.errors import did_you_mean
+from rsjax.config import Config, ConfigError, from_dict, require, to_dict
+from rsjax.config.leaves import Leaf, leaves, with_values
+from rsjax.errors import UserError, did_you_mean
+from rsjax.files import disk_guard, lock, read_json, write_atomically
+from rsjax.progress import note
+
+Value = bool | int | float | str
 
 DEFAULT_AXES = ("model.depth=True,False", "loss.keypoints=True,False")
+SWITCHES = {  # a field → the switch without which the field has no effect
+    "loss.depth": "model.depth",
+    "loss.keypoint": "loss.keypoints",
+    "loss.attention": "loss.keypoints",
+    "loss.gamma": "loss.keypoints",
+    "loss.num_keypoints": "loss.keypoints",
+}
 SEED = "train.seed"
-TASK = "SLURM_ARRAY_TASK_ID"
-NAME_LENGTH = 180  # of a cell's directory; file systems allow 255, and files in the making add endings
-
-# A weight or constant of a term that a switch takes away: where it is off, all its values give the same cell.
-_SWITCHES = {"loss.depth": "model.depth"} | dict.fromkeys(
-    ("loss.keypoint", "loss.attention", "loss.gamma", "loss.num_keypoints"), "loss.keypoints"
-)
+FILE = "grid.json"
+LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # whose versions the file names
+NAME_LENGTH = 180  # of a cell's directory: file systems allow 255, and temporary files add suffixes
+NUMBERS = {int: "a whole number", float: "a number"}
 
 
-@dataclass(frozen=True)
-class Axis:
-    """A field that the grid varies, and its values in order."""
-
-    field: str
-    values: tuple[Value, ...]
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One run of a grid.
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """Cells and what they vary.
 
     Attributes:
-        name: its directory within the grid's, unique there.
-        values: of every field that the grid varies, by dotted name.
-        seed: ``train.seed``.
-        config: what it runs.
+        fields: the dotted names of the fields that vary; the configurations agree in all others but the seed.
+        cells: configuration by name, in order. A cell's name is its directory within the grid's.
+        versions: library → version, of the command that made the grid.
     """
 
-    name: str
-    values: Mapping[str, Value]
-    seed: int
-    config: Config
+    fields: tuple[str, ...]
+    cells: Mapping[str, Config]
+    versions: Mapping[str, str] = dataclasses.field(default_factory=lambda: {each: version(each) for each in LIBRARIES})
 
 
-def parse_axes(base: Config, texts: Sequence[str]) -> tuple[Axis, ...]:
-    """Axes from ``FIELD=VALUE,VALUE…`` each; dashes in a field's name count as underscores.
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Some of a grid's cells.
+
+    Attributes:
+        number: the position of a single cell, counted from 0; None for all.
+        only: names or shell patterns (``model.depth=True,*``); cells that match none are left out. Empty for all.
+        skip: names or patterns of cells to leave out.
+    """
+
+    number: int | None = None
+    only: Sequence[str] = ()
+    skip: Sequence[str] = ()
+
+    def of(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Returns the chosen names, in order.
+
+        Raises:
+            ConfigError: no cell has this number, or none matches one of the patterns.
+        """
+        for flag, patterns in (("--only", self.only), ("--skip", self.skip)):
+            for pattern in patterns:
+                problem = f"{flag} {pattern}: no such cell{did_you_mean(pattern, names)} (--list names them)"
+                require(_matches(names, [pattern]) != set(), problem)
+        require(
+            self.number is None or 0 <= self.number < len(names),
+            f"cell {self.number} is not in this grid; its cells are 0 … {len(names) - 1} (--list names them)",
+        )
+        kept = (_matches(names, self.only) if self.only else set(names)) - _matches(names, self.skip)
+        return tuple(name for i, name in enumerate(names) if name in kept and self.number in (None, i))
+
+
+def _matches(names: Sequence[str], patterns: Sequence[str]) -> set[str]:
+    return {name for name in names if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)}
+
+
+def parse_axes(base: Config, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:
+    """Parses ``FIELD=VALUE,VALUE…`` arguments into values by field. Dashes in a field's name count as underscores.
 
     Raises:
-        GridError: a field that does not exist, stands twice or is the seed; a value that is not of its type or stands
-            twice.
+        ConfigError: a field does not exist, is repeated or is the seed; a value has another type or is repeated.
     """
-    known, axes = leaves(base), {}
+    known, axes = leaves(base), dict[str, tuple[Value, ...]]()
     for text in texts:
-        name, equals, values = text.partition("=")
+        name, _, values = text.partition("=")
         field = name.strip().lstrip("-").replace("-", "_")
-        if not equals or not values:
-            raise GridError(f"--grid {text}: write FIELD=VALUE,VALUE, such as {DEFAULT_AXES[0]}")
-        if field not in known:
-            raise GridError(f"--grid {text}: no field {field!r}{did_you_mean(field, known)}")
-        if field == SEED:
-            raise GridError(f"--grid {text}: seeds have an option of their own, --seeds {values.replace(',', ' ')}")
-        if field == "name":
-            raise GridError(f"--grid {text}: the preset's name changes nothing; vary another field")
-        if field in axes:
-            raise GridError(f"--grid {text}: {field} has an axis already; put all its values into one")
-        parsed = tuple(parse_value(field, known[field].kind, value.strip()) for value in values.split(","))
-        if len(set(parsed)) < len(parsed):
-            raise GridError(f"--grid {text}: a value stands twice")
-        axes[field] = Axis(field, parsed)
-    return tuple(axes.values())
+        for wrong, cure in (
+            (not values, f"write FIELD=VALUE,VALUE, such as {DEFAULT_AXES[0]}"),
+            (field not in known, f"no field {field!r}{did_you_mean(field, known)}"),
+            (field == SEED, f"seeds have their own option, --seeds {values.replace(',', ' ')}"),
+            (field == "name", "the preset's name has no effect; vary another field"),
+            (field in axes, f"{field} has an axis already; put all its values into one"),
+        ):
+            require(not wrong, f"--grid {text}: {cure}")
+        axes[field] = tuple(parse_value(field, known[field].kind, value.strip()) for value in values.split(","))
+        require(len(set(axes[field])) == len(axes[field]), f"--grid {text}: a value is repeated; name each once")
+    return axes
 
 
-def expand(base: Config, axes: Sequence[Axis], seeds: Sequence[int]) -> tuple[Cell, ...]:
-    """All cells. The last axis changes fastest and the seed slowest, so that a grid that stops early has whole tables.
-
-    Raises:
-        GridError: no seeds, a seed that stands twice or is not in [0, 2³²), or cells that cannot run, by name.
-    """
-    if not seeds or len(set(seeds)) < len(seeds):
-        raise GridError(f"--seeds {' '.join(map(str, seeds))}: give one or more, each once")
-    for seed in seeds:
-        if not 0 <= seed < 2**32:
-            raise GridError(f"--seeds: {seed} is not between 0 and 2^32 - 1")
-    cells, wrong = [], []
-    fields = [axis.field for axis in axes]
-    for seed in seeds:
-        for combination in itertools.product(*(axis.values for axis in axes)):
-            values = dict(zip(fields, combination, strict=True))
-            try:
-                cells.append(make_cell(base, values, seed))
-            except ConfigError as error:
-                wrong.append(f"{cell_name(values, seed)}: {error}")
-    if wrong:
-        raise GridError(f"{len(wrong)} of {len(wrong) + len(cells)} cells cannot run; the first is {wrong[0]}")
-    return tuple(cells)
-
-
-def make_cell(base: Config, values: Mapping[str, Value], seed: int, name: str = "") -> Cell:
-    """The cell with these values.
+def parse_value(name: str, kind: Any, text: str) -> Value:
+    """Parses one value of a field.
 
     Args:
-        name: of a cell that has one already.
+        name: the field, for the error.
+        kind: its declared type.
 
     Raises:
-        ConfigError: the combination cannot run.
+        ConfigError: the text is not of this type, or the field takes more than one value.
     """
-    return Cell(name or cell_name(values, seed), values, seed, with_values(base, {**values, SEED: seed}))
+    options = (True, False) if kind is bool else typing.get_args(kind) if typing.get_origin(kind) is Literal else ()
+    if options:
+        choices = {str(option): option for option in options}
+        problem = f"{name} is {text!r} in the grid{did_you_mean(text, choices)} (choices: {', '.join(choices)})"
+        require(text in choices, problem)
+        return choices[text]
+    if kind is str:
+        return text
+    require(kind in NUMBERS, f"{name} takes several values, so a grid cannot vary it; set it for all cells (--{name})")
+    with suppress(ValueError, OverflowError):
+        if math.isfinite(value := kind(text)):
+            return value
+    raise ConfigError(f"{name} is {text!r} in the grid; it takes {NUMBERS[kind]}")
+
+
+def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[int]) -> Grid:
+    """Returns all cells. The last axis changes fastest and the seed slowest: a grid that stops early has whole tables.
+
+    Raises:
+        ConfigError: no seed, a repeated one or one outside [0, 2³²); or cells that cannot run, with the first one's
+            name.
+    """
+    flag = f"--seeds {' '.join(map(str, seeds))}"
+    require(0 < len(seeds) == len(set(seeds)), f"{flag}: name one or more, each once")
+    require(all(0 <= seed < 2**32 for seed in seeds), f"{flag}: a seed lies between 0 and 2^32 - 1")
+    cells, wrong = dict[str, Config](), list[str]()
+    for seed, combination in itertools.product(seeds, itertools.product(*axes.values())):
+        values = dict(zip(axes, combination, strict=True))
+        try:
+            cells[cell_name(values, seed)] = with_values(base, {**values, SEED: seed})
+        except ConfigError as error:
+            wrong.append(f"{cell_name(values, seed)}: {error}")
+    require(not wrong, f"{len(wrong)} of {len(wrong) + len(cells)} cells cannot run; the first is {''.join(wrong[:1])}")
+    return Grid(tuple(axes), cells)
+
+
+def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
+    """Returns the values of these fields, by dotted name."""
+    known = leaves(config)
+    return {field: known[field].value for field in fields}
 
 
 def cell_name(values: Mapping[str, Value], seed: int) -> str:
-    """A directory's name that reads as the values do: ``model.depth=True,loss.gamma=5.0,seed=0``.
+    """Returns a directory's name that shows the values: ``model.depth=True,loss.gamma=5.0,seed=0``.
 
-    Where that is too long, or a text has characters that do not belong into a file's name, they are left out and a
-    digest of the values keeps the name unique.
+    A name that is too long or has unsafe characters is shortened and cleaned, and a hash keeps it unique.
     """
     name = ",".join([*(f"{field}={value}" for field, value in values.items()), f"seed={seed}"])
     safe = re.sub(r"[^A-Za-z0-9_.=,+-]", "-", name)
@@ -125,64 +175,94 @@ def cell_name(values: Mapping[str, Value], seed: int) -> str:
     return f"{safe[: NAME_LENGTH - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def idle(cells: Sequence[Cell]) -> list[str]:
-    """Fields that are varied where their switch is off, one line each: those cells repeat each other."""
-    lines = []
-    for field, switch in _SWITCHES.items():
-        off = {cell.values[field] for cell in cells if field in cell.values and not leaves(cell.config)[switch].value}
-        if len(off) > 1:
-            lines.append(f"{field} changes nothing where {switch} is False; cells that differ in it alone are the same")
+def repeated_cells(grid: Grid) -> list[str]:
+    """Returns one line per field that varies among cells whose switch takes its effect away."""
+    cells, lines = [leaves(config) for config in grid.cells.values()], []
+    for field, switch in SWITCHES.items():
+        off = {known[field].value for known in cells if field in known and switch in known and not known[switch].value}
+        if field in grid.fields and len(off) > 1:
+            lines.append(f"{field} has no effect where {switch} is False; cells that differ in it alone are the same")
     return lines
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Which cells of a grid a command is about.
+def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, ...]]:
+    """Adds cells to a directory's grid.
 
-    Attributes:
-        number: one cell, counted from 0; None for all.
-        only: names or shell patterns (``model.depth=True,*``); of the cells those that match any. Empty for all.
-        skip: likewise, those that are left out.
-    """
+    A cell with the values of an earlier one is that one, under its earlier name. The others are named by all fields
+    that vary now.
 
-    number: int | None = None
-    only: Sequence[str] = ()
-    skip: Sequence[str] = ()
+    Args:
+        out: the directory, for the error.
 
-    def of(self, cells: Sequence[Cell]) -> tuple[Cell, ...]:
-        """The chosen cells, in order.
-
-        Raises:
-            GridError: there is no such number, or a name or pattern that fits no cell.
-        """
-        for flag, patterns in (("--only", self.only), ("--skip", self.skip)):
-            for pattern in patterns:
-                if not _matches(cells, [pattern]):
-                    near = did_you_mean(pattern, [cell.name for cell in cells])
-                    raise GridError(f"{flag} {pattern}: no such cell{near} (--list names them)")
-        if self.number is not None and not 0 <= self.number < len(cells):
-            raise GridError(
-                f"cell {self.number} is not in this grid, whose cells are 0 … {len(cells) - 1} (--list names them)"
-            )
-        kept = _matches(cells, self.only) if self.only else {cell.name for cell in cells}
-        kept -= _matches(cells, self.skip)
-        numbered = enumerate(cells)
-        return tuple(cell for i, cell in numbered if cell.name in kept and self.number in (None, i))
-
-
-def task_number(environment: Mapping[str, str]) -> int | None:
-    """Which cell a task of a Slurm array job is to run; None outside of array jobs.
+    Returns:
+        The whole grid, and the names of the new cells in it.
 
     Raises:
-        GridError: the variable is not a number.
+        ConfigError: the earlier cells have another configuration; the message names the differing fields.
     """
-    text = environment.get(TASK)
-    if not text:
+    if before is None:
+        return new, tuple(new.cells)
+    fields = tuple(dict.fromkeys((*before.fields, *new.fields)))
+    old, now = (leaves(next(iter(grid.cells.values()))) for grid in (before, new))
+    unset = Leaf("not set", None, False)
+    pairs = {name: (old.get(name, unset), now.get(name, unset)) for name in old | now if name not in (*fields, SEED)}
+    differing = [
+        f"{name} is {there.value} there, {here.value} here"
+        for name, (there, here) in pairs.items()
+        if there.value != here.value and not here.runtime
+    ]
+    require(
+        not differing,
+        f"{out} holds a grid of another configuration ({'; '.join(differing)}); choose another --out, or vary these "
+        f"fields with --grid",
+    )
+    # All other fields agree, so these values tell cells apart.
+    names = {tuple(values_of(config, (*fields, SEED)).values()): name for name, config in before.cells.items()}
+    cells = dict[str, Config]()
+    for config in new.cells.values():
+        values = values_of(config, fields)
+        name = names.get((*values.values(), config.train.seed)) or cell_name(values, config.train.seed)
+        cells[name] = config
+    return Grid(fields, {**before.cells, **cells}), tuple(cells)
+
+
+def read_grid(out: Path) -> Grid | None:
+    """Reads a directory's ``grid.json``; returns None where there is none.
+
+    Raises:
+        ConfigError: the file is damaged or of another version.
+    """
+    path = out / FILE
+    if not path.exists():
         return None
-    if not text.isdigit():
-        raise GridError(f"{TASK} is {text!r}, not a cell's number; unset it, or choose with --cell")
-    return int(text)
+    try:
+        saved = read_json(path)
+        base = from_dict(Config, saved["config"])
+        cells = {name: with_values(base, values) for name, values in saved["cells"].items()}
+        return Grid(tuple(saved["fields"]), cells, saved["versions"])
+    except (UserError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path}: damaged or of another version ({error}); choose another --out") from error
 
 
-def _matches(cells: Sequence[Cell], patterns: Sequence[str]) -> set[str]:
-    return {cell.name for cell in cells if any(fnmatchcase(cell.name, pattern) for pattern in patterns)}
+def add_cells(out: Path, new: Grid, choice: Choice) -> tuple[Grid, tuple[str, ...]]:
+    """Writes ``grid.json`` with these cells added; a bad choice changes nothing.
+
+    Returns:
+        The whole grid, and the names of the chosen ones among the new cells.
+
+    Raises:
+        ConfigError: as :func:`merge` and :meth:`Choice.of`.
+    """
+    with lock(out / ".locks" / "grid", wait=f"{out}: waiting for another command that writes {FILE}"):
+        before = read_grid(out)
+        grid, names = merge(before, new, out)
+        chosen = choice.of(names)
+        if before and before.versions != grid.versions:
+            then, now = (", ".join(map(" ".join, each.versions.items())) for each in (before, grid))
+            note(f"{out}: earlier cells may be of other versions ({then}; now {now})")
+        base = to_dict(next(iter(grid.cells.values())))
+        cells = {name: values_of(config, (*grid.fields, SEED)) for name, config in grid.cells.items()}
+        content = {"fields": grid.fields, "cells": cells, "config": base, "versions": grid.versions}
+        with disk_guard(out):
+            write_atomically(out / FILE, json.dumps(content, indent=1).encode())
+    return grid, chosen

@@ -1,55 +1,82 @@
-"""The one table of a grid: every combination of values, with the mean and standard deviation over its seeds."""
+"""The results of a grid's cells and their table: a row per combination of values, mean ± deviation over the seeds."""
 
 import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from rsjax.ablation.fields import Value
-from rsjax.ablation.results import Result
+from rsjax.ablation.grid import Value, values_of
+from rsjax.files import FileError, is_held, read_json
+from rsjax.pipeline.run import STAGES, Run
+from rsjax.training.log import read_log
 
+ERROR = "error.json"  # in the directory of a cell that failed
+FINAL_SHARE = 0.1  # of the logged steps, over which a loss term is averaged
 ABSENT = "–"
+LEGEND = (
+    "Mean ± sample standard deviation over the finished seeds (of all). **Bold**: the best mean of its column, "
+    "which may be chance. L_RGB: training loss, mean over the last tenth of the logged steps."
+)
+State = Literal["finished", "running", "failed", "interrupted", "missing"]
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A column: its key in a cell's metrics, its heading, the digits shown, and whether more is better."""
+class Column(NamedTuple):
+    """A metric of the table."""
 
-    key: str
-    heading: str
-    digits: int
-    more: bool
+    name: str  # in a cell's metrics
+    title: str
+    unit: str
+    better: Literal["higher", "lower"]
+    decimals: int
+
+    @property
+    def heading(self) -> str:
+        """``PSNR, dB ↑``."""
+        return f"{self.title}{', ' if self.unit else ''}{self.unit} {'↑' if self.better == 'higher' else '↓'}"
 
 
-METRICS = (
-    Metric("psnr", "PSNR, dB ↑", 2, True),
-    Metric("ssim", "SSIM ↑", 4, True),
-    Metric("depth_absrel", "depth AbsRel ↓", 4, False),
-    Metric("depth_delta1", "depth δ₁ ↑", 4, True),
-    Metric("delta_psnr", "ΔPSNR, dB ↑", 2, True),
-    Metric("loss_rgb", "L_RGB ↓", 3, False),
+COLUMNS = (
+    Column("psnr", "PSNR", "dB", "higher", 2),
+    Column("ssim", "SSIM", "", "higher", 4),
+    Column("depth_absrel", "depth AbsRel", "", "lower", 4),
+    Column("depth_delta1", "depth δ₁", "", "higher", 4),
+    Column("delta_psnr", "ΔPSNR", "dB", "higher", 2),
+    Column("loss_rgb", "L_RGB", "", "lower", 3),
 )
 
 
 @dataclass(frozen=True)
-class Spread:
+class Result:
+    """A cell's state, and its metrics once it is finished.
+
+    Attributes:
+        reason: one line that says why there are no metrics.
+        metrics: the numbers of ``metrics.json``, and ``loss_rgb`` … at the end of training.
+    """
+
+    run: Run
+    state: State
+    reason: str
+    metrics: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """The cell's."""
+        return self.run.directory.name
+
+
+class Spread(NamedTuple):
     """Mean and sample standard deviation (n - 1; None for one value) of n values."""
 
     mean: float
     std: float | None
     n: int
-
-    @classmethod
-    def over(cls, values: Iterable[float]) -> "Spread | None":
-        """Of these values; None where there are none."""
-        array = np.array(list(values), np.float64)
-        if not len(array):
-            return None
-        return cls(float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else None, len(array))
 
 
 @dataclass(frozen=True)
@@ -57,12 +84,12 @@ class Row:
     """The cells that differ in their seed alone.
 
     Attributes:
-        values: of the fields that vary.
+        values: the value of every field that varies.
         results: one per seed.
-        spreads: over the finished ones, by metric; every metric that any of them has.
+        spreads: of the finished results, for every metric that any of them has.
     """
 
-    values: Mapping[str, Value]
+    values: dict[str, Value]
     results: tuple[Result, ...]
     spreads: Mapping[str, Spread]
 
@@ -71,99 +98,127 @@ class Row:
         """``model.depth True, loss.keypoints False``."""
         return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as configured"
 
-    @property
-    def finished(self) -> list[Result]:
-        return [result for result in self.results if result.state == "finished"]
+
+def lock_of(run: Run) -> Path:
+    """Returns the path of the lock that a process holds while it runs the cell."""
+    return run.directory.parent / ".locks" / f"cell-{run.directory.name}"
 
 
-def tabulate(results: Sequence[Result]) -> list[Row]:
-    """Rows in the order of their first cells."""
+def read_result(run: Run) -> Result:
+    """Reads a cell's state and metrics; damaged files count as unfinished, and nothing is changed."""
+    if is_held(lock_of(run)):
+        return Result(run, "running", "in another process", {})
+    if (metrics := read_metrics(run)) is not None:
+        return Result(run, "finished", "", metrics)
+    with suppress(FileError):
+        return Result(run, "failed", str(read_json(run.directory / ERROR).get("error")), {})
+    if run.directory.exists():
+        done = sum(run.finished(stage) for stage in STAGES)
+        return Result(run, "interrupted", f"{done} of {len(STAGES)} stages are finished", {})
+    return Result(run, "missing", "not started", {})
+
+
+def read_metrics(run: Run) -> dict[str, float] | None:
+    """Returns a run's metrics and the end of its loss terms; None where it is not finished."""
+    if not run.finished("report"):
+        return None
+    try:
+        saved = read_json(run.directory / "metrics.json")
+    except FileError:
+        return None
+    numbers = {name: float(value) for name, value in saved.items() if isinstance(value, int | float)}
+    terms = run.config.loss.terms(run.config.model.depth)
+    return numbers | final_terms(read_log(run.directory / "world_model"), tuple(terms))
+
+
+def final_terms(log: Sequence[Mapping[str, Any]], terms: Sequence[str]) -> dict[str, float]:
+    """Returns ``loss_<term>``: each term's mean over the last tenth of the logged steps (at least one)."""
+    steps = [row for row in log if any(term in row for term in terms)]  # validation metrics have rows of their own
+    last = steps[-max(1, round(FINAL_SHARE * len(steps))) :]
+    values = {term: [row[term] for row in last if term in row] for term in terms}
+    return {f"loss_{term}": float(np.mean(numbers)) for term, numbers in values.items() if numbers}
+
+
+def tabulate(results: Iterable[Result], fields: Sequence[str]) -> list[Row]:
+    """Groups results by the values of the fields that vary, in the order of their first cells."""
     groups: dict[tuple[Value, ...], list[Result]] = {}
     for result in results:
-        groups.setdefault(tuple(result.cell.values.values()), []).append(result)
-    return [_row(group) for group in groups.values()]
+        groups.setdefault(tuple(values_of(result.run.config, fields).values()), []).append(result)
+    rows = []
+    for values, group in groups.items():
+        names = dict.fromkeys(name for result in group for name in result.metrics)
+        spreads = {name: spread([r.metrics[name] for r in group if name in r.metrics]) for name in names}
+        rows.append(Row(dict(zip(fields, values, strict=True)), tuple(group), spreads))
+    return rows
 
 
-def _row(group: list[Result]) -> Row:
-    names = dict.fromkeys(name for result in group for name in result.metrics)
-    spreads = {name: Spread.over(r.metrics[name] for r in group if name in r.metrics) for name in names}
-    return Row(group[0].cell.values, tuple(group), {name: s for name, s in spreads.items() if s is not None})
+def spread(values: Sequence[float]) -> Spread:
+    """Returns mean, sample standard deviation and count of one or more values."""
+    std = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return Spread(float(np.mean(values)), std, len(values))
 
 
-def best(rows: Sequence[Row], metric: Metric) -> set[int]:
-    """The rows with the best mean as shown, to its digits; none where fewer than two rows have one to compare."""
-    spreads = {i: row.spreads[metric.key] for i, row in enumerate(rows) if metric.key in row.spreads}
-    means = {i: round(spread.mean, metric.digits) for i, spread in spreads.items()}
-    means = {i: mean for i, mean in means.items() if not math.isnan(mean)}
-    if len(means) < 2:
-        return set()
-    top = (max if metric.more else min)(means.values())
-    return {i for i, mean in means.items() if mean == top}
+def best(rows: Sequence[Row], column: Column) -> set[int]:
+    """Returns the rows whose mean, rounded as shown, is the best; none where fewer than two rows have a mean."""
+    spreads = {i: row.spreads[column.name] for i, row in enumerate(rows) if column.name in row.spreads}
+    means = {i: round(s.mean, column.decimals) for i, s in spreads.items() if not math.isnan(s.mean)}
+    top = (max if column.better == "higher" else min)(means.values(), default=None)
+    return {i for i, mean in means.items() if mean == top} if len(means) > 1 else set()
 
 
-def present(rows: Sequence[Row]) -> tuple[Metric, ...]:
-    """The columns that any row has a number for."""
-    return tuple(metric for metric in METRICS if any(metric.key in row.spreads for row in rows))
+def shown_columns(rows: Sequence[Row]) -> tuple[Column, ...]:
+    """Returns the columns that any row has a number for."""
+    return tuple(column for column in COLUMNS if any(column.name in row.spreads for row in rows))
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """The table, what its marks mean, and every cell that is not in it with the reason."""
-    fields, metrics = list(rows[0].values), present(rows)
-    lines = [[*fields, "seeds", *(metric.heading for metric in metrics)]]
-    top = {metric.key: best(rows, metric) for metric in metrics}
-    for i, row in enumerate(rows):
-        numbers = [_cell(row.spreads.get(m.key), m, bold=i in top[m.key]) for m in metrics]
-        seeds = f"{len(row.finished)}/{len(row.results)}"
-        values = [str(row.values[field]).replace("|", r"\|") for field in fields]
-        lines.append([*values, seeds, *numbers])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    rule = ["-" * width for width in widths]
-    padded = [
-        [text.ljust(width) for text, width in zip(line, widths, strict=True)] for line in (lines[0], rule, *lines[1:])
-    ]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in padded)
-    legend = (
-        "Mean ± sample standard deviation over the finished seeds (of all). **Bold**: the best mean of its column, "
-        "which need not be more than chance. L_RGB: training loss, mean over the last tenth of the logged steps."
-    )
-    return "\n\n".join([table, legend, *_absent(rows)]) + "\n"
+def as_markdown(rows: Sequence[Row]) -> str:
+    """Returns the table, its legend, and every cell that is not in it with the reason."""
+    columns, fields = shown_columns(rows), list(rows[0].values)
+    texts = [[*fields, "seeds", *(column.heading for column in columns)]]
+    for row in rows:
+        finished = sum(result.state == "finished" for result in row.results)
+        values = [str(value).replace("|", r"\|") for value in row.values.values()]
+        texts.append([*values, f"{finished}/{len(row.results)}", *(_number(row, column) for column in columns)])
+    for x, column in enumerate(columns, start=len(fields) + 1):
+        for y in best(rows, column):
+            texts[y + 1][x] = f"**{texts[y + 1][x]}**"
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    texts.insert(1, ["-" * width for width in widths])
+    lines = [" | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) for line in texts]
+    parts = ["\n".join(f"| {line} |" for line in lines), LEGEND]
+    absent = [result for row in rows for result in row.results if result.state != "finished"]
+    if absent:
+        parts.append("Not in the table:\n\n" + "\n".join(f"- {r.name}: {r.state} ({r.reason})" for r in absent))
+    return "\n\n".join(parts) + "\n"
 
 
-def _cell(spread: Spread | None, metric: Metric, bold: bool) -> str:
-    if spread is None:
+def _number(row: Row, column: Column) -> str:
+    if column.name not in row.spreads:
         return ABSENT
-    text = f"{spread.mean:.{metric.digits}f}" + ("" if spread.std is None else f" ± {spread.std:.{metric.digits}f}")
-    return f"**{text}**" if bold else text
-
-
-def _absent(rows: Sequence[Row]) -> list[str]:
-    left = [result for row in rows for result in row.results if result.state != "finished"]
-    if not left:
-        return []
-    return ["Not in the table:\n\n" + "\n".join(f"- {r.cell.name}: {r.state} ({r.reason})" for r in left)]
+    return " ± ".join(f"{x:.{column.decimals}f}" for x in row.spreads[column.name][:2] if x is not None)
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """One line per row: the values, then mean, standard deviation and n of every metric; empty where there is none."""
-    names = list(dict.fromkeys(name for row in rows for name in row.spreads))
+    """Returns one line per row: its values, then mean, standard deviation and n of every metric, empty where absent."""
+    names = dict.fromkeys(name for row in rows for name in row.spreads)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*rows[0].values, *(f"{name}_{part}" for name in names for part in ("mean", "std", "n"))])
+    writer.writerow([*rows[0].values, *(f"{name}_{part}" for name in names for part in Spread._fields)])
     for row in rows:
-        spreads = [row.spreads.get(name) for name in names]
-        parts = [part for s in spreads for part in ((s.mean, s.std, s.n) if s else (None, None, 0))]
-        writer.writerow([*row.values.values(), *parts])
+        numbers = [number for name in names for number in row.spreads.get(name, (None, None, 0))]
+        writer.writerow([*row.values.values(), *numbers])
     return text.getvalue()
 
 
 def as_json(rows: Sequence[Row]) -> dict[str, Any]:
-    """Everything: rows with all their metrics, which row is best in each column, and every cell with its state."""
+    """Returns the rows with all their metrics, the best rows of each column, and every cell with its state."""
     return {
-        "rows": [{"values": dict(row.values)} | {name: vars(s) for name, s in row.spreads.items()} for row in rows],
-        "best": {metric.key: sorted(best(rows, metric)) for metric in present(rows)},
-        "cells": [
-            {"name": r.cell.name, "seed": r.cell.seed, "state": r.state, "reason": r.reason, "metrics": dict(r.metrics)}
-            for row in rows
-            for r in row.results
-        ],
+        "rows": [{"values": row.values} | {k: s._asdict() for k, s in row.spreads.items()} for row in rows],
+        "best": {column.name: sorted(best(rows, column)) for column in shown_columns(rows)},
+        "cells": [_cell_json(result) for row in rows for result in row.results],
     }
+
+
+def _cell_json(result: Result) -> dict[str, Any]:
+    seed, metrics = result.run.config.train.seed, dict(result.metrics)
+    return {"name": result.name, "seed": seed, "state": result.state, "reason": result.reason, "metrics": metrics}

@@ -1,10 +1,5 @@
-"""What made a run: configuration, code, packages, machines and data, kept in its directory for every start.
+"""What made a run: configuration, code, packages, machine and data, in ``run.json`` with an entry for every start."""
 
-``run.json`` holds a list of starts. The first names everything, the later ones their time and what differs from the
-start before: so a run that was resumed a hundred times stays readable, and shows when its code or its machines changed.
-"""
-
-import dataclasses
 import hashlib
 import importlib.metadata
 import json
@@ -12,6 +7,7 @@ import os
 import platform
 import socket
 import subprocess
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,94 +15,80 @@ from typing import Any
 import jax
 
 import rsjax
-from rsjax.config import Config, to_dict
+from rsjax.config import to_dict
 from rsjax.data.store import MANIFEST
-from rsjax.errors import UserError
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import disk_guard, read_json, write_atomically
 from rsjax.pipeline.run import Run
-from rsjax.progress import note
 
 NAME = "run.json"
-DECIDE = ("code", "packages", "data")  # a change of these may change results though the configuration is the same
-
-
-class ProvenanceError(UserError):
-    """A ``run.json`` that cannot be read; the next start of the run moves it aside."""
+DECIDE = ("code", "packages", "data")  # they may change results although the configuration is the same
 
 
 def read_starts(directory: Path) -> list[dict[str, Any]]:
-    """Every start of a run, oldest first, each complete.
+    """Reads every start of a run, oldest first.
 
     Returns:
-        Dicts of ``time`` (ISO 8601, UTC), ``command``, ``config`` (resolved), ``keys`` (of the stages), ``seeds``,
-        ``code``, ``packages``, ``machine`` and ``data``. Empty where the run was never started.
+        Dicts of ``time`` (ISO 8601, UTC), ``command``, ``config`` (resolved), ``keys`` (of the stages), ``code``,
+        ``packages``, ``machine`` and ``data``. Empty where the run was never started.
 
     Raises:
-        ProvenanceError: the file is damaged.
+        FileError: the file is damaged.
     """
-    starts: list[dict[str, Any]] = []
-    for differing in _read(directory / NAME):
-        starts.append((starts[-1] if starts else {}) | differing)
-    return starts
+    path = directory / NAME
+    return read_json(path, list) if path.exists() else []
 
 
 def record_start(run: Run, command: str) -> list[str]:
-    """Appends this start; called once by the lead process, when the devices are known and the directory is there.
-
-    A damaged file is moved aside.
+    """Appends this start; called once by the lead process, after the devices are set up and the directory is made.
 
     Args:
         command: how the run was started.
 
     Returns:
-        Which of ``DECIDE`` are not what they were at the last start.
+        Which of ``DECIDE`` have changed since the last start. Data and packages that are new are no change.
 
     Raises:
-        StoreError: the disk is full.
+        FileError: the file is damaged, or the disk is full.
     """
-    try:
-        before = (read_starts(run.directory) or [{}])[-1]
-    except ProvenanceError as error:
-        path = run.directory / NAME
-        note(f"{error}; it is now {path.name}.damaged, and a new one is begun")
-        os.replace(path, path.with_name(f"{path.name}.damaged"))
-        before = {}
     now: dict[str, Any] = {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "config": to_dict(run.config),
         "keys": run.keys(),
-        "seeds": _seeds(run.config),
         "code": code_version(Path(rsjax.__file__).resolve().parents[1]),
-        "packages": {d.metadata["Name"]: d.version for d in sorted(importlib.metadata.distributions(), key=_name)},
+        "packages": dict(sorted((each.metadata["Name"], each.version) for each in importlib.metadata.distributions())),
         "machine": _machine(),
         "data": data_fingerprints(run),
     }
-    differing = {name: value for name, value in now.items() if name == "time" or before.get(name) != value}
-    _write(run.directory, [*_read(run.directory / NAME), differing])
-    # What was not there yet is no change: data that are made later, a package that nothing used.
-    return [name for name in DECIDE if any(_other(v, now[name].get(k)) for k, v in before.get(name, {}).items())]
+    starts = read_starts(run.directory)
+    _write(run.directory, [*starts, now])
+    before = starts[-1] if starts else {}
+    return [name for name in DECIDE if any(_differ(old, now[name].get(k)) for k, old in before.get(name, {}).items())]
 
 
-def _other(before: Any, now: Any) -> bool:
-    """Whether two entries differ in more than the place where the data lie."""
+def _differ(before: Any, now: Any) -> bool:
+    """Whether two entries differ in more than the place of the data."""
     if isinstance(before, dict) and isinstance(now, dict):
         return before | {"path": ""} != now | {"path": ""}
     return before != now
 
 
 def record_data(run: Run) -> None:
-    """Completes the last start by the data that it has made since."""
-    starts, data = read_starts(run.directory), data_fingerprints(run)
-    if starts and starts[-1]["data"] != data:
-        differing = _read(run.directory / NAME)
-        _write(run.directory, [*differing[:-1], differing[-1] | {"data": data}])
+    """Adds the data that the last start has made since to its entry."""
+    starts = read_starts(run.directory)
+    if starts:
+        _write(run.directory, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
+
+
+def _write(directory: Path, starts: list[dict[str, Any]]) -> None:
+    with disk_guard(directory):
+        write_atomically(directory / NAME, json.dumps(starts, indent=1).encode())
 
 
 def data_fingerprints(run: Run) -> dict[str, Any]:
-    """What identifies each data set of a run that is there: its place, content key, splits, and its manifest's hash.
+    """Returns path, content key, manifest hash and the size of each split of every data set that exists.
 
-    The manifest names all files with their sizes and numbers of records.
+    The manifest names all files with their sizes and numbers of records, so its hash changes with them.
     """
     stores = {"clips": run.clips, "tokens": run.output("tokens")}
     loops = (run.config.tokenizer_train, run.config.train)
@@ -114,17 +96,28 @@ def data_fingerprints(run: Run) -> dict[str, Any]:
     return {name: _fingerprint(path) for name, path in stores.items() if (path / MANIFEST).exists()}
 
 
-def code_version(root: Path) -> dict[str, Any]:
-    """The revision of the checkout at ``root``, whether it differs from what is committed, and a hash of how.
+def _fingerprint(path: Path) -> dict[str, Any]:
+    raw = (path / MANIFEST).read_bytes()
+    known: dict[str, Any] = {"path": str(path.absolute()), "manifest_sha256": hashlib.sha256(raw).hexdigest()}
+    with suppress(ValueError, KeyError, TypeError):  # the stage that reads a damaged one reports it
+        manifest = json.loads(raw)
+        files = {name: split["files"] for name, split in manifest["splits"].items()}
+        splits = {name: {of: sum(file[of] for file in files[name]) for of in ("count", "bytes")} for name in files}
+        known |= {"key": manifest.get("key"), "splits": splits}
+    return known
 
-    All null where there is no checkout; the hash is of ``git diff HEAD``, which does not see new files.
+
+def code_version(root: Path) -> dict[str, Any]:
+    """Returns version, git revision, whether the checkout at ``root`` has changes, and the hash of ``git diff HEAD``.
+
+    All but the version are null without a checkout. The diff does not include new files.
     """
-    found: dict[str, Any] = {"version": rsjax.__version__, "revision": None, "dirty": None, "diff_sha256": None}
+    code: dict[str, Any] = {"version": rsjax.__version__, "revision": None, "dirty": None, "diff_sha256": None}
     # An environment inside somebody else's checkout is not that checkout's code.
     if _git(root, "rev-parse", "--show-toplevel") != str(root.resolve()):
-        return found
+        return code
     status, diff = _git(root, "status", "--porcelain"), _git(root, "diff", "HEAD")
-    return found | {
+    return code | {
         "revision": _git(root, "rev-parse", "HEAD"),
         "dirty": None if status is None else bool(status),
         "diff_sha256": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
@@ -153,38 +146,3 @@ def _machine() -> dict[str, Any]:
         "processes": jax.process_count(),
         "environment": {k: v for k, v in sorted(os.environ.items()) if k.startswith(("JAX_", "XLA_"))},
     }
-
-
-def _seeds(config: Config) -> dict[str, int]:
-    sections = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
-    return {f"{name}.seed": section.seed for name, section in sections.items() if hasattr(section, "seed")}
-
-
-def _fingerprint(path: Path) -> dict[str, Any]:
-    raw = (path / MANIFEST).read_bytes()
-    found: dict[str, Any] = {"path": str(path.absolute()), "manifest_sha256": hashlib.sha256(raw).hexdigest()}
-    try:
-        manifest = json.loads(raw)
-        splits = {
-            name: {of: sum(file[of] for file in split["files"]) for of in ("count", "bytes")}
-            for name, split in manifest["splits"].items()
-        }
-    except (ValueError, KeyError, TypeError):  # a damaged one is told by the stage that reads it
-        return found
-    return found | {"key": manifest.get("key"), "splits": splits}
-
-
-def _name(distribution: importlib.metadata.Distribution) -> str:
-    return distribution.metadata["Name"].lower()
-
-
-def _read(path: Path) -> list[dict[str, Any]]:
-    try:
-        return json.loads(path.read_text())["starts"] if path.exists() else []
-    except (ValueError, KeyError, TypeError) as error:
-        raise ProvenanceError(f"{path}: damaged ({error})") from error
-
-
-def _write(directory: Path, starts: list[dict[str, Any]]) -> None:
-    with disk_guard(directory):
-        write_atomically(directory / NAME, json.dumps({"starts": starts}, indent=1).encode())

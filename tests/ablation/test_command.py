@@ -18,6 +18,6 @@ def test_a_cell_is_the_run_that_its_configuration_makes_alone(debug: Path, comma
     assert metrics[0] == metrics[1] != metrics[2]
     logs = [{name for row in read_log(run / "world_model") for name in row} for run in (debug, same, other)]
     assert logs[0] == logs[1] == logs[2] | {"keypoint", "attention"}
-    told = json.loads((out / "table.json").read_text())
-    assert [cell["metrics"]["psnr"] for cell in told["cells"]] == [metrics[1]["psnr"], metrics[2]["psnr"]]
+    table = json.loads((out / "table.json").read_text())
+    assert [cell["metrics"]["psnr"] for cell in table["cells"]] == [metrics[1]["psnr"], metrics[2]["psnr"]]
     assert all((run / "report.html").exists() for run in (same, other))

@@ -1,14 +1,32 @@
+import json
 import os
+from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.ablation.fields import GridError, leaves
-from rsjax.ablation.grid import DEFAULT_AXES, Choice, cell_name, expand, idle, parse_axes, task_number
-from rsjax.config import presets
+from rsjax.ablation.grid import (
+    DEFAULT_AXES,
+    SEED,
+    SWITCHES,
+    Choice,
+    Grid,
+    add_cells,
+    cell_name,
+    expand,
+    merge,
+    parse_axes,
+    parse_value,
+    read_grid,
+    repeated_cells,
+    values_of,
+)
+from rsjax.config import ConfigError, presets
+from rsjax.config.leaves import leaves
 from tests.ablation import toy
 
 DEBUG = presets.debug()
@@ -33,16 +51,14 @@ def test_every_combination_is_there_once_in_order_and_is_what_it_says(
     grid: dict[str, list[Any]], seeds: list[int]
 ) -> None:
     axes = parse_axes(DEBUG, [f"{name}={','.join(map(str, values))}" for name, values in grid.items()])
-    cells = expand(DEBUG, axes, seeds)
-    assert [(cell.seed, *cell.values.values()) for cell in cells] == list(product(seeds, *grid.values()))
-    assert len({cell.name for cell in cells}) == len(cells)
-    assert len({cell.config for cell in cells}) == len(cells)
-    for cell in cells:
-        found = leaves(cell.config)
-        assert {name: found[name].value for name in grid} == dict(cell.values)
-        assert cell.config.train.seed == cell.seed
-        others = {name: leaf for name, leaf in leaves(DEBUG).items() if name not in (*grid, "train.seed")}
-        assert {name: found[name] for name in others} == others
+    found = expand(DEBUG, axes, seeds)
+    assert found.fields == tuple(grid)
+    expected = list(product(seeds, *grid.values()))
+    assert len(found.cells) == len(set(found.cells.values())) == len(expected)
+    others = [name for name in leaves(DEBUG) if name not in (*grid, SEED)]
+    for config, values in zip(found.cells.values(), expected, strict=True):
+        assert tuple(values_of(config, (SEED, *grid)).values()) == values
+        assert values_of(config, others) == values_of(DEBUG, others)
 
 
 @given(st.dictionaries(st.sampled_from(sorted(VALUES)), st.text(max_size=80), min_size=1), st.integers(0, 9))
@@ -60,12 +76,40 @@ def test_names_that_had_to_be_changed_stay_apart() -> None:
 
 
 def test_without_axes_there_is_a_cell_per_seed() -> None:
-    assert [cell.name for cell in toy.cells(seeds=(4, 2))] == ["seed=4", "seed=2"]
+    assert list(toy.grid(seeds=(4, 2)).cells) == ["seed=4", "seed=2"]
 
 
 def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
-    cells = toy.cells(*DEFAULT_AXES)
-    assert [(c.config.model.depth, c.config.loss.keypoints) for c in cells] == list(product((True, False), repeat=2))
+    cells = toy.grid(*DEFAULT_AXES).cells.values()
+    assert [(c.model.depth, c.loss.keypoints) for c in cells] == list(product((True, False), repeat=2))
+
+
+def test_the_named_fields_exist() -> None:
+    assert set(SWITCHES) | set(SWITCHES.values()) | {SEED} <= set(leaves(DEBUG))
+
+
+def test_a_value_as_printed_is_read_back() -> None:
+    for name, leaf in leaves(DEBUG).items():
+        if not isinstance(leaf.value, tuple):
+            value = parse_value(name, leaf.kind, str(leaf.value))
+            assert (value, type(value)) == (leaf.value, type(leaf.value)), name
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("model.depth", "Tru", "model.depth is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
+        ("sample.unmask", "greed", "did you mean 'greedy'? (choices: random, greedy)"),
+        ("loss.gamma", "five", "loss.gamma is 'five' in the grid; it takes a number"),
+        ("loss.gamma", "nan", "it takes a number"),
+        ("loss.num_keypoints", "8.5", "it takes a whole number"),
+        ("tokenizer.channel_multipliers", "1", "takes several values"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(name: str, text: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_value(name, leaves(DEBUG)[name].kind, text)
+    assert line in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -75,22 +119,22 @@ def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
         (["gamma=1"], "did you mean 'loss.gamma'?"),
         (["loss.gamma"], "write FIELD=VALUE,VALUE"),
         (["loss.gamma="], "write FIELD=VALUE,VALUE"),
-        (["loss.gamma=1,1.0"], "a value stands twice"),
+        (["loss.gamma=1,1.0"], "a value is repeated"),
         (["loss.gamma=1", "--loss.gamma=2"], "loss.gamma has an axis already"),
-        (["train.seed=1,2"], "seeds have an option of their own, --seeds 1 2"),
-        (["name=a"], "the preset's name changes nothing"),
+        (["train.seed=1,2"], "seeds have their own option, --seeds 1 2"),
+        (["name=a"], "the preset's name has no effect"),
         (["loss.num-keypoints=1,x"], "loss.num_keypoints is 'x' in the grid; it takes a whole number"),
     ],
 )
 def test_each_mistake_in_an_axis_gets_a_line(texts: list[str], line: str) -> None:
-    with pytest.raises(GridError) as caught:
+    with pytest.raises(ConfigError) as caught:
         parse_axes(DEBUG, texts)
     assert line in str(caught.value)
 
 
 def test_cells_that_cannot_run_are_named_before_any_runs() -> None:
-    with pytest.raises(GridError) as caught:
-        toy.cells("loss.num_keypoints=8,65", "loss.keypoints=True,False")
+    with pytest.raises(ConfigError) as caught:
+        toy.grid("loss.num_keypoints=8,65", "loss.keypoints=True,False")
     assert "1 of 4 cells cannot run; the first is loss.num_keypoints=65,loss.keypoints=True,seed=0: " in str(
         caught.value
     )
@@ -99,37 +143,98 @@ def test_cells_that_cannot_run_are_named_before_any_runs() -> None:
 
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (2**32,)])
 def test_seeds_are_given_once_and_in_range(seeds: tuple[int, ...]) -> None:
-    with pytest.raises(GridError, match="--seeds"):
-        toy.cells(seeds=seeds)
+    with pytest.raises(ConfigError, match="--seeds"):
+        toy.grid(seeds=seeds)
 
 
-def test_a_weight_of_a_term_that_is_off_is_told() -> None:
-    assert idle(toy.cells("loss.gamma=4,5", "loss.keypoints=True,False")) == [
-        "loss.gamma changes nothing where loss.keypoints is False; cells that differ in it alone are the same"
+def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
+    assert repeated_cells(toy.grid("loss.gamma=4,5", "loss.keypoints=True,False")) == [
+        "loss.gamma has no effect where loss.keypoints is False; cells that differ in it alone are the same"
     ]
-    assert not idle(toy.cells("loss.gamma=4,5", "model.depth=True,False"))
+    assert not repeated_cells(toy.grid("loss.gamma=4,5", "model.depth=True,False"))
 
 
 def test_cells_are_chosen_by_number_name_and_pattern() -> None:
-    cells = toy.cells(*DEFAULT_AXES, seeds=(0, 1))
-    names = [cell.name for cell in cells]
-    assert [c.name for c in Choice().of(cells)] == names
-    assert [c.name for c in Choice(number=3).of(cells)] == [names[3]]
-    assert [c.name for c in Choice(only=("*seed=1", names[0])).of(cells)] == [names[0], *names[4:]]
-    assert [c.name for c in Choice(only=("*seed=1",), skip=("model.depth=True,*",)).of(cells)] == names[6:]
-    assert Choice(number=0, only=("*seed=1",)).of(cells) == ()
+    names = list(toy.grid(*DEFAULT_AXES, seeds=(0, 1)).cells)
+    assert list(Choice().of(names)) == names
+    assert list(Choice(number=3).of(names)) == [names[3]]
+    assert list(Choice(only=("*seed=1", names[0])).of(names)) == [names[0], *names[4:]]
+    assert list(Choice(only=("*seed=1",), skip=("model.depth=True,*",)).of(names)) == names[6:]
+    assert Choice(number=0, only=("*seed=1",)).of(names) == ()
     for choice, line in (
-        (Choice(number=8), "cell 8 is not in this grid, whose cells are 0 … 7"),
+        (Choice(number=8), "cell 8 is not in this grid; its cells are 0 … 7"),
         (Choice(only=(names[0].replace("Tr", "T"),)), f"did you mean '{names[0]}'"),
         (Choice(skip=("seed",)), "--skip seed: no such cell"),
     ):
-        with pytest.raises(GridError) as caught:
-            choice.of(cells)
+        with pytest.raises(ConfigError) as caught:
+            choice.of(names)
         assert line in str(caught.value)
 
 
-def test_an_array_jobs_task_runs_the_cell_of_its_number() -> None:
-    assert task_number({}) is None
-    assert task_number({"SLURM_ARRAY_TASK_ID": "11"}) == 11
-    with pytest.raises(GridError, match="SLURM_ARRAY_TASK_ID is 'x'"):
-        task_number({"SLURM_ARRAY_TASK_ID": "x"})
+def add(out: Path, grid: Grid) -> tuple[str, ...]:
+    return add_cells(out, grid, Choice())[1]
+
+
+def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
+    assert read_grid(tmp_path) is None
+    grid = toy.grid("loss.gamma=4,5", "sample.unmask=greedy", seeds=(0, 7))
+    assert add(tmp_path, grid) == tuple(grid.cells)
+    assert read_grid(tmp_path) == grid
+    assert grid.fields == ("loss.gamma", "sample.unmask")
+    assert json.loads((tmp_path / "grid.json").read_text())["versions"]["jax"]
+
+
+def test_more_values_fields_and_seeds_add_cells_and_keep_those_there_are(tmp_path: Path) -> None:
+    first = toy.grid("model.depth=True,False")
+    add(tmp_path, first)
+    names = add(tmp_path, toy.grid("loss.gamma=4,5", seeds=(0, 1)))
+    assert names[0] == "model.depth=True,loss.gamma=4.0,seed=0"
+    assert names[1] == "model.depth=True,seed=0", "γ is 5 already: that cell is there"
+    grid = read_grid(tmp_path)
+    assert grid is not None
+    assert list(grid.cells) == ["model.depth=True,seed=0", "model.depth=False,seed=0", names[0], *names[2:]]
+    assert list(grid.cells.values())[:2] == list(first.cells.values())
+    assert grid.fields == ("model.depth", "loss.gamma")
+    assert len(set(grid.cells.values())) == len(grid.cells) == 5
+
+
+def test_cells_of_several_bases_keep_their_values_and_names_apart(tmp_path: Path) -> None:
+    """A field that was varied may differ in the configuration; each cell still has the value it was made with."""
+    add(tmp_path, toy.grid("loss.gamma=4,5"))
+    for gamma in (6.0, 7.0):
+        base = replace(DEBUG, loss=replace(DEBUG.loss, gamma=gamma))
+        add(tmp_path, toy.grid("model.depth=True", base=base))
+    grid = read_grid(tmp_path)
+    assert grid is not None
+    assert [config.loss.gamma for config in grid.cells.values()] == [4.0, 5.0, 6.0, 7.0]
+
+
+def test_another_configuration_is_refused_by_name_and_nothing_changes(tmp_path: Path) -> None:
+    add(tmp_path, toy.grid("loss.gamma=4,5"))
+    before = (tmp_path / "grid.json").read_bytes()
+    wide = replace(DEBUG, model=replace(DEBUG.model, width=64))
+    with pytest.raises(ConfigError) as caught:
+        add(tmp_path, toy.grid("loss.gamma=4,5", base=wide))
+    assert "another configuration (model.width is 32 there, 64 here); choose another --out" in str(caught.value)
+    assert (tmp_path / "grid.json").read_bytes() == before
+
+
+def test_how_runs_are_carried_out_and_the_seed_may_differ(tmp_path: Path) -> None:
+    base = replace(DEBUG, train=replace(DEBUG.train, log_every=1, seed=9))
+    grid, names = merge(toy.grid("loss.gamma=4"), toy.grid("loss.gamma=4", base=base), tmp_path)
+    assert list(grid.cells) == list(names)
+
+
+def test_other_versions_of_the_libraries_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = toy.grid("loss.gamma=4")
+    add(tmp_path, replace(grid, versions={"jax": "0.1"}))
+    assert not capsys.readouterr().out
+    add(tmp_path, grid)
+    assert "earlier cells may be of other versions (jax 0.1; now rsjax" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("text", ["{", "{}", '{"config": {"name": "x", "nonsense": 1}}', "[]"])
+def test_a_damaged_file_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "grid.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"grid.json: damaged or of another version .* --out"):
+        read_grid(tmp_path)

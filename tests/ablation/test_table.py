@@ -1,7 +1,7 @@
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,76 +10,84 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from rsjax.ablation.figure import draw
-from rsjax.ablation.results import Result, State, final_terms
-from rsjax.ablation.table import METRICS, Spread, as_csv, as_json, best, markdown, present, tabulate
+from rsjax.ablation.sweep import runs_of
+from rsjax.ablation.table import (
+    COLUMNS,
+    Result,
+    Row,
+    as_csv,
+    as_json,
+    as_markdown,
+    best,
+    final_terms,
+    shown_columns,
+    spread,
+    tabulate,
+)
 from tests.ablation import toy
 
-PSNR = METRICS[0]
-CELLS = toy.cells("model.depth=True,False", "loss.keypoints=True,False", seeds=(0, 1, 2))
+PSNR = COLUMNS[0]
+GRID = toy.grid("model.depth=True,False", "loss.keypoints=True,False", seeds=(0, 1, 2))
+RUNS = list(runs_of(GRID, Path("out"), Path("data")).values())
 
 
-def results(metrics: Mapping[int, Mapping[str, float]], others: State = "missing") -> list[Result]:
-    """The cells' results: these are finished with their metrics, and the others are not."""
-    return [
-        Result(cell, "finished", "", metrics[i]) if i in metrics else Result(cell, others, "its reason", {})
-        for i, cell in enumerate(CELLS)
-    ]
+def rows_of(metrics: Mapping[int, Mapping[str, float]]) -> list[Row]:
+    """The table of cells of which these are finished with their metrics, and the others are not."""
+    results = (
+        Result(run, "finished", "", metrics[i]) if i in metrics else Result(run, "missing", "its reason", {})
+        for i, run in enumerate(RUNS)
+    )
+    return tabulate(results, GRID.fields)
 
 
 def full(rng: np.random.Generator) -> dict[int, dict[str, float]]:
-    """Of all cells; those without depth have no depth scores."""
+    """Metrics of all cells; those without depth have no depth metrics."""
     return {
-        i: {m.key: float(rng.normal()) for m in METRICS if cell.config.model.depth or not m.key.startswith("depth")}
-        for i, cell in enumerate(CELLS)
+        i: {c.name: float(rng.normal()) for c in COLUMNS if run.config.model.depth or not c.name.startswith("depth")}
+        for i, run in enumerate(RUNS)
     }
 
 
-@given(st.lists(st.floats(-1e6, 1e6), max_size=8))
-def test_a_spread_is_numpys(values: list[float]) -> None:
-    spread = Spread.over(values)
-    if not values:
-        assert spread is None
-        return
-    assert spread is not None
-    assert spread.n == len(values)
-    assert spread.mean == pytest.approx(np.mean(values), abs=1e-6)
-    if len(values) == 1:
-        assert spread.std is None
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=8))
+def test_a_spread_is_mean_and_sample_deviation(values: list[float]) -> None:
+    mean, std, n = spread(values)
+    assert n == len(values)
+    assert mean == pytest.approx(np.mean(values), abs=1e-6)
+    if n == 1:
+        assert std is None
     else:
-        assert spread.std == pytest.approx(
-            np.sqrt(np.square(np.array(values) - np.mean(values)).sum() / (len(values) - 1)), abs=1e-6
-        )
+        assert std == pytest.approx(np.sqrt(np.square(np.array(values) - np.mean(values)).sum() / (n - 1)), abs=1e-6)
 
 
 def test_rows_gather_the_seeds_of_equal_values() -> None:
     metrics = full(np.random.default_rng(0))
-    rows = tabulate(results(metrics))
+    rows = rows_of(metrics)
     assert [tuple(row.values.values()) for row in rows] == [(True, True), (True, False), (False, True), (False, False)]
     for number, row in enumerate(rows):
         seeds = [metrics[number + 4 * seed]["psnr"] for seed in range(3)]
         expected = (np.mean(seeds), np.std(seeds, ddof=1), 3)
-        assert tuple(vars(row.spreads["psnr"]).values()) == pytest.approx(expected)
+        assert tuple(row.spreads["psnr"]) == pytest.approx(expected)
     assert "depth_absrel" not in rows[2].spreads
 
 
 def test_the_best_mean_is_the_largest_or_smallest_as_the_metric_wants() -> None:
     metrics = full(np.random.default_rng(1))
-    rows = tabulate(results(metrics))
-    for metric in METRICS:
-        means = [row.spreads[metric.key].mean if metric.key in row.spreads else np.nan for row in rows]
-        assert best(rows, metric) == {int(np.nanargmax(means) if metric.more else np.nanargmin(means))}
-        less = replace(metric, digits=-1)
+    rows = rows_of(metrics)
+    for column in COLUMNS:
+        means = [row.spreads[column.name].mean if column.name in row.spreads else np.nan for row in rows]
+        assert best(rows, column) == {int(np.nanargmax(means) if column.better == "higher" else np.nanargmin(means))}
+        less = column._replace(decimals=-1)
         assert best(rows, less) == {i for i, mean in enumerate(means) if not np.isnan(mean)}, "all are shown as 0"
     assert best(rows[:1], PSNR) == set(), "nothing to compare with"
-    same = tabulate(results({i: {"psnr": 1.0} for i in range(12)}))
+    same = rows_of({i: {"psnr": 1.0} for i in range(12)})
     assert best(same, PSNR) == {0, 1, 2, 3}
-    broken = tabulate(results({i: {"psnr": float("nan") if i % 4 == 0 else i % 4} for i in range(12)}))
+    broken = rows_of({i: {"psnr": float("nan") if i % 4 == 0 else i % 4} for i in range(12)})
     assert best(broken, PSNR) == {3}
 
 
 def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
     metrics = {0: {"psnr": 20.0, "depth_absrel": 0.1}, 4: {"psnr": 21.0, "depth_absrel": 0.3}, 2: {"psnr": 22.0}}
-    text = markdown(tabulate(results(metrics)))
+    text = as_markdown(rows_of(metrics))
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     assert lines[0] == ["model.depth", "loss.keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
     assert lines[2] == ["True", "True", "2/3", "20.50 ± 0.71", "0.2000 ± 0.1414"]
@@ -91,44 +99,41 @@ def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
 
 
 def test_a_whole_table_names_no_cell() -> None:
-    assert "Not in the table" not in markdown(tabulate(results(full(np.random.default_rng(2)))))
+    assert "Not in the table" not in as_markdown(rows_of(full(np.random.default_rng(2))))
 
 
 def test_files_have_every_metric_at_full_precision() -> None:
     metrics = {i: m | {"psnr_low": -1.5} for i, m in full(np.random.default_rng(3)).items()}
-    rows = tabulate(results(metrics))
+    rows = rows_of(metrics)
     lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
-    told = as_json(rows)
-    for row, line, entry in zip(rows, lines, told["rows"], strict=True):
+    saved = as_json(rows)
+    for row, line, entry in zip(rows, lines, saved["rows"], strict=True):
         assert line["model.depth"] == str(row.values["model.depth"])
         assert entry["values"] == row.values
-        for name, spread in row.spreads.items():
-            assert [float(line[f"{name}_{part}"]) for part in ("mean", "std", "n")] == [
-                spread.mean,
-                spread.std,
-                spread.n,
-            ]
-            assert entry[name] == {"mean": spread.mean, "std": spread.std, "n": spread.n}
+        for name, numbers in row.spreads.items():
+            assert [float(line[f"{name}_{part}"]) for part in ("mean", "std", "n")] == list(numbers)
+            assert entry[name] == {"mean": numbers.mean, "std": numbers.std, "n": numbers.n}
     assert lines[3]["depth_absrel_mean"] == "" and lines[3]["depth_absrel_n"] == "0"
-    assert told["best"]["psnr"] == sorted(best(rows, PSNR))
-    assert [cell["metrics"] for cell in told["cells"]] == [dict(r.metrics) for row in rows for r in row.results]
+    assert saved["best"]["psnr"] == sorted(best(rows, PSNR))
+    assert [cell["metrics"] for cell in saved["cells"]] == [dict(r.metrics) for row in rows for r in row.results]
 
 
 def test_the_picture_has_a_panel_per_metric_and_grows_with_the_rows() -> None:
-    whole, part = tabulate(results(full(np.random.default_rng(4)))), tabulate(results({0: {"psnr": 1.0}}))
+    whole, part = rows_of(full(np.random.default_rng(4))), rows_of({0: {"psnr": 1.0}})
     sizes = []
-    for rows in (whole, part, whole[:2], tabulate(results({}))):
+    for rows in (whole, part, whole[:2], rows_of({})):
         with Image.open(io.BytesIO(draw(rows, "a grid"))) as image:
             sizes.append(image.size)
     assert sizes[0][0] > sizes[1][0]
     assert sizes[0][1] > sizes[2][1]
-    assert [len(present(rows)) for rows in (whole, part)] == [len(METRICS), 1]
+    assert [len(shown_columns(rows)) for rows in (whole, part)] == [len(COLUMNS), 1]
 
 
 def test_a_bar_stands_in_a_text_value_without_breaking_the_table() -> None:
-    cells = toy.cells("train.start_from=a|b,c")
-    rows = tabulate([Result(cell, "finished", "", {"psnr": 1.0}) for cell in cells])
-    assert r"| a\|b" in markdown(rows)
+    grid = toy.grid("train.start_from=a|b,c")
+    results = [Result(run, "finished", "", {}) for run in runs_of(grid, Path("out"), Path("data")).values()]
+    rows = tabulate(results, grid.fields)
+    assert r"| a\|b" in as_markdown(rows)
 
 
 @given(st.lists(st.floats(0, 10), min_size=1, max_size=40))

@@ -1,12 +1,12 @@
-"""Grids of runs that are made in no time: their stages leave files and numbers, and train nothing."""
+"""Grids whose runs take no time: their stages leave files and numbers, and train nothing."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from rsjax.ablation import runner
-from rsjax.ablation.grid import Cell, expand, parse_axes
+from rsjax.ablation import sweep
+from rsjax.ablation.grid import Grid, expand, parse_axes
 from rsjax.config import Config, presets
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import STAGES, Run
@@ -14,23 +14,28 @@ from rsjax.pipeline.run import STAGES, Run
 DEBUG = presets.debug()
 
 
-def cells(*axes: str, seeds: tuple[int, ...] = (0,), base: Config = DEBUG) -> tuple[Cell, ...]:
+def grid(*axes: str, seeds: tuple[int, ...] = (0,), base: Config = DEBUG) -> Grid:
     return expand(base, parse_axes(base, axes), seeds)
 
 
 def psnr(config: Config) -> float:
-    """What a cell of this configuration scores."""
+    """The score of a cell with this configuration."""
     return 20.0 + config.loss.gamma + config.train.seed / 8
 
 
 def log(directory: Path, word: str) -> None:
-    """Appends a word to the record of what was made."""
+    """Appends a word to the list of stages that were made."""
     with (directory / "made").open("a") as file:
         file.write(f"{word}\n")
 
 
+def made(directory: Path) -> list[str]:
+    """Returns stage and run directory of every stage that was made, in order."""
+    return (directory / "made").read_text().splitlines() if (directory / "made").exists() else []
+
+
 def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
-    """Puts the toys in place of the stages; what is made is told in ``record / "made"``."""
+    """Puts the toys in place of the stages; ``record / "made"`` lists what they make. Pictures are left empty."""
 
     def leave(run: Run, stage: str) -> None:
         output = run.output(stage)
@@ -52,13 +57,9 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
                     if stage == "report":
                         (run.directory / "metrics.json").write_text(json.dumps({"psnr": psnr(run.config)}))
 
-    monkeypatch.setattr(runner, "run_all", everything)
+    monkeypatch.setattr(stages, "run_all", everything)
     monkeypatch.setattr(stages, "collect_clips", lambda run: None if run.clips.exists() else leave(run, "collect"))
     monkeypatch.setattr(stages, "train_tokenizer", lambda run, resume: leave(run, "tokenizer"))
     monkeypatch.setattr(stages, "tokenize", lambda run: leave(run, "tokens"))
     monkeypatch.setattr(stages, "train_world_model", lambda run, resume: leave(run, "world_model"))
-
-
-def made(record: Path) -> list[str]:
-    """What the toy stages made so far: stage and the directory's name, in order."""
-    return (record / "made").read_text().splitlines() if (record / "made").exists() else []
+    monkeypatch.setattr(sweep, "draw", lambda rows, title: b"")

@@ -1,0 +1,217 @@
+"""Runs the cells of a grid one after another; any number of processes may work on it at once, on several machines.
+
+What several cells need is made once. The clips lie outside the runs. A tokenizer, its tokens and, where cells differ
+only in how they are sampled or scored, the world model are made under ``shared``, each in a run directory named by its
+content key. They come into the cells as hard links, so every cell is a whole run directory that can be moved, resumed
+or deleted by itself and takes no disk space twice.
+"""
+
+import json
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import jax
+
+from rsjax.ablation.figure import draw
+from rsjax.ablation.grid import FILE, Choice, Grid, add_cells, merge, read_grid, repeated_cells
+from rsjax.ablation.table import (
+    ERROR,
+    Row,
+    State,
+    as_csv,
+    as_json,
+    as_markdown,
+    lock_of,
+    read_metrics,
+    read_result,
+    tabulate,
+)
+from rsjax.config import require
+from rsjax.errors import UserError
+from rsjax.files import disk_guard, lock, write_atomically
+from rsjax.pipeline import stages
+from rsjax.pipeline.run import Run
+from rsjax.progress import note, stage
+
+SHARED = ("tokenizer", "tokens", "world_model")  # each needs those before it
+
+
+def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "") -> dict[str, State]:
+    """Adds cells to a directory, runs the chosen ones that are not finished, and writes the tables after each.
+
+    A cell that fails is recorded and the next one starts. An interrupt or SIGTERM ends the command.
+
+    Args:
+        out: the grid's directory, with a run directory per cell.
+        data: the directory of simulated data sets.
+        command: how to repeat the sweep, for the cells' reports.
+
+    Returns:
+        The state of each chosen cell, by name; "running" where another process runs it.
+
+    Raises:
+        ConfigError: ``out`` holds a grid of another configuration, or the choice fits no cell.
+        Preempted: SIGTERM; the unfinished cell is saved.
+    """
+    grid, chosen = add_cells(out, new, choice)
+    for line in repeated_cells(grid):
+        note(line)
+    runs = runs_of(grid, out, data)
+    states: dict[str, State] = {}
+    for number, name in enumerate(chosen, 1):
+        with lock(lock_of(runs[name])) as free:
+            if not free:
+                states[name], text = "running", "another process runs it, left to that one"
+            elif read_metrics(runs[name]) is not None:
+                states[name], text = "finished", "finished, skipped"
+            else:
+                text = f"in {runs[name].directory}"
+            stage(number, len(chosen), name, text)
+            if name not in states:
+                others = [run for run in runs.values() if run is not runs[name]]
+                states[name] = _run_cell(runs[name], others, out / "shared", command)
+        write_tables(out, data)
+    return states
+
+
+def runs_of(grid: Grid, out: Path, data: Path) -> dict[str, Run]:
+    """Returns the run of every cell, by name."""
+    return {name: Run(config, out / name, data) for name, config in grid.cells.items()}
+
+
+def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> State:
+    failure = run.directory / ERROR
+    failure.unlink(missing_ok=True)
+    if run.finished("report"):  # but its metrics.json is gone
+        run.output("report").unlink()
+    try:
+        run.prepare(overwrite=False)
+        share(run, others, shared)
+        stages.run_all(run, command=command)
+    except Exception as error:
+        line = " ".join((str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}").split())
+        note(f"failed: {line}")
+        record = {"error": line, "time": time.strftime("%Y-%m-%d %H:%M:%S"), "traceback": traceback.format_exc()}
+        with suppress(OSError):  # on a full disk only the terminal shows it, and the cell counts as interrupted
+            failure.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(failure, json.dumps(record, indent=1).encode())
+        return "failed"
+    finally:
+        jax.clear_caches()  # no other cell uses a cell's compiled programs; they would pile up
+    return "finished"
+
+
+def share(run: Run, others: Sequence[Run], shared: Path) -> None:
+    """Gives a cell's run the stages that it has in common with others, and makes those that nobody has made.
+
+    Processes that need the same stage wait for the one that makes it. If that one is killed, the next continues from
+    its checkpoints.
+
+    Args:
+        others: the other cells' runs.
+        shared: the directory where shared stages are made and kept.
+    """
+    # The directory of an ingested store may be read-only.
+    locks = shared / ".locks" if run.config.data.key else run.clips.parent
+    with lock(locks / f".{run.clips.name}.lock", wait="waiting for another process that collects"):
+        if not run.finished("collect"):
+            with run.stage("collect"):
+                stages.collect_clips(run)
+    for name in SHARED:
+        key = run.keys()[name]
+        same = [other for other in others if other.keys()[name] == key]
+        if run.finished(name) or (name == "world_model" and not same):
+            continue
+        maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
+        with lock(shared / ".locks" / maker.directory.name, wait=f"waiting for another process that makes the {name}"):
+            source = next((source for source in (maker, *same) if source.finished(name)), None)
+            if source is None:
+                _make(maker, run, name)
+            link_stage(source or maker, run, name)
+
+
+def _make(maker: Run, run: Run, name: str) -> None:
+    """Makes a stage in a shared run directory, from the stages before it, which the cell's run has."""
+    maker.prepare(overwrite=False)
+    for before in SHARED[: SHARED.index(name)]:
+        link_stage(run, maker, before)
+    note(f"for all cells that share it, in {maker.directory}: {name.replace('_', ' ')}")
+    with maker.stage(name):
+        if name == "tokenizer":
+            stages.train_tokenizer(maker, resume=True)
+        elif name == "tokens":
+            stages.tokenize(maker)
+        else:
+            stages.train_world_model(maker, resume=True)
+
+
+def link_stage(source: Run, run: Run, name: str) -> None:
+    """Puts a finished stage of one run into another, where it appears whole. Its checkpoints stay behind.
+
+    The stage's output never changes and is linked; logs and marks are copied.
+    """
+    if run.finished(name):
+        return
+    target, temporary = run.directory / name, run.directory / f"{name}.linking"
+    output, checkpoints = source.output(name), shutil.ignore_patterns("checkpoints")
+
+    def copy(path: str, to: str) -> None:
+        if output not in Path(path).parents or not _hard_link(path, to):
+            shutil.copy2(path, to)
+
+    with disk_guard(temporary):
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.copytree(source.directory / name, temporary, symlinks=True, ignore=checkpoints, copy_function=copy)
+        shutil.rmtree(target, ignore_errors=True)
+        temporary.rename(target)
+
+
+def _hard_link(path: str, to: str) -> bool:
+    """Whether the file system made the link."""
+    try:
+        os.link(path, to)
+    except OSError:
+        return False
+    return True
+
+
+def write_tables(out: Path, data: Path) -> list[Row]:
+    """Writes ``table.md``, ``.csv``, ``.json`` and ``.png`` of all cells in ``grid.json`` as they are now.
+
+    Of several processes the last one to write has also read last, so the files never fall behind.
+
+    Raises:
+        ConfigError: ``out`` holds no grid.
+        FileError: the disk is full.
+    """
+    require((out / FILE).exists(), f"{out} holds no grid ({FILE}); choose its directory with --out, or run it first")
+    with lock(out / ".locks" / "table", wait="waiting for another process that writes the table"), disk_guard(out):
+        grid = read_grid(out)
+        assert grid is not None
+        runs = runs_of(grid, out, data).values()
+        rows = tabulate(map(read_result, runs), grid.fields)
+        write_atomically(out / "table.md", as_markdown(rows).encode())
+        write_atomically(out / "table.csv", as_csv(rows).encode())
+        write_atomically(out / "table.json", json.dumps(as_json(rows), indent=1).encode())
+        write_atomically(out / "table.png", draw(rows, f"{next(iter(runs)).config.name}: {out.name}"))
+    return rows
+
+
+def print_table(out: Path, data: Path) -> None:
+    """Writes the tables, and prints the table and the paths of the files. Raises as :func:`write_tables`."""
+    print(f"\n{as_markdown(write_tables(out, data))}")
+    print(f"table: {(out / 'table.md').absolute()} (and .csv, .json)\npicture: {(out / 'table.png').absolute()}")
+
+
+def print_cells(new: Grid, choice: Choice, out: Path, data: Path) -> None:
+    """Prints the chosen cells with their numbers and states. Nothing is written. Raises as :func:`run_sweep`."""
+    grid, names = merge(read_grid(out), new, out)
+    chosen, runs = choice.of(names), runs_of(grid, out, data)
+    for number, name in enumerate(names):
+        if name in chosen:
+            print(f"{number:4}  {read_result(runs[name]).state:11}  {name}")

@@ -1,0 +1,42 @@
+"""Every field of a nested config by its dotted name: read them all, or replace some at once."""
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
+
+T = TypeVar("T")
+
+
+class Leaf(NamedTuple):
+    """A field's value, its declared type, and whether it leaves results as they are (:func:`rsjax.config.runtime`)."""
+
+    value: Any
+    kind: Any
+    runtime: bool
+
+
+def leaves(config: Any, prefix: str = "") -> dict[str, Leaf]:
+    """Returns every field of a config dataclass and of those nested in it, by dotted name (``loss.gamma``)."""
+    hints = typing.get_type_hints(type(config))
+    out: dict[str, Leaf] = {}
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), prefix + field.name
+        if dataclasses.is_dataclass(value):
+            out |= leaves(value, f"{name}.")
+        else:
+            out[name] = Leaf(value, hints[field.name], bool(field.metadata.get("runtime")))
+    return out
+
+
+def with_values(config: T, values: Mapping[str, Any]) -> T:
+    """Returns the config with new values of these dotted names. It is checked once, after all of them are set.
+
+    Raises:
+        ConfigError: the combination cannot run.
+    """
+    changes: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
+    for head in {name.partition(".")[0] for name in values if "." in name}:
+        inner = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{head}.")}
+        changes[head] = with_values(getattr(config, head), inner)
+    return dataclasses.replace(config, **changes)  # type: ignore[type-var]
