@@ -1,12 +1,8 @@
-"""Parses the arguments of every command and reports its errors."""
+"""Parses the arguments of every command."""
 
-import contextlib
 import dataclasses
-import errno
-import io
 import os
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -14,10 +10,10 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import tyro
 from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
+from rsjax.command import main_errors as main_errors  # every command imports both from here
 from rsjax.config import Config, ConfigError, StageConfig, presets
 from rsjax.config.stages import format_stage, parse_stage
-from rsjax.errors import Preempted, UserError, did_you_mean
-from rsjax.runtime import sigterm_stops
+from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
 
@@ -103,106 +99,69 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
             raise ConfigError(f"name a preset first; {usage}")
         print(f"{usage}\n{description}\nOptions and common fields: {prog} tiny --help; every field: --help-all")
         raise SystemExit(0)
-    prog = f"{prog} {argv[0]}"
-    preset = presets.get(argv[0])
-    known = [*_flags(PresetOptions()), *_flags(options)]
-    before = _parse(PresetOptions(), argv[1:], prog, "", [*known, *_flags(preset)], rest=True)
-    preset = before.apply(preset)
+    name, *argv = argv
+    prog, preset = f"{prog} {name}", presets.get(name)
+    preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
+    preset = preset_options.apply(preset)
     fields: Any = preset
     if {"-h", "--help"}.intersection(argv):
         fields, description = _first_fields(preset), f"{description} Every field: {prog} --help-all"
     elif "--help-all" in argv:
-        argv = ["", "--help"]
-    parts = {"options": options, "before": before, "fields": fields}
-    # Flags are named without their part. Those of a configuration's booleans take a value: --model.depth False.
-    markers: dict[str, Any] = {name: (tyro.conf.arg(name=""),) for name in parts}
-    markers["fields"] += (tyro.conf.FlagConversionOff,)
-    kinds = [(name, Annotated[(type(part), *markers[name])]) for name, part in parts.items()]  # type: ignore[misc]
-    command = dataclasses.make_dataclass("Command", kinds)(**parts)
-    parsed = _parse(command, argv[1:], prog, description, [*known, *_flags(preset)])
+        argv = ["--help"]
+    parsed = _parse({"options": options, "preset": preset_options, "fields": fields}, argv, prog, description)
     return parsed.fields, parsed.options
 
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:
     """Parses the arguments of a command without a preset. Arguments and errors as in :func:`parse`."""
-    return _parse(options, argv, prog, description, _flags(options))
+    return _parse({"options": options}, argv, prog, description).options
 
 
-@contextlib.contextmanager
-def main_errors() -> Iterator[None]:
-    """Turns errors that the user can cure into one line on standard error and an exit status, without a traceback.
+def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: str, rest: bool = False) -> Any:
+    """Parses arguments into dataclasses like those of ``parts``; with ``rest``, skips arguments that none has.
 
-    Around a command's main function, as a decorator or in a ``with``. Exits with 2 for most :class:`UserError`, a full
-    disk or a missing permission, with 130 for an interrupt, and with 75 (to be started again) for SIGTERM. Any other
-    exception is a bug and keeps its traceback.
+    Flags are named after fields, without their part. A boolean of the part "fields" takes a value: --model.depth False.
     """
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
-    try:
-        with sigterm_stops():
-            yield
-    except KeyboardInterrupt:
-        _exit("interrupted; the same command resumes", 130)
-    except Preempted as stop:
-        _exit(str(stop), os.EX_TEMPFAIL)
-    except UserError as error:
-        _exit(f"error: {error}", error.status)
-    except Exception as error:
-        cure = _cure(error)
-        if cure is None:
-            raise
-        _exit(f"error: {cure}", 2)
-
-
-def _cure(error: Exception) -> str | None:
-    where = f" at {error.filename}" if isinstance(error, OSError) and error.filename else ""
-    # Orbax, TensorStore and ArrayRecord report a full disk in errors of their own.
-    if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left on device" in str(error):
-        return f"disk full{where}; free some space or choose another directory: the same command resumes"
-    if isinstance(error, PermissionError) or getattr(error, "errno", None) == errno.EROFS:
-        return f"no permission to write or read{where}; choose another directory or change its owner"
-    return None
-
-
-def _exit(line: str, status: int) -> None:
-    print(" ".join(line.split()), file=sys.stderr)
-    jax = sys.modules.get("jax")
-    if status == UserError.status and jax is not None and jax.distributed.is_initialized():
-        # At exit, jax would wait in vain for the other processes and then abort with a status of its own.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    raise SystemExit(status)
-
-
-def _parse(default: Any, argv: Sequence[str], prog: str, description: str, known: list[str], rest: bool = False) -> Any:
-    """Parses arguments into a dataclass like ``default``; with ``rest``, skips arguments that it does not have."""
+    markers = {name: [tyro.conf.arg(name="")] for name in parts}
+    markers.get("fields", []).append(tyro.conf.FlagConversionOff)
+    kinds = [(name, Annotated[(type(part), *markers[name])]) for name, part in parts.items()]  # type: ignore[misc]
+    default: Any = dataclasses.make_dataclass("Command", kinds)(**parts)
 
     def refuse(event: parse_errors.ParseErrorEvent) -> None:
-        if message := _message(event, known):  # of an event without a message, tyro prints its own report
+        flags = [flag for part in parts.values() for flag in _flags(part)]
+        if message := _message(event, flags):  # of an event without a message, tyro prints its own report
             raise ConfigError(f"{message} (see {prog} --help)")
 
     settings: dict[str, Any] = {"args": argv, "default": default, "prog": prog, "description": description}
     settings |= {"registry": REGISTRY, "return_unknown_args": rest, "add_help": not rest}
-    with parse_errors.on_parse_error(refuse):
-        parsed: Any = tyro.cli(type(default), **settings)
+    try:
+        with parse_errors.on_parse_error(refuse):
+            parsed: Any = tyro.cli(type(default), **settings)
+    except BrokenPipeError:  # --help-all | head
+        os._exit(0)
     return parsed[0] if rest else parsed
 
 
-def _message(event: parse_errors.ParseErrorEvent, known: list[str]) -> str:
+def _message(event: parse_errors.ParseErrorEvent, flags: list[str]) -> str:
     match event:
         case parse_errors.UnrecognizedArgs(tokens=[token, *_]):
             word = token.partition("=")[0].lstrip("-").replace("_", "-")
-            return f"unknown argument {token!r}{did_you_mean(word, known, '--')}"
+            return f"unknown argument {token!r}{did_you_mean(word, flags, '--')}"
         case parse_errors.MissingArgs(missing_arguments=missing):
-            return f"missing {', '.join(item.arg.display_name() for item in missing)}"
+            return f"missing {', '.join(_name(item.arg) for item in missing)}"
         case parse_errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            return f"{argument.display_name()}: {value!r} is none of {', '.join(choices)}"
+            return f"{_name(argument)}: {value!r} is none of {', '.join(choices)}"
         case parse_errors.BadValue(argument=argument):
-            return f"{argument.display_name()}: its value is missing"
+            return f"{_name(argument)}: its value is missing"
         case parse_errors.InstantiationFailure(argument=argument, message=message):
-            return f"{argument.display_name()}: {message}" if argument else message
+            return f"{_name(argument)}: {message}" if argument else message
     return ""
+
+
+def _name(argument: Any) -> str:
+    """Returns an option's flag, --run-dir, or a positional argument's name, RUN-DIR."""
+    name: str = argument.display_name()
+    return name if name.startswith("-") else name.rpartition(".")[2].upper()
 
 
 def _first_fields(preset: Config) -> Any:

@@ -109,7 +109,7 @@ def test_options_without_a_preset() -> None:
     )
     with pytest.raises(ConfigError, match="did you mean '--clips'"):
         parse_options(["a/run", "--clip", "2"], "generate", "", NeedsRun(tyro.MISSING))
-    with pytest.raises(ConfigError, match="missing run-dir"):
+    with pytest.raises(ConfigError, match="missing RUN-DIR"):
         parse_options([], "generate", "", NeedsRun(tyro.MISSING))
 
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rsjax.errors import UserError
+from rsjax.command import main_errors
 
 PROG = "python -m rsjax.convert"
 
@@ -34,25 +34,20 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+@main_errors()
 def main(argv: Sequence[str]) -> None:
-    """Converts and prints what was written. Prints a :class:`UserError` as one line and exits with status 2."""
+    """Converts and prints what was written."""
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.convert import commands
 
-    try:
-        if options.kind == "tokenizer":
-            lines = commands.convert_tokenizer(options.source, options.out, options.weights)
-        elif options.kind == "genie":
-            lines = commands.convert_genie(options.source, options.out, options.heads)
-        else:
-            sources = [options.source] + ([options.heads_file] if options.heads_file else [])
-            lines = commands.convert_lpips(sources, options.out)
-    except UserError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        raise SystemExit(2) from None
-    for line in lines:
-        print(line)
+    if options.kind == "tokenizer":
+        lines = commands.convert_tokenizer(options.source, options.out, options.weights)
+    elif options.kind == "genie":
+        lines = commands.convert_genie(options.source, options.out, options.heads)
+    else:
+        lines = commands.convert_lpips([path for path in (options.source, options.heads_file) if path], options.out)
+    print(*lines, sep="\n")
 
 
 if __name__ == "__main__":
