@@ -142,7 +142,7 @@ def test_cells_that_cannot_run_are_named_before_any_runs() -> None:
 
 
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (2**32,)])
-def test_seeds_are_given_once_and_in_range(seeds: tuple[int, ...]) -> None:
+def test_seeds_are_distinct_and_in_range(seeds: tuple[int, ...]) -> None:
     with pytest.raises(ConfigError, match="--seeds"):
         toy.grid(seeds=seeds)
 
