@@ -55,11 +55,11 @@ def main() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from experiments.ingest import source_options
     from rsjax.ingest.checks import KINDS, Thresholds
     from rsjax.ingest.doctor import diagnose, open_any
-    from rsjax.ingest.jobs.pool import count_workers
+    from rsjax.ingest.options import source_options
     from rsjax.ingest.selection import write_selection
+    from rsjax.processes import count_workers
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     source = open_any(options.what, options.path, **source_options(options.option))

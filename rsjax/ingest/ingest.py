@@ -1,189 +1,216 @@
-"""A data set of any format into a store of clips: stages over its episodes, then one pass that packs what they left."""
+"""Ingests a data set of any format into a store of clips: runs the steps on every episode, then packs their clips."""
 
 import hashlib
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
 
 from rsjax.config import content_key
 from rsjax.data.store import MANIFEST, StoreError, open_store
 from rsjax.files import disk_guard, lock
+from rsjax.ingest.clips import CLIPS
 from rsjax.ingest.episode import EpisodeRef
-from rsjax.ingest.jobs.runner import Executor, run
-from rsjax.ingest.jobs.work_items import Job, Unit, mark_path
-from rsjax.ingest.packing import CLIPS, Contents, choose_contents, cuts_of, fitting, pack
-from rsjax.ingest.report import Counts, count, nothing, write_tables, write_windows
+from rsjax.ingest.packing import Contents, choose_contents, cut_episodes, pack, refuse_odd
+from rsjax.ingest.summary import IngestSummary, no_clips, summarise, write_tables
+from rsjax.ingest.work_items import EpisodeWork, IngestPlan, mark_path, run_episode
+from rsjax.processes import WorkerDied, count_cores, run_items
 
 LOCK = "lock"
-Found = tuple[list[EpisodeRef], list[EpisodeRef]]
-Report = Callable[[int, int], None]
+Settle = Callable[[EpisodeRef, int, int], None]  # an episode, the work items that were run on it, and their clips
+Progress = Callable[[int, int], None]  # done, of how many
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What is ingested, and where it goes.
+class Runner(Protocol):
+    """Runs the work items that have no mark, on workers that may die; every episode has its marks at the end."""
 
-    Attributes:
-        job: its last stage makes the clips; its folder is kept, so that other parameters reuse what they can.
-        out: the store.
-        test_share: of the episodes; all clips of an episode are in one split.
-        meta: more of the manifest.
-    """
+    def __call__(self, plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Settle) -> None:
+        """Calls ``settle`` after each episode.
 
-    job: Job
-    out: Path
-    test_share: float
-    meta: dict[str, Any]
+        Raises:
+            UserError: no work item could be run: a full disk, a missing package.
+        """
+        ...
 
-    def steps(self, refs: Sequence[EpisodeRef]) -> int:
-        """How many units there are, and as many more as episodes are packed."""
-        return len(refs) * (len(self.job.stages) + 1)
+
+def run_on_this_machine(plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Settle, workers: int = 0) -> None:
+    """Runs the work items in this process, or in ``workers`` others. A :class:`Runner`."""
+
+    def settled(ref: EpisodeRef, result: tuple[int, int] | WorkerDied) -> None:
+        if isinstance(result, WorkerDied):
+            work = EpisodeWork(plan, ref)
+            failed = next(step.name for step in plan.steps if work.mark(step.name) is None)
+            work.fail(failed, result)
+            result = 1, 0
+        settle(ref, *result)
+
+    threads = max(1, count_cores() // workers) if workers else None
+    run_items(partial(_open_worker, plan, threads), refs, workers, settled)
+
+
+def _open_worker(plan: IngestPlan, threads: int | None) -> Callable[[EpisodeRef], tuple[int, int]]:
+    if threads is not None:
+        limit_threads(threads)
+    prepared: set[str] = set()
+    return lambda ref: run_episode(plan, ref, prepared)
 
 
 def ingest(
-    plan: Plan,
-    start: Callable[[], Executor],
-    report: Report,
-    found: Found | None = None,
+    plan: IngestPlan,
+    run: Runner = run_on_this_machine,
+    progress: Progress = lambda done, total: None,
+    listed: tuple[list[EpisodeRef], list[EpisodeRef]] | None = None,
     *,
     keep_clips: bool = False,
     retry: bool = False,
-) -> Counts | None:
-    """Does what is not done yet, and packs it; the store appears whole or not at all.
+) -> IngestSummary | None:
+    """Runs the work items that are missing and packs the clips; the store appears whole or not at all.
 
     Args:
-        start: makes the workers, closed here.
-        report: called with (steps finished, :meth:`Plan.steps`).
-        found: what :func:`listed` gave, if that was asked before.
+        progress: called with how many of :func:`count_steps` are done, and with that number.
+        listed: what :func:`list_episodes` returned, if it was called before.
         keep_clips: keep the cut clips beside the store too, which saves time when episodes are added.
-        retry: run what was quarantined again.
+        retry: run the quarantined again.
 
     Returns:
-        What became of every episode; None where the store is there already, made of the same.
+        What became of every episode; None where the store is up to date.
 
     Raises:
-        UserError: the source cannot be listed, nothing can be written, no episode gave a clip, another process is at
-            the same store, or the place holds something else.
+        UserError: the source cannot be listed, nothing can be written, no episode gave a clip, another process makes
+            the same store, or something else is in its place.
     """
-    refs, duplicates = found or listed(plan.job)
-    made = is_made(plan, refs)
-    if made and not retry:
+    refs, duplicates = listed or list_episodes(plan)
+    up_to_date = is_up_to_date(plan, refs)
+    if up_to_date and not retry:
         return None
-    with lock(plan.job.folder / LOCK) as held:
+    with lock(plan.folder / LOCK) as held:
         if not held:
             raise StoreError(f"{plan.out}: another process is making it; wait for that one or stop it")
-        if retry and not forget_failures(plan.job, refs) and made:
+        if retry and not forget_failures(plan, refs) and up_to_date:
             return None
-        return _ingest(plan, start, report, refs, duplicates, keep_clips)
+        this_run = _run(plan, refs, run, progress)
+        return _pack(plan, refs, duplicates, this_run, progress, keep_clips)
 
 
-def is_made(plan: Plan, refs: Sequence[EpisodeRef]) -> bool:
-    """Whether the store is there already, made of the same episodes in the same way.
+def count_steps(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
+    """Returns how many steps an ingest has, packing each episode included."""
+    return len(refs) * (len(plan.steps) + 1)
+
+
+def list_episodes(plan: IngestPlan) -> tuple[list[EpisodeRef], list[EpisodeRef]]:
+    """Returns a source's episodes, and apart from them those with the id of an earlier one.
 
     Raises:
-        StoreError: something else is there, which is not to be replaced.
+        UserError: there are none, or they cannot be listed.
     """
-    return _present(plan) == asked_key(plan, refs)
+    refs: dict[str, EpisodeRef] = {}
+    duplicates: list[EpisodeRef] = []
+    for ref in plan.source.episodes():
+        if refs.setdefault(ref.id, ref) is not ref:
+            duplicates.append(ref)
+    if not refs:
+        raise StoreError(f"the {plan.source.name} data set has no episode; check the path")
+    return list(refs.values()), duplicates
 
 
-def _ingest(
-    plan: Plan,
-    start: Callable[[], Executor],
-    report: Report,
-    refs: list[EpisodeRef],
-    duplicates: list[EpisodeRef],
-    keep_clips: bool,
-) -> Counts:
-    steps = plan.steps(refs)
-    executor = start()
-    try:
-        ran = run(plan.job, refs, executor, lambda done, _: report(done, steps))
-    finally:
-        executor.close()
-    cuts, odd = fitting(cuts_of(plan.job, refs))
-    refused = [(cut.ref, why) for cut, why in odd]
-    refused += [(ref, f"id: another episode is called {ref.id} too; rename one") for ref in duplicates]
-    unfit = {cut.ref.id for cut, _ in odd}
-    counts = count(plan.job, [ref for ref in refs if ref.id not in unfit], refused)
-    contents = choose_contents(cuts, plan.test_share)
-    left_out = sum(cut.records for cut in contents.made() if cut.depth_unit not in (None, contents.depth_unit))
-    counts = replace(counts, depth_left_out=left_out, ran=ran)
-    write_tables(plan.job.folder, counts)
-    write_windows(plan.job, refs)
-    if not counts.done:
-        raise StoreError(nothing(counts, plan.job.folder))
-    pack(
-        plan.job,
-        plan.out,
-        contents,
-        counts,
-        plan.meta | {"asked": asked_key(plan, refs), "key": store_key(plan, refs, contents)},
-        lambda packed: report(steps - counts.done + packed, steps),
-    )
-    _clean(plan.job.folder / "units", keep_clips)
-    return counts
+def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
+    """Returns whether the store exists, made from the same episodes in the same way.
 
-
-def _present(plan: Plan) -> str | None:
-    """What the store was asked for that is there already, if one is; errors as in :func:`is_made`."""
-    out, name = plan.out, plan.job.source.name
+    Raises:
+        StoreError: something else is in its place, which must not be replaced.
+    """
+    out, name = plan.out, plan.source.name
     if out.exists() and not (out / MANIFEST).exists():
         raise StoreError(f"{out}: exists and is not a store; move it away or choose another --out")
     try:
         manifest = open_store(out).manifest
-    except StoreError:  # nothing, or something damaged
-        return None
+    except StoreError:  # missing or damaged
+        return False
     ours = "counts" in manifest and manifest.get("source") == name  # merging and splitting leave the counts out
     if not ours or manifest.get("kind") != "clips":
         what = f"{manifest.get('kind')} of {manifest.get('source', 'another origin')}"
         raise StoreError(f"{out}: holds {what}, not what this makes of {name}; move it away or choose another --out")
-    return manifest.get("asked")
+    return manifest.get("asked") == _plan_key(plan, refs)
 
 
-def _clean(units: Path, keep_clips: bool) -> None:
-    """Deletes what killed workers left half written, and clips that are packed; marks of failures stay."""
-    for path in units.rglob("*.tmp"):
-        path.unlink(missing_ok=True)
-    for path in () if keep_clips else (units / CLIPS).rglob("*.array_record"):
-        mark_path(path).unlink(missing_ok=True)
-        path.unlink(missing_ok=True)
-
-
-def forget_failures(job: Job, refs: Sequence[EpisodeRef]) -> int:
+def forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
     """Removes the marks of what is quarantined, so that it is run again; returns how many there were."""
     failures = 0
-    for unit in (Unit(ref, stage.name) for ref in refs for stage in job.stages):
-        mark = job.mark(unit)
-        if mark is not None and mark["status"] == "failed":
-            with disk_guard(job.folder):
-                mark_path(job.output(unit)).unlink()
-            failures += 1
+    for work in (EpisodeWork(plan, ref) for ref in refs):
+        for step in plan.steps:
+            mark = work.mark(step.name)
+            if mark is not None and mark["status"] == "failed":
+                with disk_guard(plan.folder):
+                    mark_path(work.output(step.name)).unlink()
+                failures += 1
     return failures
 
 
-def listed(job: Job) -> Found:
-    """A source's episodes, and those whose id another one has already."""
-    seen: set[str] = set()
-    refs: list[EpisodeRef] = []
-    duplicates: list[EpisodeRef] = []
-    for ref in job.source.episodes():
-        (duplicates if ref.id in seen else refs).append(ref)
-        seen.add(ref.id)
-    if not refs:
-        raise StoreError(f"the {job.source.name} data set has no episode; check the path")
-    return refs, duplicates
+def limit_threads(count: int) -> None:
+    """Limits the threads of libraries in a worker, whose cores others share. Called before a network is loaded."""
+    import os
+
+    import cv2
+
+    os.environ["OMP_NUM_THREADS"] = str(count)  # PyTorch
+    cv2.setNumThreads(count)
 
 
-def store_key(plan: Plan, refs: Sequence[EpisodeRef], contents: Contents) -> str:
-    """The content key of a store: what was asked for, and which episodes gave how many clips, as some may fail."""
-    made = [f"{cut.ref.id} {cut.records}" for cut in contents.made()]
-    return content_key(asked_key(plan, refs), contents.depth_unit, *made)
+def _run(plan: IngestPlan, refs: list[EpisodeRef], run: Runner, progress: Progress) -> dict[str, float]:
+    """Runs what is missing; returns ``this_run`` of :class:`IngestSummary`."""
+    began, episodes, items, clips = time.monotonic(), 0, 0, 0
+
+    def settle(ref: EpisodeRef, ran: int, cut: int) -> None:
+        nonlocal episodes, items, clips
+        episodes, items, clips = episodes + 1, items + ran, clips + cut
+        progress(episodes * len(plan.steps), count_steps(plan, refs))
+
+    run(plan, refs, settle)
+    seconds = time.monotonic() - began
+    return {"items": items, "clips": clips, "seconds": seconds, "clips_per_second": clips / seconds}
 
 
-def asked_key(plan: Plan, refs: Sequence[EpisodeRef]) -> str:
-    """A hash of all that was asked for: the episodes, and how they are made into clips."""
+def _pack(
+    plan: IngestPlan,
+    refs: list[EpisodeRef],
+    duplicates: list[EpisodeRef],
+    this_run: dict[str, float],
+    progress: Progress,
+    keep_clips: bool,
+) -> IngestSummary:
+    cuts, refused = refuse_odd(cut_episodes(plan, refs))
+    odd = {ref.id for ref, _ in refused}
+    refused += [(ref, f"id: another episode is called {ref.id} too; rename one") for ref in duplicates]
+    contents = choose_contents(cuts, plan.test_share)
+    summary = replace(
+        summarise(plan, [ref for ref in refs if ref.id not in odd], refused),
+        depth_left_out=contents.depth_left_out(),
+        this_run=this_run,
+    )
+    write_tables(plan, refs, summary)
+    if not summary.done:
+        raise StoreError(no_clips(plan, summary))
+    steps = count_steps(plan, refs)
+    keys = {"asked": _plan_key(plan, refs), "key": _store_key(plan, refs, contents)}
+    pack(plan, contents, summary, keys, lambda packed: progress(steps - summary.done + packed, steps))
+    for path in plan.items.rglob("*.tmp"):  # killed workers left these
+        path.unlink(missing_ok=True)
+    for path in () if keep_clips else (plan.items / CLIPS).rglob("*.array_record"):
+        mark_path(path).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+    return summary
+
+
+def _plan_key(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> str:
+    """Returns a hash of the episodes and of how they become clips."""
     digest = hashlib.sha256()
     for ref in refs:
-        digest.update(plan.job.keys(ref)[CLIPS].encode())
+        digest.update(plan.keys(ref)[CLIPS].encode())
     return content_key("ingest", digest.hexdigest(), plan.test_share)
+
+
+def _store_key(plan: IngestPlan, refs: Sequence[EpisodeRef], contents: Contents) -> str:
+    """Returns the content key of the store: as some episodes may fail, it also depends on how many clips each gave."""
+    cut = [f"{cut.ref.id} {cut.records}" for cut in contents.episodes()]
+    return content_key(_plan_key(plan, refs), contents.depth_unit, *cut)

@@ -1,26 +1,23 @@
-"""Cut clips into one store: whose they are, in which split, in which unit of depth, and what the manifest says."""
+"""Packs cut clips into one store: which episodes, in which split, in which unit of depth, with what manifest."""
 
 import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import StoreError, open_store, write_store
-from rsjax.ingest.clips import words
+from rsjax.ingest.clips import CLIPS, clip_labels
 from rsjax.ingest.episode import EpisodeRef
-from rsjax.ingest.jobs.work_items import Job, Unit
-from rsjax.ingest.report import Counts
-
-CLIPS = "clips"  # the last stage
+from rsjax.ingest.summary import IngestSummary
+from rsjax.ingest.work_items import EpisodeWork, IngestPlan
 
 
-class Cut(NamedTuple):
-    """An episode whose clips were cut; the fields after ``records`` are those of its summary."""
+class CutEpisode(NamedTuple):
+    """An episode whose clips were cut; the fields after ``records`` are from the summary of :func:`clips.cut`."""
 
     ref: EpisodeRef
     records: int
@@ -35,51 +32,54 @@ class Contents:
     """What goes into the store.
 
     Attributes:
-        splits: the episodes of ``train`` and ``test`` that gave clips.
+        splits: the episodes of ``train`` and ``test``.
         depth_unit: that of most train clips with depth; None where there are none. Other clips' depth is left out.
         depth_range: of the train clips in that unit.
     """
 
-    splits: dict[str, list[Cut]]
+    splits: dict[str, list[CutEpisode]]
     depth_unit: str | None
     depth_range: list[float] | None
 
-    def made(self) -> list[Cut]:
-        """All episodes, by split."""
+    def episodes(self) -> list[CutEpisode]:
+        """Returns all episodes, by split."""
         return [cut for cuts in self.splits.values() for cut in cuts]
+
+    def depth_left_out(self) -> int:
+        """Counts the clips that lose their depth."""
+        return sum(cut.records for cut in self.episodes() if cut.depth_unit not in (None, self.depth_unit))
 
 
 def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
-    """``train`` and ``test``, in order; chosen by a hash of the ids, at least one each where there are two or more."""
+    """Splits into ``train`` and ``test``, in order, by a hash of the ids; each gets one at least of two or more."""
     ranked = sorted(refs, key=lambda ref: hashlib.sha256(ref.id.encode("utf-8", "surrogatepass")).digest())
-    held = min(len(refs) - 1, max(1, round(test_share * len(refs)))) if test_share > 0 else 0
-    test = {ref.id for ref in ranked[:held]}
+    count = min(len(refs) - 1, max(1, round(test_share * len(refs)))) if test_share > 0 else 0
+    test = {ref.id for ref in ranked[:count]}
     return {"train": [r for r in refs if r.id not in test], "test": [r for r in refs if r.id in test]}
 
 
-def cuts_of(job: Job, refs: Sequence[EpisodeRef]) -> Iterator[Cut]:
-    """Of the episodes whose last stage is done."""
+def cut_episodes(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> list[CutEpisode]:
+    """Returns the episodes that gave clips."""
+    cuts = []
     for ref in refs:
-        mark = job.mark(Unit(ref, CLIPS))
-        if mark is not None and mark["status"] == "done":
-            told = mark["summary"]
-            yield Cut(ref, mark["records"], *(told[name] for name in Cut._fields[2:]))
+        mark = EpisodeWork(plan, ref).done(CLIPS)
+        if mark is not None and mark["records"]:
+            cuts.append(CutEpisode(ref, mark["records"], *(mark["summary"][name] for name in CutEpisode._fields[2:])))
+    return cuts
 
 
-def fitting(cuts: Iterator[Cut]) -> tuple[list[Cut], list[tuple[Cut, str]]]:
-    """Those that gave clips with actions as long as most episodes' are, and those whose actions differ, with why."""
-    made = [cut for cut in cuts if cut.records]
-    widths = Counter(cut.action_dim for cut in made)
-    usual = widths.most_common(1)[0][0] if widths else None
+def refuse_odd(cuts: list[CutEpisode]) -> tuple[list[CutEpisode], list[tuple[EpisodeRef, str]]]:
+    """Returns the episodes whose actions have as many dimensions as most, and the others with the reason."""
+    usual = Counter(cut.action_dim for cut in cuts).most_common(1)[0][0] if cuts else None
     why = f"dimensions, those of most others have {usual}; ingest it alone"
-    odd = [(cut, f"actions: {cut.action_dim} {why}") for cut in made if cut.action_dim != usual]
-    return [cut for cut in made if cut.action_dim == usual], odd
+    odd = [(cut.ref, f"actions: {cut.action_dim} {why}") for cut in cuts if cut.action_dim != usual]
+    return [cut for cut in cuts if cut.action_dim == usual], odd
 
 
-def choose_contents(made: Sequence[Cut], test_share: float) -> Contents:
-    """Of the store of these episodes. Metres and relative depth do not mix: the unit of more train clips is taken."""
-    by_id = {cut.ref.id: cut for cut in made}
-    chosen = split_episodes([cut.ref for cut in made], test_share)
+def choose_contents(cuts: Sequence[CutEpisode], test_share: float) -> Contents:
+    """Splits the episodes and chooses the unit of depth, as metres and relative depth do not mix in one store."""
+    by_id = {cut.ref.id: cut for cut in cuts}
+    chosen = split_episodes([cut.ref for cut in cuts], test_share)
     splits = {split: [by_id[ref.id] for ref in refs] for split, refs in chosen.items()}
     units: Counter[str] = Counter()
     for cut in splits["train"]:
@@ -92,86 +92,79 @@ def choose_contents(made: Sequence[Cut], test_share: float) -> Contents:
 
 
 def pack(
-    job: Job, out: Path, contents: Contents, counts: Counts, meta: dict[str, Any], packed: Callable[[int], None]
+    plan: IngestPlan, contents: Contents, summary: IngestSummary, keys: dict[str, str], packed: Callable[[int], None]
 ) -> None:
-    """Writes the store out of the clips that the units left.
+    """Writes the store out of the clips that were cut.
 
     Its manifest has the train split's action statistics, unit and range of depth (None without depth), the episodes of
-    each split, what was left out and why, and what every clip is called.
+    each split, what was left out and why, and every clip's labels.
 
     Args:
-        meta: more of the manifest.
+        keys: further entries of the manifest, as are those of the plan.
         packed: called with the number of episodes that are packed.
     """
-    made = contents.made()
+    episodes = contents.episodes()
+    successes = [(cut.success, cut.records) for cut in episodes if cut.success is not None]
+    quarantine: dict[str, str] = {}
+    for row in summary.quarantined:  # several may have one id
+        reason = f"{row['stage']}: {row['error']}"
+        quarantine[row["episode"]] = "; ".join(filter(None, (quarantine.get(row["episode"]), reason)))
     manifest = {
-        "source": job.source.name,
-        **_statistics(job, contents.splits["train"]),
+        "source": plan.source.name,
+        **_statistics(plan, contents.splits["train"]),
         "depth_range": contents.depth_range,
         "depth_unit": contents.depth_unit,
         "episodes": {split: [cut.ref.id for cut in cuts] for split, cuts in contents.splits.items()},
-        "success_share": _success_share(made),
+        "success_share": sum(s for s, _ in successes) / sum(n for _, n in successes) if successes else None,
         "counts": {
-            "found": counts.found,
-            "done": counts.done,
-            "without": len(counts.filtered),
-            "quarantined": len(counts.quarantined),
-            "windows": counts.windows,
-            "depth_left_out": counts.depth_left_out,
+            "found": summary.episodes,
+            "done": summary.done,
+            "without": len(summary.filtered),
+            "quarantined": len(summary.quarantined),
+            "windows": summary.windows,
+            "depth_left_out": summary.depth_left_out,
         },
-        "filtered": counts.filtered,
-        "quarantine": _reasons(counts),
+        "filtered": summary.filtered,
+        "quarantine": quarantine,
     }
-    done = iter(range(1, len(made) + 1))
+    done = iter(range(1, len(episodes) + 1))
     records = {
-        split: _records(job, cuts, contents, lambda: packed(next(done))) for split, cuts in contents.splits.items()
+        split: _records(plan, cuts, contents, lambda: packed(next(done))) for split, cuts in contents.splits.items()
     }
-    write_store(out, "clips", records, manifest | {name: finite(value) for name, value in meta.items()}, words)
-    open_store(out)
+    write_store(plan.out, "clips", records, manifest | _finite(plan.meta | keys), clip_labels)
+    open_store(plan.out)
 
 
-def finite(value: Any) -> Any:
-    """The same, with null for numbers that JSON has not: infinity, where an option bounds nothing."""
+def _finite(value: Any) -> Any:
+    """Replaces numbers that JSON does not have (infinity, where an option bounds nothing) by null."""
     if isinstance(value, dict):
-        return {name: finite(part) for name, part in value.items()}
+        return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(part) for part in value]
+        return [_finite(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _records(job: Job, cuts: Sequence[Cut], contents: Contents, packed: Callable[[], None]) -> Iterator[Record]:
-    """The clips of these episodes, one at a time, in the store's unit of depth or without, and with its range."""
+def _records(
+    plan: IngestPlan, cuts: Sequence[CutEpisode], contents: Contents, packed: Callable[[], None]
+) -> Iterator[Record]:
+    """Reads the clips of these episodes, one at a time, with the store's unit of depth or without, and its range."""
     for cut in cuts:
-        source = job.records(Unit(cut.ref, CLIPS), {"records": cut.records})
+        source = EpisodeWork(plan, cut.ref).records(CLIPS, cut.records)
         changes: dict[str, Any] = {} if cut.depth_unit == contents.depth_unit else {"depth": None}
-        told = {"depth_range": contents.depth_range} | ({"depth_unit": ""} if changes else {})
+        provenance = {"depth_range": contents.depth_range} | ({"depth_unit": ""} if changes else {})
         for number in range(len(source)):
             record = source[number]
-            yield record | changes | {"provenance": record["provenance"] | told}
+            yield record | changes | {"provenance": record["provenance"] | provenance}
         packed()
 
 
-def _success_share(made: Sequence[Cut]) -> float | None:
-    """Of the clips of episodes that say whether they succeed; None where none does."""
-    told = [cut for cut in made if cut.success is not None]
-    return sum(cut.success or 0 for cut in told) / sum(cut.records for cut in told) if told else None
-
-
-def _statistics(job: Job, cuts: Sequence[Cut]) -> dict[str, Any]:
+def _statistics(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> dict[str, Any]:
     total: Statistics | None = None
     for cut in cuts:
-        mark = job.mark(Unit(cut.ref, CLIPS))
+        work = EpisodeWork(plan, cut.ref)
+        mark = work.done(CLIPS)
         if mark is None:
-            raise StoreError(f"{job.output(Unit(cut.ref, CLIPS))}: was deleted meanwhile; run again")
+            raise StoreError(f"{work.output(CLIPS)}: was deleted meanwhile; run again")
         rows = Statistics.from_json(mark["summary"]["actions"])
         total = total.merged(rows) if total else rows
     return total.to_json() if total else {}
-
-
-def _reasons(counts: Counts) -> dict[str, str]:
-    """Of the quarantined, by id, of which there may be several."""
-    found: dict[str, str] = {}
-    for row in counts.quarantined:
-        told = f"{row['stage']}: {row['error']}"
-        found[row["episode"]] = f"{found[row['episode']]}; {told}" if row["episode"] in found else told
-    return found

@@ -1,7 +1,7 @@
-"""Windows: clips of a fixed number of frames at a fixed rate, as an index into an episode, and which of them are kept.
+"""Windows: fixed numbers of frames at a fixed rate, as an index into an episode, and which of them become clips.
 
-Windows overlap: a minute at 30 fps holds about a hundred of 16 frames at 2 Hz, each spanning 226 recorded frames. So
-depth and tracks are made once per episode, and a window is no more than the numbers of the frames that it takes.
+Windows overlap: a minute at 30 fps has about a hundred of 16 frames at 2 Hz, each spanning 226 recorded frames. So
+depth and tracks are made once per episode, and a window is no more than the numbers of its frames.
 
 Axes: N recorded frames, T frames of a window, W windows, S spans.
 """
@@ -34,7 +34,7 @@ class WindowConfig:
     within_segments: bool = False  # each window in one segment of the data set; else only cuts between shots bound it
     least_motion: float = 0.0  # mean over the window's frames; below, nothing happens
     most_motion: float = float("inf")  # above, the camera shakes or the picture is broken
-    key_frame: bool = False  # keep only windows that hold a key frame
+    key_frame: bool = False  # keep only windows with a key frame
     most_gap: float = 1.5  # of the time between two frames of a window, relative to 1 / rate; a recording may stop
 
     def __post_init__(self) -> None:
@@ -55,7 +55,7 @@ class WindowIndex:
     Attributes:
         offsets: recorded frames from a window's first frame to each of its frames; the same for all windows.
         starts: each window's first frame, increasing.
-        short: how many spans (shots, segments) hold no window because they are too short.
+        short: how many spans (shots, segments) are too short for a window.
     """
 
     offsets: Int[np.ndarray, " T"]
@@ -71,15 +71,15 @@ class WindowIndex:
         return int(self.offsets[-1]) + 1
 
     def frames(self, window: int) -> Int[np.ndarray, " T"]:
-        """The recorded frames that a window takes."""
+        """Returns the recorded frames of a window."""
         return self.starts[window] + self.offsets
 
 
 def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
-    """The recorded frames nearest to even steps of ``1 / rate`` seconds, from 0 on, increasing.
+    """Returns the recorded frames nearest to even steps of ``1 / rate`` seconds, from 0 on, increasing.
 
     Raises:
-        EpisodeError: it was recorded at a lower rate than asked for, or at one that no camera has.
+        EpisodeError: it was recorded at a lower rate than windows take, or at one that no camera has.
     """
     step = fps / config.rate if config.rate else 1.0
     if not step < MAX_STEP:
@@ -91,11 +91,11 @@ def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
 
 
 def index_windows(fps: float, spans: Sequence[Span], config: WindowConfig) -> WindowIndex:
-    """All windows that lie within one span.
+    """Returns all windows that lie within one span.
 
     Args:
         fps: recorded frames per second.
-        spans: parts of the episode that windows may not reach across, in order, without overlap.
+        spans: in order, without overlap.
         config: how long windows are and how far apart.
 
     Raises:
@@ -105,21 +105,21 @@ def index_windows(fps: float, spans: Sequence[Span], config: WindowConfig) -> Wi
     step = fps / config.rate if config.rate else 1.0
     starts, short = [np.zeros(0, np.int64)], 0
     for first, end in spans:
-        room = end - first - int(offsets[-1]) - 1
-        if room < 0:
+        last = end - first - int(offsets[-1]) - 1  # the last possible start, from the first frame of the span
+        if last < 0:
             short += 1
             continue
-        found = np.floor(np.arange(int(room / (step * config.hop)) + 2) * step * config.hop + 0.5 + 1e-9)
-        starts.append(first + found[found <= room].astype(np.int64))
+        even = np.floor(np.arange(int(last / (step * config.hop)) + 2) * step * config.hop + 0.5 + 1e-9)
+        starts.append(first + even[even <= last].astype(np.int64))
     return WindowIndex(offsets, np.concatenate(starts), short)
 
 
 def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], config: WindowConfig) -> list[Span]:
-    """What bounds windows: the shots, and within them the data set's segments where the config says so.
+    """Returns the spans that bound windows: the shots, or their parts in one segment where the config asks for it.
 
     Args:
-        count: recorded frames; what lies beyond is cut off.
-        shots: in order, without overlap; none: the episode is one.
+        count: recorded frames; shots are cut off there.
+        shots: in order, without overlap; none: the episode is one shot.
         segments: the data set's own.
 
     Raises:
@@ -137,9 +137,9 @@ def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], co
 
 
 def segment_at(segments: Sequence[Segment], frames: Int[np.ndarray, " T"]) -> Segment | None:
-    """The segment that holds most of a window's frames, the earlier one of two; None where none holds any."""
-    held = [int(((frames >= segment.start) & (frames < segment.end)).sum()) for segment in segments]
-    return segments[int(np.argmax(held))] if any(held) else None
+    """Returns the segment with most of a window's frames, the earlier one of two; None where none has any."""
+    shares = [int(((frames >= segment.start) & (frames < segment.end)).sum()) for segment in segments]
+    return segments[int(np.argmax(shares))] if any(shares) else None
 
 
 def judge(
@@ -149,14 +149,14 @@ def judge(
     key_frames: Sequence[int],
     config: WindowConfig,
 ) -> list[str]:
-    """Why each window is left out, "" where it is kept.
+    """Returns why each window is left out, "" where it is kept.
 
     Args:
         index: the windows.
         timestamps: seconds of the recorded frames.
         motion: of each frame against the one before, in pixels per second of a 256-pixel-wide picture; None where it
-            was not measured, then it keeps nothing out.
-        key_frames: recorded frames at which something happens.
+            was not measured, then no window is left out for it.
+        key_frames: recorded frames at which something decisive happens.
 
     Returns:
         ``gap``, ``still``, ``shaking``, ``no key frame`` or "".
@@ -166,40 +166,34 @@ def judge(
     # Rounding to recorded frames makes some steps longer than 1 / rate where nothing is missing.
     steps = np.maximum(np.diff(index.offsets) * recorded, 1 / config.rate if config.rate else 0.0)
     torn = (np.diff(timestamps[frames], axis=1) > config.most_gap * steps).any(1) if len(index) else np.zeros(0, bool)
-    means = _window_means(motion, index) if motion is not None else None
+    means = np.full(len(index), np.nan) if motion is None else _window_means(motion, index)  # nan passes both bounds
     keys = np.sort(np.asarray(key_frames, np.int64))
     has_key = np.searchsorted(keys, index.starts) < np.searchsorted(keys, index.starts + index.span)
-    reasons = []
-    for window in range(len(index)):
-        if torn[window]:
-            reasons.append("gap")
-        elif means is not None and means[window] < config.least_motion:
-            reasons.append("still")
-        elif means is not None and means[window] > config.most_motion:
-            reasons.append("shaking")
-        elif config.key_frame and not has_key[window]:
-            reasons.append("no key frame")
-        else:
-            reasons.append("")
-    return reasons
+    reasons = {
+        "gap": torn,
+        "still": means < config.least_motion,
+        "shaking": means > config.most_motion,
+        "no key frame": ~has_key & config.key_frame,
+    }
+    return np.select(list(reasons.values()), list(reasons), "").tolist()
 
 
 def tally(reasons: Sequence[str]) -> dict[str, int]:
-    """How many windows each reason leaves out; ``kept`` is the rest. The numbers add up to all windows."""
+    """Counts the windows by reason; ``kept`` is the rest. The numbers add up to all windows."""
     counts = Counter(reasons)
     return {"kept": counts.pop("", 0), **dict(sorted(counts.items()))}
 
 
 def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, list[int]]:
-    """The first frames of the windows that each reason leaves out."""
-    found: dict[str, list[int]] = {}
+    """Returns the first frames of the windows that each reason leaves out."""
+    starts: dict[str, list[int]] = {}
     for start, reason in zip(index.starts.tolist(), reasons, strict=True):
         if reason:
-            found.setdefault(reason, []).append(start)
-    return found
+            starts.setdefault(reason, []).append(start)
+    return starts
 
 
 def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:
-    """Mean motion between a window's first frame and its last; the first one's own is of what lay before."""
+    """Returns the mean motion between a window's first frame and its last; that of the first frame lies before it."""
     sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
     return (sums[index.starts + index.span] - sums[index.starts + 1]) / (index.span - 1)

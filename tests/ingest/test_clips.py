@@ -11,8 +11,9 @@ from rsjax.clip import Clip
 from rsjax.data.codec import Record
 from rsjax.data.store import decode_clip
 from rsjax.ingest.actions import ActionConfig
+from rsjax.ingest.annotate import Annotated
 from rsjax.ingest.annotators.categories import CategoryConfig
-from rsjax.ingest.clips import Annotated, ClipConfig, cut, words
+from rsjax.ingest.clips import ClipConfig, clip_labels, cut
 from rsjax.ingest.episode import Episode, EpisodeError, Segment
 from rsjax.ingest.windows import WindowConfig
 from tests.ingest.toy import Pictures, episode
@@ -143,8 +144,8 @@ def test_words_are_the_tasks_and_the_segments() -> None:
     config = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("pick*", "simple"),)))
     found, _ = clips(episode("a"), config, motion=np.arange(40.0), scene="kitchen")
     named = {"task": "pick a cup", "difficulty": "simple", "scene": "kitchen"}
-    assert words(found[0]) == named | {"segment": "reach", "skill": "unknown"}
-    assert words(found[4]) == named | {"segment": "grasp", "skill": "Grasp"}
+    assert clip_labels(found[0]) == named | {"segment": "reach", "skill": "unknown"}
+    assert clip_labels(found[4]) == named | {"segment": "grasp", "skill": "Grasp"}
     assert [record["provenance"]["segment"] for record in found] == ["reach", "reach", "reach", "grasp", "grasp"]
     assert found[0]["provenance"]["motion"] == np.mean(np.arange(1, 16))
     unnamed, _ = clips(episode("a", task=""), config)

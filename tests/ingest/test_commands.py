@@ -15,7 +15,8 @@ import pytest
 
 from experiments import doctor, ingest, inspect, store
 from rsjax.data.store import open_store
-from rsjax.ingest.report import QUARANTINE
+from rsjax.ingest.options import source_options
+from rsjax.ingest.summary import QUARANTINE
 from tests.bridge import BRIDGE, needs_bridge
 from tests.data.clips import clip_store, numbers
 
@@ -52,7 +53,7 @@ def test_the_bundled_bridge_episodes_become_a_store(command: Command, tmp_path: 
     line = ["rlds", BRIDGE, "--out", out, "--windows.frames", 4, "--windows.rate", 0, "--windows.hop", 4]
     line += ["--workers", 0, "--difficulty", "put*=simple", "*=difficult", "--shots", "none", "--motion", "none"]
     told = command(ingest, *line)
-    assert "episodes  25 found = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
+    assert "episodes  25 = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
     opened = open_store(out)
     counts = opened.labels("train").counts()["difficulty"]
     assert set(counts) == {"simple", "difficult"}
@@ -88,13 +89,13 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
         command(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL]
     told = command(ingest, *line, "--manifest", tmp_path / "fixed.json")
-    assert "episodes  4 found = 3 with clips + 0 without + 1 quarantined" in told
+    assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in told
     rows = [json.loads(row) for row in (tmp_path / "store.work" / "quarantine.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == ["episode_02"]
     assert "left out by the manifest: duplicate" in rows[0]["error"]
     manifest = open_store(tmp_path / "store").manifest
     assert "left out by the manifest" in manifest["quarantine"]["episode_02"]
-    assert "episodes  4 found = 4 with clips" in command(ingest, *line)
+    assert "episodes  4 = 4 with clips" in command(ingest, *line)
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
@@ -112,7 +113,7 @@ def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, num
     marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/**/*.json")}
     assert 0 < len(marks) < 200 and not (tmp_path / "store").exists()
     told = command(ingest, *line, "--workers", 0, "--keep-clips")
-    assert f"this run  {200 - len(marks)} units" in told
+    assert f"this run  {200 - len(marks)} work items" in told
     assert {path: path.stat().st_mtime_ns for path in marks} == marks
 
 
@@ -132,7 +133,7 @@ def test_recordings_that_are_too_short_are_told_in_numbers_with_a_cure(command: 
     assert "16 frames at 2 Hz take 76 of 10 fps; the longest has 12" in told
     assert "raise --windows.rate or lower --windows.frames" in told and QUARANTINE not in told
     cured = command(ingest, *line, "--windows.rate", 10, "--windows.frames", 12)
-    assert "2 found = 2 with clips" in cured
+    assert "2 = 2 with clips" in cured
 
 
 def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
@@ -206,6 +207,6 @@ def test_what_cannot_be_done_is_one_line(
 
 
 def test_source_options_are_json_where_they_can_be() -> None:
-    found = ingest.source_options(("fps=5", "held=[6]", "keys=bridge", "task=a=b"))
+    found = source_options(("fps=5", "held=[6]", "keys=bridge", "task=a=b"))
     assert found == {"fps": 5, "held": [6], "keys": "bridge", "task": "a=b"}
     json.dumps(found)

@@ -1,22 +1,32 @@
-"""Episodes made up on the spot, some of them broken, and stages that count how often they run."""
+"""Episodes made up on the spot, some of them broken, steps that count how often they run, and ingests of both."""
 
 import os
 import signal
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from rsjax.data.codec import Record
+from rsjax.config import content_key
+from rsjax.ingest.annotate import Annotators, annotation_steps
+from rsjax.ingest.annotators.categories import CategoryConfig
 from rsjax.ingest.annotators.protocols import AnnotationError, Annotator, DepthMaps, Tracked
+from rsjax.ingest.clips import ClipConfig, clip_step
 from rsjax.ingest.episode import Depths, Episode, EpisodeError, EpisodeRef, Frames, Segment
-from rsjax.ingest.jobs.work_items import Inputs, Job, Summary, Work
+from rsjax.ingest.ingest import ingest
+from rsjax.ingest.summary import IngestSummary
+from rsjax.ingest.windows import WindowConfig
+from rsjax.ingest.work_items import IngestPlan, Inputs, Records, Step
 from tests.ingest.videos import ArrayDepths
 
 FPS = 10.0
+CONFIG = ClipConfig(
+    WindowConfig(frames=4, rate=2), image_size=8, tracks=6, categories=CategoryConfig((("pick*", "simple"),))
+)
+NOTHING = Annotators(shots=None, motion=None, tracks=None, semantics=None)
 
 
 @dataclass(frozen=True)
@@ -96,53 +106,53 @@ class Source:
 
 @dataclass(frozen=True)
 class Noting:
-    """A stage of two records that leaves a line in a log for each run, and may die, fail or wait.
+    """The work of a step with two records. It leaves a line in a log for each run, and may die or fail.
 
     Attributes:
-        log: a file; a line is a stage's name and an episode's.
-        kills: a file; while it is not there, the episode ``fatal`` creates it and kills its worker. "": it always dies.
+        log: a file; a line is the step's name and the episode's. Process ids are names of files in pids/ beside it.
+        needs: the steps whose output it reads.
+        deadly: an episode that kills its worker each time.
+        once: likewise, but the first time only.
         fails: an episode that raises.
-        seconds: for which each run takes.
+        seconds: how long each run takes.
     """
 
     log: str
-    name: str = "first"
-    version: int = 1
+    name: str
     needs: tuple[str, ...] = ()
-    cpus: float = 1.0
-    gpus: float = 0.0
-    extra: int = 0
-    fatal: str = ""
-    kills: str = ""
+    deadly: str = ""
+    once: str = ""
     fails: str = ""
     seconds: float = 0.0
 
-    def params(self) -> dict[str, Any]:
-        return {"extra": self.extra}
-
-    def open(self) -> Work:
-        return self._work
-
-    def _work(self, episode: Episode, inputs: Inputs) -> Generator[Record, None, Summary]:
+    def __call__(self, episode: Episode, inputs: Inputs) -> Records:
+        line = f"{self.name} {episode.id}"
+        first = not Path(self.log).exists() or line not in Path(self.log).read_text().splitlines()
         with Path(self.log).open("a") as file:
-            file.write(f"{self.name} {episode.id}\n")
+            file.write(f"{line}\n")
+        (Path(self.log).parent / "pids").mkdir(exist_ok=True)
+        (Path(self.log).parent / "pids" / str(os.getpid())).touch()
         time.sleep(self.seconds)
         yield {"i": np.array(0), "from": [len(inputs[name]) for name in self.needs]}
-        if episode.id == self.fatal and not (self.kills and Path(self.kills).exists()):
-            if self.kills:
-                Path(self.kills).touch()
+        if episode.id == self.deadly or (episode.id == self.once and first):
             os.kill(os.getpid(), signal.SIGKILL)
         if episode.id == self.fails:
             raise ValueError("no such colour")
         yield {"i": np.array(1)}
-        return {"windows": {"kept": 2}}
+        return {"windows": {"kept": 2}, "left_out": {}}
 
 
-def job(folder: Path, source: Source, **fields: Any) -> Job:
-    """Two :class:`Noting` stages, whose fields are those given; ``log`` lies in the folder."""
+def noting_plan(folder: Path, source: Source, extra: int = 0, seconds: float = 0.0, **fields: Any) -> IngestPlan:
+    """Returns a plan of two :class:`Noting` steps, ``first`` with these fields and ``clips`` after it.
+
+    Args:
+        extra: a parameter of both steps.
+        seconds: how long each takes.
+    """
     log = str(folder / "log")
-    first = Noting(log, "first", **fields)
-    return Job(source, "", (first, Noting(log, "second", needs=("first",), seconds=first.seconds)), folder)
+    work = Noting(log, "first", seconds=seconds, **fields), Noting(log, "clips", ("first",), seconds=seconds)
+    steps = tuple(Step(each.name, each, content_key({"extra": extra}), each.needs) for each in work)
+    return IngestPlan(source, steps, folder / "store")
 
 
 def runs(folder: Path) -> list[str]:
@@ -179,3 +189,20 @@ class ByDepth(Annotator):
             raise AnnotationError("no depth to track by")
         x = depth.read(range(len(frames)))[:, 0, 0] / 10
         return Tracked(np.stack([x, x], 1)[None].astype(np.float32), np.ones((1, len(frames)), bool))
+
+
+def clip_plan(
+    folder: Path, source: Source, annotators: Annotators = NOTHING, share: float = 0.25, config: ClipConfig = CONFIG
+) -> IngestPlan:
+    """Returns the plan of a store of clips in ``folder``."""
+    steps = annotation_steps(annotators, config.camera)
+    steps = (*steps, clip_step(config, tuple(step.name for step in steps)))
+    return IngestPlan(source, steps, folder / "store", share, meta={"config": {}})
+
+
+def ingested(plan: IngestPlan, keep_clips: bool = False, retry: bool = False) -> IngestSummary | None:
+    """Ingests in this process; the numbers of the summary add up."""
+    summary = ingest(plan, keep_clips=keep_clips, retry=retry)
+    if summary is not None:
+        assert summary.episodes == summary.done + len(summary.filtered) + len(summary.quarantined)
+    return summary

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from rsjax.config import ConfigError
 from rsjax.errors import did_you_mean
+from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.annotators.depth import RecordedDepth
-from rsjax.ingest.stages import Annotators
 
 NONE = "none"
 METHODS: dict[str, dict[str, tuple[str, str]]] = {  # module and class, by stage and the method's name

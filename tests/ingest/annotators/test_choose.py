@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from rsjax.config import ConfigError
+from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.annotators.choose import METHODS, choose, choose_annotators, choose_recorded
 from rsjax.ingest.annotators.depth import RecordedDepth
 from rsjax.ingest.annotators.networks.tracks import BootsTapir
 from rsjax.ingest.annotators.tracks import LucasKanade
-from rsjax.ingest.stages import Annotators
 
 
 def test_a_word_is_a_method_and_its_fields() -> None:

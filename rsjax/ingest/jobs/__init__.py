@@ -1,1 +1,0 @@
-"""Running the work items of an ingest: on this machine or on a Ray cluster, resumable."""

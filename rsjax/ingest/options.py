@@ -1,0 +1,157 @@
+"""The options of an ingest, and the plan and the runner that they make."""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from rsjax.config import content_key, require, to_dict
+from rsjax.config.fields import ConfigError
+from rsjax.ingest.actions import ActionConfig
+from rsjax.ingest.windows import WindowConfig
+
+
+@dataclass(frozen=True)
+class IngestOptions:
+    """Options of ``experiments.ingest``."""
+
+    out: Path | None = None
+    """The store; data/SOURCE by default."""
+    option: tuple[str, ...] = ()
+    """The source's own settings, such as keys=bridge or fps=5, as docs/formats.md lists them; lists as JSON."""
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    actions: ActionConfig = field(default_factory=ActionConfig)
+    image_size: int = 64
+    """Side of a clip in pixels."""
+    points: int = 256
+    """Tracks of a clip."""
+    manifest: Path | None = None
+    """A file written by experiments.doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
+    camera: str = ""
+    """The camera to use; the episode's first by default."""
+    difficulty: tuple[str, ...] = ()
+    """The difficulty of tasks, by the first pattern that matches: 'pick*=simple' '*fold*=difficult'. Where none matches
+    the task, the patterns are tried on the text of the segment, and then on its skill."""
+    scene: tuple[str, ...] = ()
+    """The word for a scene, by the first pattern that matches its description."""
+    test_share: float = 0.1
+    """Share of the episodes whose clips are the test split."""
+    shots: str = "hsv-histogram"
+    """hsv-histogram, transnetv2 or none, as docs/annotate.md explains; so are the next four."""
+    motion: str = "dis"
+    """dis, raft or none."""
+    depth: str = "recorded"
+    """recorded (or recorded:most_holes=0.8), depth-anything, video-depth-anything or none."""
+    tracks: str = "lucas-kanade"
+    """lucas-kanade, spatial-tracker, bootstapir or none."""
+    semantics: str = "own"
+    """own, internvl or none."""
+    runner: Literal["pool", "ray"] = "pool"
+    """Processes of this machine, or a Ray cluster."""
+    workers: int = -1
+    """Processes; 0: this one alone, -1: one per core. With Ray, of each step at most; -1: as many as fit."""
+    ray_address: str = "local"
+    """Of the cluster (auto: the one that this machine belongs to)."""
+    cpus: float = 1.0
+    """Of each worker, on Ray; fractions share a core."""
+    gpus: float = 0.0
+    """Of each worker that has a network, on Ray; fractions share a GPU."""
+    retry: bool = False
+    """Try the quarantined episodes again."""
+    keep_clips: bool = False
+    """Keep the clips of each episode beside the store too: more disk, less time when episodes are added."""
+
+    def __post_init__(self) -> None:
+        require(
+            0 <= self.test_share < 1, f"--test-share is {self.test_share}; it is a share of the episodes, 0 to below 1"
+        )
+        require(
+            self.cpus > 0 and self.gpus >= 0,
+            f"--cpus is {self.cpus} and --gpus {self.gpus}; they cannot be negative, nor --cpus 0",
+        )
+        require(
+            self.workers >= -1,
+            f"--workers is {self.workers}; give a number, 0 for this process alone or -1 for as many as fit",
+        )
+        if self.runner != "ray":
+            for name in ("ray_address", "cpus", "gpus"):
+                flag, default = f"--{name.replace('_', '-')}", type(self).__dataclass_fields__[name].default
+                require(getattr(self, name) == default, f"{flag} is for Ray alone; add --runner ray or leave it out")
+
+
+def make_plan(source: str, path: Path, options: IngestOptions) -> Any:
+    """Returns the :class:`rsjax.ingest.work_items.IngestPlan` for a data set of the format ``source`` at ``path``.
+
+    Raises:
+        UserError: an option is impossible, or the source is unknown or not at its path.
+    """
+    from rsjax.ingest.annotate import annotation_steps
+    from rsjax.ingest.annotators.categories import CategoryConfig, parse_table
+    from rsjax.ingest.annotators.choose import choose_annotators, choose_recorded
+    from rsjax.ingest.clips import ClipConfig, clip_step
+    from rsjax.ingest.formats import open_source
+    from rsjax.ingest.selection import select
+    from rsjax.ingest.work_items import IngestPlan
+
+    out = Path(os.path.abspath(options.out or Path("data") / source))
+    require(bool(out.name), f"--out is {options.out}; name a directory for the store")
+    methods = {step: getattr(options, step) for step in ("shots", "motion", "depth", "tracks", "semantics")}
+    recorded = choose_recorded(methods["depth"])
+    difficulties, scenes = parse_table("--difficulty", options.difficulty), parse_table("--scene", options.scene)
+    config = ClipConfig(
+        options.windows,
+        options.image_size,
+        options.points,
+        options.camera,
+        recorded_depth=recorded is not None,
+        most_holes=recorded.most_holes if recorded else 0.0,
+        actions=options.actions,
+        categories=CategoryConfig(difficulties, scenes),
+    )
+    steps = annotation_steps(choose_annotators(methods), config.camera, options.cpus, options.gpus)
+    steps = (*steps, clip_step(config, tuple(step.name for step in steps), options.cpus))
+    settings = source_options(options.option)
+    episodes: Any = open_source(source, path.absolute(), **settings)
+    if options.manifest is not None:
+        episodes = select(episodes, options.manifest)
+    reading = content_key(json.dumps(settings, sort_keys=True))
+    meta = {"config": to_dict(config) | {"methods": methods, "source": settings}}
+    return IngestPlan(episodes, steps, out, options.test_share, reading, meta)
+
+
+def make_runner(options: IngestOptions) -> Any:
+    """Returns the :class:`rsjax.ingest.ingest.Runner` that the options ask for.
+
+    Raises:
+        UserError: more workers than this machine has work for.
+    """
+    if options.runner == "ray":
+        from rsjax.ingest.ray_runner import run_on_ray
+
+        most = None if options.workers < 0 else max(1, options.workers)
+        return partial(run_on_ray, address=options.ray_address, most=most)
+    from rsjax.ingest.ingest import run_on_this_machine
+    from rsjax.processes import count_workers
+
+    return partial(run_on_this_machine, workers=count_workers(options.workers))
+
+
+def source_options(words: Sequence[str]) -> dict[str, Any]:
+    """Reads settings of a source: ``fps=5`` as a number, ``held=[6]`` as a list, everything that is not JSON as text.
+
+    Raises:
+        ConfigError: a word is not of this form.
+    """
+    settings: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals):
+            raise ConfigError(f"--option {word!r}: write NAME=VALUE, such as fps=5")
+        try:
+            settings[name] = json.loads(value)
+        except ValueError:
+            settings[name] = value
+    return settings

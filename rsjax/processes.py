@@ -1,0 +1,185 @@
+"""Worker processes on this machine: the one way in which rsjax spreads work over cores.
+
+A worker does one item at a time. It may be killed, most often by the kernel for lack of memory, without the others
+noticing: another worker tries its item once more. Workers end with the process that started them, even by SIGKILL.
+"""
+
+import ctypes
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import NamedTuple, TypeVar
+
+from rsjax.errors import UserError
+
+MOST_PER_CORE = 4  # workers; more only take memory from each other
+MAX_DEATHS = 2  # of workers over one item; the second time it is the item and not the machine
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class WorkerDied(Exception):
+    """The workers that had an item are gone; most often they were killed for lack of memory."""
+
+    def __init__(self) -> None:
+        super().__init__(f"{MAX_DEATHS} workers died over it, most likely for lack of memory; try fewer workers")
+
+
+def count_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def count_workers(workers: int) -> int:
+    """Returns the number of processes that ``--workers`` stands for; 0 is this process alone.
+
+    Raises:
+        UserError: it is below -1, or more than :data:`MOST_PER_CORE` for each core.
+    """
+    cores = count_cores()
+    if not -1 <= workers <= MOST_PER_CORE * cores:
+        raise UserError(
+            f"--workers is {workers}; give 1 to {MOST_PER_CORE * cores} ({cores} cores have work for {cores}), 0 for "
+            f"this process alone or -1 for one per core"
+        )
+    return cores if workers == -1 else workers
+
+
+class _Worker(NamedTuple):
+    process: BaseProcess
+    pipe: Connection
+
+
+def run_items(
+    make: Callable[[], Callable[[Item], Result]],
+    items: Iterable[Item],
+    workers: int,
+    settle: Callable[[Item, Result | WorkerDied], None],
+) -> None:
+    """Works on items in processes, in no particular order, until all are settled.
+
+    Args:
+        make: called once in each worker, returns the function that does an item's work. Picklable, as are items and
+            results.
+        items: taken one by one, as workers become free.
+        workers: how many processes at most; each is started when there is an item for it. 0: this process does it all.
+        settle: called in this process with each item and its result, or with :class:`WorkerDied` where
+            :data:`MAX_DEATHS` workers died over it.
+
+    Raises:
+        Exception: whatever the work raised; a bug carries the worker's traceback as a note.
+    """
+    if not workers:
+        work = make()
+        for item in items:
+            settle(item, work(item))
+        return
+    first_message = pickle.dumps(make)
+    fresh, again = ((item, 0) for item in items), deque[tuple[Item, int]]()
+    started: list[_Worker] = []
+    idle: list[_Worker] = []
+    busy: dict[Connection, tuple[_Worker, Item, int]] = {}
+    try:
+        while True:
+            while len(busy) < workers and (entry := again.popleft() if again else next(fresh, None)):
+                worker = idle.pop() if idle else _start(first_message, started)
+                busy[worker.pipe] = worker, *entry
+                _send(worker, entry[0])
+            if not busy:
+                return
+            ready = wait(list(busy))
+            for pipe in [pipe for pipe in busy if pipe in ready]:
+                worker, item, deaths = busy.pop(pipe)
+                try:
+                    succeeded, answer = worker.pipe.recv()
+                except (EOFError, OSError):
+                    started.remove(worker)
+                    _stop([worker])
+                    if deaths + 1 < MAX_DEATHS:
+                        again.append((item, deaths + 1))
+                    else:
+                        settle(item, WorkerDied())
+                    continue
+                idle.append(worker)
+                if not succeeded:
+                    raise answer
+                settle(item, answer)
+    finally:
+        _stop(started)
+
+
+def _start(first_message: bytes, started: list[_Worker]) -> _Worker:
+    """Starts a worker and notes it in ``started``, also where Ctrl-C or SIGTERM comes in between."""
+    context = multiprocessing.get_context("spawn")  # a forked JAX, PyTorch or OpenGL does not work
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(os.getpid(), there))
+    resource_tracker.ensure_running()  # it would unblock the signals
+    # A worker inherits the blocked signals: Ctrl-C and SIGTERM are its parent's to answer, which then stops it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    started.append(_Worker(process, here))
+    try:
+        process.start()
+    finally:
+        there.close()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        here.send_bytes(first_message)
+    except OSError:  # it died already, which the next wait sees
+        process.kill()
+    return started[-1]
+
+
+def _send(worker: _Worker, item: object) -> None:
+    try:
+        worker.pipe.send(item)
+    except OSError:  # it died while it was idle, which the next wait sees
+        worker.process.kill()
+
+
+def _stop(workers: list[_Worker]) -> None:
+    """Kills workers: files that they are writing have temporary names."""
+    begun = [worker for worker in workers if worker.process.pid is not None]
+    for worker in begun:
+        worker.process.kill()
+    for worker in begun:
+        worker.process.join()
+    for worker in workers:
+        worker.pipe.close()
+
+
+def _serve(parent: int, pipe: Connection) -> None:
+    """Answers each item with (True, result) or (False, error) until the parent closes the pipe. Runs in a worker."""
+    _end_with(parent)
+    work = None
+    try:
+        first_message = pipe.recv_bytes()
+        while True:
+            item = pipe.recv()
+            try:
+                work = work or pickle.loads(first_message)()
+                answer = True, work(item)
+            except Exception as error:
+                if not isinstance(error, UserError):  # a bug, whose traceback a pipe does not carry
+                    error.add_note(traceback.format_exc())
+                answer = False, error
+            pipe.send(answer)
+    except (EOFError, OSError):
+        return
+
+
+def _end_with(parent: int) -> None:
+    """Has the kernel kill this process when its parent dies, whatever either is doing."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # the parent died before that
+        os._exit(1)
