@@ -15,14 +15,14 @@ RATE_WINDOW_SECONDS = 30.0  # short enough to forget the first step, which compi
 _BAR_COLUMNS = 30  # of the bar and the space around it
 
 
-def stage(number: int, of: int, name: str, note: str, console: Console | None = None) -> None:
+def stage(number: int, of: int, name: str, note: str) -> None:
     """Prints a stage's headline, such as ``[2/6] tokenizer: up to date, skipped``."""
-    _print(console or Console(), f"[{number}/{of}] {name}: {note}")
+    print(f"[{number}/{of}] {name}: {note}", flush=True)
 
 
-def note(line: str, console: Console | None = None) -> None:
+def note(line: str) -> None:
     """Prints a message of a stage, such as that something is switched off."""
-    _print(console or Console(), f"  note: {line}")
+    print(f"  note: {line}", flush=True)
 
 
 def duration(seconds: float) -> str:
@@ -95,7 +95,7 @@ class Progress:
         parts, values = self._parts(), [f"{name}={float(value):.4g}" for name, value in scalars.items()]
         line = ", ".join(parts + values)
         if self._bar is None:
-            _print(self._console, f"  {self.stage}: {line}")
+            self._print(line)
             return
         if len(self.stage) + _BAR_COLUMNS + len(line) > self._console.width:
             line = f"{', '.join(parts)}\n{', '.join(values)}"
@@ -107,7 +107,10 @@ class Progress:
         if kind is None:
             seconds, done = self._clock() - self._began, self._done - self._first
             rates = f" ({', '.join(self._rates(done / seconds))})" if seconds > 0 and done else ""
-            _print(self._console, f"  {self.stage}: {self._done} {self.unit} in {duration(seconds)}{rates}")
+            self._print(f"{self._done} {self.unit} in {duration(seconds)}{rates}")
+
+    def _print(self, line: str) -> None:
+        self._console.print(f"  {self.stage}: {line}", markup=False, highlight=False, soft_wrap=True)
 
     def _parts(self) -> list[str]:
         (then, before), (now, done) = self._samples[0], self._samples[-1]
@@ -131,7 +134,3 @@ def _thousands(number: float) -> str:
         if number >= 0.9995 * size:
             return f"{number / size:#.3g}".rstrip(".") + letter
     return f"{number:.3g}"
-
-
-def _print(console: Console, line: str) -> None:
-    console.print(line, markup=False, highlight=False, soft_wrap=True)

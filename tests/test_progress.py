@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from rsjax.progress import PLAIN_SECONDS, RATE_WINDOW_SECONDS, Progress, _thousands, duration, stage
+from rsjax.progress import PLAIN_SECONDS, RATE_WINDOW_SECONDS, Progress, _thousands, duration, note, stage
 
 
 class Clock:
@@ -100,10 +100,10 @@ def test_after_an_error_there_is_no_summary() -> None:
     assert shown.getvalue() == ""
 
 
-def test_headlines_are_printed_verbatim() -> None:
-    shown = io.StringIO()
-    stage(2, 6, "tokenizer", "up to date, skipped", Console(file=shown))
-    assert shown.getvalue() == "[2/6] tokenizer: up to date, skipped\n"
+def test_headlines_and_notes_are_printed_verbatim(capsys: pytest.CaptureFixture[str]) -> None:
+    stage(2, 6, "tokenizer", "up to date, skipped")
+    note("[bold] is no markup")
+    assert capsys.readouterr().out == "[2/6] tokenizer: up to date, skipped\n  note: [bold] is no markup\n"
 
 
 @pytest.mark.parametrize(
