@@ -1,4 +1,4 @@
-"""The records that flow through everything: each array's shape, dtype, unit and range, said once.
+"""Clips and batches of tokens: each array's shape, dtype, unit and range.
 
 Axes: T frames, H×W pixels, H'×W' token cells, A action dimensions, N₀ tracks, B clips.
 """

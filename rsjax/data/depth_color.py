@@ -14,14 +14,13 @@ from jaxtyping import Float
 from rsjax.clip import Array
 
 Scale = Literal["linear", "inverse"]
-# numpy in, numpy out; JAX in, JAX out
 
 
 def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale: Scale) -> Float[Array, "*batch 3"]:
-    """Depth in metres to colours 0–255 (float32, whole numbers); depth outside [near, far] is clipped to it.
+    """Returns depth as colours 0–255 (float32, whole numbers); depth outside [near, far] is clipped to it.
 
     Args:
-        depth: metres, > 0.
+        depth: depth in metres, > 0; numpy or JAX, and the colours likewise.
         near: depth that becomes white.
         far: depth that becomes black.
         scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.
@@ -33,7 +32,7 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
 
 
 def color_to_depth(color: Float[Array, "*batch 3"], near: float, far: float, scale: Scale) -> Float[Array, "*batch"]:
-    """The inverse of :func:`depth_to_color`, for any colours 0–255: metres in [near, far]."""
+    """Inverts :func:`depth_to_color` for any colours 0–255; returns metres in [near, far]."""
     position = color.astype(np.float32).mean(-1) / 255.0
     near_value, far_value = _scaled(near, scale), _scaled(far, scale)
     return _scaled(far_value + position * (near_value - far_value), scale)

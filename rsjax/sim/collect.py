@@ -1,7 +1,7 @@
-"""Collect Lift episodes in parallel processes into a store of clips.
+"""Collects Lift episodes in parallel processes into a store of clips.
 
-Each finished episode is a file in ``<out>.partial``, so that an interrupted collection goes on where it stopped; at
-the end they are packed into one store. An episode that the simulator fails at is left out and named in the manifest.
+Each finished episode is a file in ``<out>.partial``, so that an interrupted collection resumes; at the end they are
+packed into one store. An episode that the simulator fails at is left out and named in the manifest.
 """
 
 import importlib.metadata
@@ -26,25 +26,25 @@ from rsjax.errors import UserError
 from rsjax.files import disk_guard, write_atomically
 from rsjax.sim.expert import MODES, Expert, difficulty, draw_manner
 from rsjax.sim.gl import GLError, choose_gl
-from rsjax.sim.labels import Snapshot, pick_pixels, track
 from rsjax.sim.lift import TASK, LiftSim
+from rsjax.sim.tracks import Snapshot, pick_pixels, track
 
 SOURCE = "robosuite/Lift/Panda"
-RECIPE = 1  # raise it when the same configuration gives other episodes
-MAX_FAILURES = 0.1  # share of the episodes; more than a bad seed or two is a broken installation
+RECIPE = 1  # to raise when the same configuration gives other episodes
+MAX_FAILURES = 0.1  # share of the episodes; more failures mean a broken installation
 
 
 class CollectError(UserError):
-    """The collection cannot be completed. The message says why and what to do."""
+    """The collection cannot be completed. The message names the reason and the cure."""
 
 
 def collection_key(config: SimConfig) -> str:
-    """The content key of the store that :func:`collect` makes."""
+    """Returns the content key of the store that :func:`collect` makes."""
     return content_key("lift", RECIPE, MODES, config)
 
 
 def run_episode(sim: LiftSim, config: SimConfig, episode: int) -> Clip:
-    """Simulate one episode; it depends on nothing but the configuration's seed and the episode's number.
+    """Simulates one episode, which depends on nothing but the configuration's seed and the episode's number.
 
     Frame 0 is the start; ``config.control_steps`` control steps of 50 ms lead to each later frame.
     """
@@ -86,17 +86,17 @@ def run_episode(sim: LiftSim, config: SimConfig, episode: int) -> Clip:
 
 
 def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) -> None:
-    """Collect ``config.episodes`` episodes into a store at ``out``; its test split is the last ``test_episodes``.
+    """Collects ``config.episodes`` episodes into a store at ``out``; its test split is the last ``test_episodes``.
 
-    Returns at once if the store is there and was made by the same configuration.
+    Returns at once if ``out`` is a store made by the same configuration.
 
     Args:
         report: called with (episodes done, episodes in all) as they finish.
 
     Raises:
-        GLError: without a usable OpenGL library.
-        StoreError: if ``out`` cannot be written, e.g. on a full disk.
-        CollectError: if worker processes die, or more than ``MAX_FAILURES`` of the episodes fail.
+        GLError: there is no usable OpenGL library.
+        FileError: ``out`` cannot be written, e.g. on a full disk.
+        CollectError: worker processes die, or more than ``MAX_FAILURES`` of the episodes fail.
     """
     if complete_key(out) == collection_key(config):
         report(config.episodes, config.episodes)
@@ -117,7 +117,7 @@ def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) ->
 
 
 def _prepare(partial: Path, key: str) -> None:
-    """Make the directory of finished episodes; those of another configuration are thrown away."""
+    """Makes the directory of finished episodes and removes those of another configuration."""
     marker = partial / "key"
     if not marker.exists() or marker.read_text() != key:
         shutil.rmtree(partial, ignore_errors=True)
@@ -153,7 +153,7 @@ _sim: dict[tuple[str, int], LiftSim] = {}  # this worker's simulator, by camera 
 
 
 def _start_worker(workers: int) -> None:
-    """The parent handles Ctrl-C. One core each: threads of Mesa's software renderer would get in each other's way."""
+    """Leaves Ctrl-C to the parent and gives Mesa's software renderer this worker's share of the cores."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("LP_NUM_THREADS", str(max(1, _cores() // workers)))
 
@@ -167,7 +167,7 @@ def _worker_sim(config: SimConfig) -> LiftSim:
 
 
 def _work(config: SimConfig, partial: Path, episode: int) -> None:
-    """Simulate one episode in a worker process and leave its clip, or why there is none, in ``partial``."""
+    """Simulates one episode in a worker process and writes its clip, or the reason of failure, into ``partial``."""
     sim = _worker_sim(config)
     try:
         payload = encode(encode_clip(run_episode(sim, config, episode)))
@@ -188,7 +188,7 @@ def _error_file(partial: Path, episode: int) -> Path:
 
 
 def _pack(config: SimConfig, partial: Path, out: Path) -> None:
-    """Write the finished episodes as one store."""
+    """Writes the finished episodes as one store."""
     failures = {path.stem: path.read_text() for path in sorted(partial.glob("*.error"))}
     if len(failures) > MAX_FAILURES * config.episodes:
         shutil.rmtree(partial)
@@ -197,61 +197,50 @@ def _pack(config: SimConfig, partial: Path, out: Path) -> None:
             f"{next(iter(failures.values()))}; nothing was stored, check the installation with `make test`"
         )
     cut = config.episodes - config.test_episodes
-    files = {
-        "train": [path for i in range(cut) if (path := _clip_file(partial, i)).exists()],
-        "test": [path for i in range(cut, config.episodes) if (path := _clip_file(partial, i)).exists()],
-    }
-    statistics = _train_statistics(files["train"])
-    summary = _summary(files["train"] + files["test"])
-    meta = {
-        "key": collection_key(config),
-        "source": SOURCE,
-        "config": to_dict(config),
-        "quarantine": failures,
-        **statistics,
-        **summary,
-    }
-    stamp = {"depth_range": statistics["depth_range"]}
-    write_store(out, "clips", {split: _stamped(paths, stamp) for split, paths in files.items()}, meta, labels)
+    numbers = {"train": range(cut), "test": range(cut, config.episodes)}
+    files = {split: [path for i in of if (path := _clip_file(partial, i)).exists()] for split, of in numbers.items()}
+    meta = {"key": collection_key(config), "source": SOURCE, "config": to_dict(config), "quarantine": failures}
+    meta |= _statistics(files["train"], files["test"])
+    splits = {split: _stamped(paths, {"depth_range": meta["depth_range"]}) for split, paths in files.items()}
+    write_store(out, "clips", splits, meta, labels)
 
 
 def labels(clip: Record) -> dict[str, str]:
-    """What a curriculum can choose a clip by."""
+    """Returns the labels by which a curriculum can choose a clip."""
     return {"task": clip["task"], "difficulty": difficulty(clip["provenance"])}
 
 
 def _stamped(paths: list[Path], stamp: dict[str, Any]) -> Iterator[Record]:
-    """The clips in these files, with more provenance."""
-    for path in paths:
-        record = decode(path.read_bytes())
+    """Yields the clips in these files, with ``stamp`` added to their provenance."""
+    for record in _clips(paths):
         yield record | {"provenance": record["provenance"] | stamp}
 
 
-def _train_statistics(paths: list[Path]) -> dict[str, Any]:
-    """Depth range in metres, and the actions' mean and standard deviation (frame 0 has none), over the train split."""
-    actions, near, far = [], np.inf, 0.0
-    for path in paths:
-        record = decode(path.read_bytes())
-        near, far = min(near, float(record["depth"].min())), max(far, float(record["depth"].max()))
-        actions.append(record["actions"][1:])
-    flat = np.concatenate(actions).astype(np.float64)
-    return {
-        "depth_range": [near, far],
-        "action_mean": flat.mean(0).tolist(),
-        "action_std": flat.std(0).tolist(),
-    }
+def _clips(paths: list[Path]) -> Iterator[Record]:
+    return (decode(path.read_bytes()) for path in paths)
 
 
-def _summary(paths: list[Path]) -> dict[str, Any]:
-    """Tasks, expert modes, and the share of clips that end in success (and that ever succeed)."""
-    tasks, modes, final, ever = set(), Counter[str](), [], []
-    for path in paths:
-        record = decode(path.read_bytes())
+def _statistics(train: list[Path], test: list[Path]) -> dict[str, Any]:
+    """Returns fields of the manifest.
+
+    Over the train split, the depth range in metres, and mean and standard deviation of the actions (frame 0 has none);
+    over both splits, tasks, expert modes, and the share of clips that end in success and that ever succeed.
+    """
+    actions, depths, modes, final, ever = [], [], Counter[str](), [], []
+    tasks = set[str]()
+    for number, record in enumerate(_clips(train + test)):
+        if number < len(train):
+            depths += [float(record["depth"].min()), float(record["depth"].max())]
+            actions.append(record["actions"][1:])
         tasks.add(record["task"])
         modes[record["provenance"]["expert"]["mode"]] += 1
         final.append(bool(record["success"][-1]))
         ever.append(bool(record["success"].any()))
+    flat = np.concatenate(actions).astype(np.float64)
     return {
+        "depth_range": [min(depths), max(depths)],
+        "action_mean": flat.mean(0).tolist(),
+        "action_std": flat.std(0).tolist(),
         "tasks": sorted(tasks),
         "modes": dict(modes),
         "success_share": float(np.mean(final)),

@@ -1,7 +1,7 @@
-"""A scripted expert for Lift that often fails on purpose.
+"""A scripted expert for Lift that often fails on purpose, as a world model has to see more than success.
 
-A world model has to see more than success, so every episode draws a mode and its own manner: most lift the cube,
-others let it fall, grasp beside or above it, or move about without a goal.
+Every episode draws a mode and its own manner: most lift the cube, others let it fall, grasp beside or above it, or move
+about without a goal.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from rsjax.sim.lift import State
 
 MODES = {"lift": 0.55, "drop": 0.16, "near_miss": 0.16, "explore": 0.13}  # mode → probability
-SIMPLE = ("lift",)  # the modes that a curriculum begins with; the others are difficult
+SIMPLE = ("lift",)  # modes that a curriculum begins with; the others are difficult
 TABLE_HEIGHT = 0.8  # metres
 OPEN, CLOSE = -1.0, 1.0
 NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to the next
@@ -21,19 +21,19 @@ NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to t
 
 @dataclass(frozen=True)
 class Manner:
-    """How one episode goes; lengths in metres, times in control steps.
+    """The expert's behaviour in one episode; lengths in metres, times in control steps.
 
     Attributes:
         mode: a key of ``MODES``.
         speed: bound on the translation actions, at most 1.
-        noise: standard deviation of the action noise.
-        turn_noise: the same for the rotation actions.
+        noise: standard deviation of the noise of the translation actions.
+        turn_noise: standard deviation of the noise of the rotation actions.
         delay: steps of standing still at the beginning.
-        hover: height above the cube that it is approached at.
-        offset: from the cube's centre to where the gripper closes.
-        squeeze: steps between beginning to close and beginning to lift.
-        carry: where the cube is carried to, relative to where it was grasped.
-        release: step after the grasp at which the gripper opens again; -1 never.
+        hover: height above the cube from which the gripper descends.
+        offset: from the cube's centre to the point where the gripper closes.
+        squeeze: steps from beginning to close to beginning to lift.
+        carry: the cube's way from where it is grasped.
+        release: step after the grasp at which the gripper opens again; -1: never.
     """
 
     mode: str
@@ -49,7 +49,7 @@ class Manner:
 
 
 def draw_manner(rng: np.random.Generator) -> Manner:
-    """An episode's manner, its mode with the probabilities of ``MODES``."""
+    """Draws an episode's manner, its mode with the probabilities of ``MODES``."""
     mode = str(rng.choice(list(MODES), p=list(MODES.values())))
     offset = rng.normal(0, 0.004, 3) - np.array([0, 0, 0.004])
     if mode == "near_miss":
@@ -73,7 +73,7 @@ def draw_manner(rng: np.random.Generator) -> Manner:
 
 
 def difficulty(provenance: dict[str, Any]) -> str:
-    """A clip's difficulty for a curriculum: simple or difficult by its expert's mode, unknown where it had none."""
+    """Returns a clip's difficulty for a curriculum: simple or difficult by its expert's mode, unknown without one."""
     expert = provenance.get("expert")
     if expert is None:
         return "unknown"
@@ -84,8 +84,8 @@ class Expert:
     """The policy of one episode: :class:`State` → 7-D action in [-1, 1].
 
     Args:
-        manner: how it behaves.
-        rng: source of the action noise and of aimless motion.
+        manner: its behaviour.
+        rng: generator of the action noise and of aimless motion.
     """
 
     GAIN = 20.0  # action per metre of error: full speed until 5 cm before the target
@@ -100,7 +100,7 @@ class Expert:
         self._until = 0
 
     def act(self, state: State) -> Float[np.ndarray, " 7"]:
-        """The next action."""
+        """Returns the next action."""
         explores = self._manner.mode == "explore"
         target, finger = self._wander() if explores else self._pick(state)
         action = np.zeros(7)
@@ -126,7 +126,7 @@ class Expert:
         self._phase, self._phase_step = phase, 0
 
     def _pick(self, state: State) -> tuple[Float[np.ndarray, " 3"], float]:
-        """Where to go and what the fingers do, by phase: hover, descend, grasp, carry, release."""
+        """Returns target and finger action by phase: hover, descend, grasp, carry, release."""
         manner = self._manner
         grasp = state.cube + np.array(manner.offset)
         above = grasp + np.array([0, 0, manner.hover])
@@ -147,7 +147,7 @@ class Expert:
         return targets.get(self._phase, self._goal), CLOSE if self._phase in ("grasp", "carry") else OPEN
 
     def _wander(self) -> tuple[Float[np.ndarray, " 3"], float]:
-        """A random goal over (and sometimes on) the table, another every half second or so."""
+        """Returns a random target over or on the table, another every half second or so, and a finger action."""
         if self._step >= self._until:
             self._until = self._step + int(self._rng.integers(6, 18))
             low = (-0.15, -0.2, TABLE_HEIGHT + 0.015)

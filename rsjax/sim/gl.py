@@ -1,4 +1,4 @@
-"""Which OpenGL library MuJoCo renders with. Call :func:`choose_gl` before anything imports mujoco or robosuite."""
+"""The OpenGL library that MuJoCo renders with. Call :func:`choose_gl` before anything imports mujoco or robosuite."""
 
 import ctypes
 import ctypes.util
@@ -6,18 +6,18 @@ import os
 
 from rsjax.errors import UserError
 
-LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in the order of preference
+LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in order of preference
 
 # What a bare Debian 12 or 13 lacks: libEGL alone finds no driver, and PyOpenGL's OSMesa wants libGL beside it.
 CURE = "install one with `make setup` or `apt-get install libegl1 libgl1 libgl1-mesa-dri libosmesa6`"
 
 
 class GLError(UserError):
-    """No OpenGL library can be used. The message says how to get one."""
+    """There is no usable OpenGL library. The message says how to get one."""
 
 
 def _loads(library: str) -> bool:
-    """Whether the shared library can be found and loaded."""
+    """Returns whether this machine has the shared library and can load it."""
     name = ctypes.util.find_library(library)
     if name is None:
         return False
@@ -29,20 +29,17 @@ def _loads(library: str) -> bool:
 
 
 def choose_gl() -> str:
-    """Set ``MUJOCO_GL`` to an OpenGL library that this machine has; a value that the user set is respected.
-
-    Returns:
-        the value of ``MUJOCO_GL``.
+    """Sets ``MUJOCO_GL`` to an OpenGL library that this machine has, unless the user set it, and returns its value.
 
     Raises:
-        GLError: if the machine has none, or lacks the one that the user asked for.
+        GLError: the machine has none, or lacks the one that the user chose.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted in LIBRARIES and not _loads(LIBRARIES[wanted]):
         raise GLError(f"MUJOCO_GL is {wanted!r} but lib{LIBRARIES[wanted]} is not on this machine: {CURE}, or unset it")
     if not wanted:
-        found = [name for name, library in LIBRARIES.items() if _loads(library)]
-        if not found:
+        usable = [name for name, library in LIBRARIES.items() if _loads(library)]
+        if not usable:
             raise GLError(f"no OpenGL library (libEGL or libOSMesa) on this machine: {CURE}")
-        wanted = os.environ["MUJOCO_GL"] = found[0]
+        wanted = os.environ["MUJOCO_GL"] = usable[0]
     return wanted

@@ -1,6 +1,8 @@
-"""robosuite's Lift with the Panda arm: what it does, and exactly where everything is."""
+"""robosuite's Lift with the Panda arm: control steps, pictures, and the exact pose of every body."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +19,7 @@ CUBE_BODY = "cube_main"
 
 @dataclass(frozen=True)
 class State:
-    """What the expert sees: positions in metres in the world, yaws in radians about the vertical."""
+    """The expert's observation: positions in metres in the world, yaws in radians about the vertical."""
 
     gripper: Float[np.ndarray, " 3"]
     gripper_yaw: float
@@ -26,7 +28,7 @@ class State:
 
 
 def _load_robosuite() -> Any:
-    """robosuite, without its advice about private macro files."""
+    """Imports robosuite without its advice about private macro files."""
     choose_gl()
     logging.disable(logging.WARNING)
     try:
@@ -43,16 +45,16 @@ def _yaw(rotation: Float[np.ndarray, "3 3"]) -> float:
 class LiftSim:
     """The Lift environment: 20 Hz, 7-D actions in [-1, 1] (OSC_POSE: 6-D pose delta, gripper; +1 closes).
 
-    An episode depends on nothing but the seed given to :meth:`reset`. Use as a context manager, or call
-    :meth:`close`: a renderer left to the interpreter's exit prints errors.
+    An episode depends on nothing but the seed of :meth:`reset`. Use as a context manager, or call :meth:`close`: a
+    renderer left to the interpreter's exit prints errors.
 
     Args:
-        camera: one of robosuite's cameras.
+        camera: name of one of robosuite's cameras.
         image_size: S, pixels along each side; 0 builds no renderer.
 
     Raises:
-        GLError: if no OpenGL context can be made.
-        ConfigError: if there is no such camera.
+        GLError: no OpenGL context can be made.
+        ConfigError: there is no such camera.
     """
 
     def __init__(self, camera: str = "agentview", image_size: int = 64) -> None:
@@ -86,22 +88,22 @@ class LiftSim:
         self.close()
 
     def close(self) -> None:
-        """Free the renderer and the simulation."""
+        """Frees the renderer and the simulation."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
         self._env.close()
 
     def reset(self, seed: int) -> None:
-        """Begin an episode: the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
+        """Begins an episode; the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
         with _global_seed(seed):
             self._env.reset()
 
     def step(self, action: Float[np.ndarray, " 7"]) -> None:
-        """One control step of 50 ms.
+        """Runs one control step of 50 ms.
 
         Raises:
-            ArithmeticError: if the simulation diverges.
+            ArithmeticError: the simulation diverged.
         """
         self._env.step(action)
         if not np.isfinite(self._data.qpos).all():
@@ -120,7 +122,7 @@ class LiftSim:
 
     @property
     def success(self) -> bool:
-        """robosuite's own predicate: the cube is more than 4 cm above the table."""
+        """Returns robosuite's own predicate: the cube is more than 4 cm above the table."""
         return bool(self._env._check_success())
 
     @property
@@ -133,30 +135,30 @@ class LiftSim:
 
     @property
     def cube_body(self) -> int:
-        """The cube's body id in :meth:`segment` and :meth:`body_poses`."""
+        """Returns the cube's body id in :meth:`segment` and :meth:`body_poses`."""
         return self._cube_id
 
     @property
     def cube_half_size(self) -> Float[np.ndarray, " 3"]:
-        """Half the cube's edges, in metres."""
+        """Returns half the cube's edges in metres."""
         geom = int(self._model.body_geomadr[self._cube_id])
         return self._model.geom_size[geom].copy()
 
     @property
     def movable(self) -> Bool[np.ndarray, " bodies"]:
-        """Whether each body can move at all (is not welded to the world)."""
+        """Returns whether each body can move at all (is not welded to the world)."""
         return self._model.body_weldid != 0
 
     def body_poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3 3"]]:
-        """Each body's position in metres and rotation in the world."""
+        """Returns each body's position in metres and rotation in the world."""
         return self._data.xpos.copy(), self._data.xmat.reshape(-1, 3, 3).copy()
 
     def render(self) -> View:
-        """The current frame."""
+        """Renders the current frame."""
         return self._need_renderer().render(self._data)
 
     def segment(self) -> Int32[np.ndarray, "S S"]:
-        """The body id at each pixel's centre; 0 (the world) where there is nothing."""
+        """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
         return self._need_renderer().segment(self._data)
 
     def _need_renderer(self) -> Renderer:
@@ -165,15 +167,12 @@ class LiftSim:
         return self._renderer
 
 
-class _global_seed:
-    """robosuite draws from numpy's global generator: seed it, and put it back as it was."""
-
-    def __init__(self, seed: int) -> None:
-        self._seed = seed
-
-    def __enter__(self) -> None:
-        self._state = np.random.get_state()
-        np.random.seed(self._seed)
-
-    def __exit__(self, *_: object) -> None:
-        np.random.set_state(self._state)
+@contextmanager
+def _global_seed(seed: int) -> Iterator[None]:
+    """Seeds numpy's global generator, from which robosuite draws, and restores it afterwards."""
+    state = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)

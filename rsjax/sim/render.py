@@ -1,8 +1,8 @@
-"""MuJoCo scenes rendered in software as fast as it goes.
+"""A fast software renderer of MuJoCo scenes.
 
 robosuite renders RGB and depth at the target size with a shadow map, 4× multisampling and reflections: about 50 ms a
-frame on one CPU core. Here one pass at 5× the target size without any of these takes about 20 ms and gives both: RGB
-is the mean over 5×5 pixels (anti-aliased), depth is the middle one's, whose ray is the target pixel's centre ray.
+frame on one CPU core. This renderer makes one pass at 5× the target size without any of these, in about 20 ms: RGB is
+the mean of 5×5 pixels (anti-aliased), depth is that of the middle one, whose ray is the target pixel's centre ray.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Camera:
     """A pinhole camera with square pixels and a square image.
 
     Attributes:
-        position: in metres, in the world.
+        position: position in the world in metres.
         rotation: columns are the camera's right, up and backward axes in the world (MuJoCo's convention).
         fovy: vertical field of view in degrees.
     """
@@ -32,11 +32,11 @@ class Camera:
 
     @property
     def _half(self) -> float:
-        """Half the image's extent at a depth of 1 m."""
+        """Returns half the image's extent at a depth of 1 m."""
         return float(np.tan(np.radians(self.fovy) / 2))
 
     def project(self, points: Float[np.ndarray, "*N 3"]) -> tuple[Float[np.ndarray, "*N 2"], Float[np.ndarray, "*N"]]:
-        """World points → (x, y) with 0 and 1 at the image's edges, y down, and depth in metres (< 0 is behind)."""
+        """Projects world points to (x, y), 0 and 1 at the image's edges, y down, and depth in metres (< 0: behind)."""
         local = (points - self.position) @ self.rotation
         depth = -local[..., 2]
         x = 0.5 + 0.5 * local[..., 0] / (depth * self._half)
@@ -44,7 +44,7 @@ class Camera:
         return np.stack([x, y], -1), depth
 
     def unproject(self, xy: Float[np.ndarray, "*N 2"], depth: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N 3"]:
-        """The inverse of :meth:`project`."""
+        """Inverts :meth:`project`."""
         right = (2 * xy[..., 0] - 1) * self._half * depth
         up = (1 - 2 * xy[..., 1]) * self._half * depth
         return np.stack([right, up, -depth], -1) @ self.rotation.T + self.position
@@ -66,15 +66,15 @@ class View:
 
 
 class Renderer:
-    """Renders a MuJoCo model from one fixed camera; close it explicitly.
+    """A renderer of a MuJoCo model from one fixed camera. Close it explicitly.
 
     Args:
         model: a ``mujoco.MjModel``; its rendering quality and buffer size are set.
-        camera_id: the camera.
+        camera_id: number of the camera in the model.
         size: S, pixels along each side.
 
     Raises:
-        GLError: if no OpenGL context can be made.
+        GLError: no OpenGL context can be made.
     """
 
     def __init__(self, model: Any, camera_id: int, size: int) -> None:
@@ -103,7 +103,7 @@ class Renderer:
         self._rect = mujoco.MjrRect(0, 0, self._fine, self._fine)
 
     def close(self) -> None:
-        """Free the OpenGL context."""
+        """Frees the OpenGL context."""
         self._context.free()
         self._gl.free()
 
@@ -121,7 +121,7 @@ class Renderer:
         return rgb[::-1], depth[::-1]  # OpenGL's first row is the bottom one
 
     def render(self, data: Any) -> View:
-        """The frame that ``data`` (a ``mujoco.MjData``) describes."""
+        """Renders the frame that ``data`` (a ``mujoco.MjData``) describes."""
         rgb, buffer = self._draw(data)
         near, far = (getattr(self._model.vis.map, name) * self._model.stat.extent for name in ("znear", "zfar"))
         fine = (near / (1 - buffer.astype(np.float64) * (1 - near / far))).astype(np.float32)
@@ -133,7 +133,7 @@ class Renderer:
         )
 
     def segment(self, data: Any) -> Int32[np.ndarray, "S S"]:
-        """The body id at each pixel's centre; 0 (the world) where there is nothing."""
+        """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
         mujoco, flags = self._mj, self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
@@ -149,5 +149,5 @@ class Renderer:
 
 
 def _centres(fine: np.ndarray) -> np.ndarray:
-    """The middle one of each ``SUPERSAMPLING``² block."""
+    """Returns the middle pixel of each ``SUPERSAMPLING``² block."""
     return fine[SUPERSAMPLING // 2 :: SUPERSAMPLING, SUPERSAMPLING // 2 :: SUPERSAMPLING]

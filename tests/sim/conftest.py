@@ -5,7 +5,7 @@ import pytest
 from rsjax.sim.lift import LiftSim
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sim(gl: str) -> Iterator[LiftSim]:
     with LiftSim(image_size=64) as sim:
         yield sim

@@ -10,12 +10,6 @@ from rsjax.sim.lift import LiftSim
 STEPS = 60
 
 
-@pytest.fixture(scope="module")
-def blind(gl: str):
-    with LiftSim(image_size=0) as sim:
-        yield sim
-
-
 def manner_of(mode: str, seed: int) -> Manner:
     rng = np.random.default_rng(seed)
     while (manner := draw_manner(rng)).mode != mode:
@@ -43,38 +37,38 @@ def test_modes_come_with_their_probabilities() -> None:
     assert sum(MODES.values()) == pytest.approx(1)
 
 
-def test_each_mode_does_what_it_says(blind: LiftSim) -> None:
+def test_each_mode_does_what_it_says(sim: LiftSim) -> None:
     seeds = range(4)
-    runs = {mode: [play(blind, manner_of(mode, s), s)[1] for s in seeds] for mode in MODES}
+    runs = {mode: [play(sim, manner_of(mode, s), s)[1] for s in seeds] for mode in MODES}
     assert sum(s[-1] for s in runs["lift"]) >= 3
     assert sum(s.any() and not s[-1] for s in runs["drop"]) >= 3
     assert sum(s[-1] for s in runs["near_miss"]) <= 1
     assert not any(s.any() for s in runs["explore"])
 
 
-def test_actions_are_in_range_and_noisy(blind: LiftSim) -> None:
+def test_actions_are_in_range_and_noisy(sim: LiftSim) -> None:
     manner = manner_of("lift", 0)
-    noisy, _ = play(blind, replace(manner, noise=0.2), 0)
-    clean, _ = play(blind, replace(manner, noise=0.0, turn_noise=0.0), 0)
+    noisy, _ = play(sim, replace(manner, noise=0.2), 0)
+    clean, _ = play(sim, replace(manner, noise=0.0, turn_noise=0.0), 0)
     assert np.abs(noisy).max() <= 1
     assert np.abs(clean).max() <= 1
     assert np.std(np.diff(noisy[:, :3], axis=0)) > 1.2 * np.std(np.diff(clean[:, :3], axis=0))
 
 
-def test_turns_towards_the_cube(blind: LiftSim) -> None:
+def test_turns_towards_the_cube(sim: LiftSim) -> None:
     def misalignment() -> float:
-        difference = blind.state.cube_yaw - blind.state.gripper_yaw
+        difference = sim.state.cube_yaw - sim.state.gripper_yaw
         return abs((difference + np.pi / 4) % (np.pi / 2) - np.pi / 4)
 
     manner = replace(manner_of("lift", 0), delay=0, noise=0.0, turn_noise=0.0)
     for seed in range(20):
-        blind.reset(seed)
+        sim.reset(seed)
         before = misalignment()
         if before < np.radians(25):
             continue
         expert = Expert(manner, np.random.default_rng(0))
         for _ in range(15):
-            blind.step(expert.act(blind.state))
+            sim.step(expert.act(sim.state))
         assert misalignment() < before / 2
         return
     pytest.fail("no seed gave a turned cube")

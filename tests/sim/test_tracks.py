@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.sim.expert import Expert, draw_manner
-from rsjax.sim.labels import TOLERANCE, Snapshot, pick_pixels, track, unoccluded
 from rsjax.sim.lift import LiftSim
 from rsjax.sim.render import Camera
+from rsjax.sim.tracks import TOLERANCE, Snapshot, pick_pixels, track, unoccluded
 
 SIZE = 64
 

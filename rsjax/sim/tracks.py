@@ -1,7 +1,7 @@
-"""Exact keypoint tracks from the simulator: pixels of frame 0, carried by the bodies that they lie on.
+"""Exact keypoint tracks from the simulator: pixels of frame 0 that move with the bodies on which they lie.
 
 A pixel of frame 0 is unprojected with its depth, tied to the body that the segmentation names, moved with that body's
-pose, and projected again; it is visible where the depth buffer holds nothing nearer.
+pose, and projected again; it is visible where the depth buffer has nothing nearer.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ TOLERANCE = 0.005  # metres that the depth buffer may be nearer than a visible p
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What tracking needs of one frame."""
+    """Camera, body poses in the world (metres) and depth (metres) of one frame."""
 
     camera: Camera
     positions: Float[np.ndarray, "bodies 3"]
@@ -32,13 +32,17 @@ def pick_pixels(
     count: int,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, "count 2"]:
-    """N₀ pixels of frame 0 to track, all different as long as the image has as many.
+    """Returns (row, column) of N₀ pixels of frame 0 to track, all different if the image has enough.
 
-    Up to half lie on a regular grid over the image. The others favour what moves: half of them on the cube and half on
-    moving links of the arm, as far as these cover pixels; the rest anywhere.
+    Up to half lie on a regular grid over the image. Of the others, half lie on the cube and half on moving links of the
+    arm, as far as these cover pixels; the rest lie anywhere.
 
-    Returns:
-        (row, column) of each.
+    Args:
+        bodies: body id at each pixel.
+        movable: whether each body can move.
+        cube: the cube's body id.
+        count: N₀.
+        rng: generator of the choice.
     """
     size = bodies.shape[0]
     side = min(int(np.sqrt(count / 2)), size)
@@ -66,16 +70,16 @@ def track(
     bodies: Int32[np.ndarray, "S S"],
     snapshots: Sequence[Snapshot],
 ) -> tuple[Float32[np.ndarray, "N T 2"], Bool[np.ndarray, "N T"]]:
-    """Carry pixels of frame 0 through a clip.
+    """Tracks pixels of frame 0 through a clip.
 
     Args:
         pixels: (row, column) in frame 0.
-        depth: metres, of frame 0.
+        depth: depth of frame 0 in metres.
         bodies: body id at each pixel of frame 0.
         snapshots: one per frame, frame 0 first.
 
     Returns:
-        tracks and visibility as :class:`rsjax.clip.Clip` defines them.
+        Tracks and visibility as :class:`rsjax.clip.Clip` defines them.
     """
     rows, columns = pixels.T
     xy = (pixels[:, ::-1] + 0.5) / depth.shape[0]
@@ -94,7 +98,7 @@ def track(
 def unoccluded(
     xy: Float[np.ndarray, "N 2"], z: Float[np.ndarray, " N"], fine_depth: Float32[np.ndarray, "R R"]
 ) -> Bool[np.ndarray, " N"]:
-    """Whether each point is inside the image with nothing more than ``TOLERANCE`` before it.
+    """Returns whether each point is inside the image with nothing more than ``TOLERANCE`` nearer than it.
 
     The buffer's farthest value in the 3×3 around the point counts, so that steep surfaces don't hide themselves.
     """
