@@ -105,7 +105,7 @@ def test_every_kind_is_tried() -> None:
 
 
 @pytest.mark.parametrize("error", [EpisodeError("a.h5: truncated"), ZeroDivisionError("a surprise")])
-def test_an_episode_that_cannot_be_read_does_not_hide_the_others(error: Exception) -> None:
+def test_an_unreadable_episode_does_not_hide_the_others(error: Exception) -> None:
     diagnosis = diagnose(source(error, replace(episode(7), task="")), Thresholds())
     assert [(finding.episode, finding.kind) for finding in diagnosis.findings] == [
         ("episode-6", "unreadable"),
@@ -286,9 +286,9 @@ def test_the_commands_status(
     write_bridge(tmp_path / "data", [bridge_episode(5), bridge_episode(4, task=""), b"\xff"])
     fix = tmp_path / "m.json"
     assert run(monkeypatch, "rlds", tmp_path / "data", "--option", "split=train", "--fix", fix) == 1
-    told = capsys.readouterr().out
-    assert "train-00000-00001: no-task" in told and "train-00000-00002: unreadable" in told
-    assert "3 episodes: 1 without a finding, 2 with" in told
+    printed = capsys.readouterr().out
+    assert "train-00000-00001: no-task" in printed and "train-00000-00002: unreadable" in printed
+    assert "3 episodes: 1 without a finding, 2 with" in printed
     assert [entry["id"] for entry in json.loads(fix.read_text())["left_out"]] == [
         "train-00000-00001",
         "train-00000-00002",
@@ -308,8 +308,8 @@ def test_a_fix_that_keeps_nothing_says_what_to_do(
     write_bridge(tmp_path / "data", [bridge_episode(4, task=""), bridge_episode(5, task="")])
     line = ("rlds", tmp_path / "data", "--fix", tmp_path / "m.json")
     assert run(monkeypatch, *line) == 1
-    (told,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith(str(tmp_path / "m.json"))]
-    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in told
+    (printed,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith(str(tmp_path / "m.json"))]
+    assert "keeps 0, leaves out 2; nothing is left to ingest: --ignore no-task, and write it again" in printed
     assert run(monkeypatch, *line, "--ignore", "no-task") == 0
     assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
 

@@ -4,7 +4,7 @@ Networks take the paths of their files: ``bootstapir:checkout=/opt/tapnet,weight
 """
 
 import dataclasses
-import importlib
+import pkgutil
 import typing
 from pathlib import Path
 from typing import Any, Literal
@@ -15,20 +15,20 @@ from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.annotators.depth import RecordedDepth
 
 NONE = "none"
-METHODS: dict[str, dict[str, tuple[str, str]]] = {  # module and class, by stage and the method's name
-    "shots": {"hsv-histogram": ("shots", "HistogramShots"), "transnetv2": ("networks.shots", "TransNetShots")},
-    "motion": {"dis": ("motion", "DISFlow"), "raft": ("networks.motion", "RaftFlow")},
+METHODS = {  # module and class in this package, by stage and the method's name
+    "shots": {"hsv-histogram": "shots:HistogramShots", "transnetv2": "networks.shots:TransNetShots"},
+    "motion": {"dis": "motion:DISFlow", "raft": "networks.motion:RaftFlow"},
     "depth": {
-        "recorded": ("depth", "RecordedDepth"),
-        "depth-anything": ("networks.depth", "DepthAnything"),
-        "video-depth-anything": ("networks.depth", "VideoDepthAnything"),
+        "recorded": "depth:RecordedDepth",
+        "depth-anything": "networks.depth:DepthAnything",
+        "video-depth-anything": "networks.depth:VideoDepthAnything",
     },
     "tracks": {
-        "lucas-kanade": ("tracks", "LucasKanade"),
-        "spatial-tracker": ("networks.tracks", "SpatialTracker"),
-        "bootstapir": ("networks.tracks", "BootsTapir"),
+        "lucas-kanade": "tracks:LucasKanade",
+        "spatial-tracker": "networks.tracks:SpatialTracker",
+        "bootstapir": "networks.tracks:BootsTapir",
     },
-    "semantics": {"own": ("semantics", "OwnSemantics"), "internvl": ("networks.semantics", "InternVL")},
+    "semantics": {"own": "semantics:OwnSemantics", "internvl": "networks.semantics:InternVL"},
 }
 
 
@@ -60,8 +60,7 @@ def choose(stage: str, text: str) -> Any:
         raise ConfigError(
             f"{stage}: no method {name!r}{did_you_mean(name, methods)}; choose {', '.join(methods)} or none"
         )
-    module, kind = methods[name]
-    method = getattr(importlib.import_module(f"rsjax.ingest.annotators.{module}"), kind)
+    method = pkgutil.resolve_name(f"rsjax.ingest.annotators.{methods[name]}")
     fields = {field.name: field for field in dataclasses.fields(method)}
     values: dict[str, Any] = {}
     for setting in filter(None, settings.split(",")):

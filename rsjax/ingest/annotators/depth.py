@@ -64,7 +64,7 @@ class FilledDepths:
 
 
 def fill_holes(depth: Float32[np.ndarray, "H W"], holes: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """Gives each hole (``holes`` is True) the depth of the nearest measured pixel, of which there is at least one."""
+    """Fills each hole (``holes`` is True) from the nearest measured pixel; at least one has to be measured."""
     _, nearest = cv2.distanceTransformWithLabels(
         holes.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )

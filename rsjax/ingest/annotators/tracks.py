@@ -1,7 +1,7 @@
 """Stage "tracks": points followed through a shot. Without weights: pyramidal Lucas–Kanade.
 
-Every tracker follows given points through a few pictures; :func:`track_in_spans` does the rest: points begin on a grid,
-those that are visible at a span's end go on, and grid cells that lost theirs get new ones.
+Every tracker follows a set of points through a few pictures; :func:`track_in_spans` does the rest: points begin on a
+grid, those that are visible at a span's end go on, and grid cells that lost theirs get new ones.
 
 Axes: P points, T frames, H×W pixels.
 """
@@ -51,7 +51,7 @@ class GridTracker(Annotator):
             depth: the pictures' maps, where the tracker needs them.
 
         Returns:
-            The points in every picture, and whether each is visible there.
+            The points in every picture, and whether each is visible in it.
         """
         raise NotImplementedError
 
@@ -61,12 +61,12 @@ class LucasKanade(GridTracker):
     """Pyramidal Lucas–Kanade from picture to picture; a point that does not come back on the way back is lost.
 
     Where a patch stays the same, its point stays too, even on a surface without texture: a camera that moves over such
-    a surface goes unnoticed. A lost point reappears only where it was lost, when its patch is there again.
+    a surface goes unnoticed. A lost point reappears only where it was lost, when its patch reappears.
 
     Attributes:
         window: side of the patch that is matched, in pixels.
         levels: of the pyramid, beyond the picture itself.
-        tolerance: how far from its start a point may end that is followed there and back, in pixels.
+        tolerance: how far from its start a point may end when it is followed forward and back, in pixels.
         likeness: least correlation of a point's patch with that of the previous picture; below it is another surface.
         still: grey levels (of 255) by which a pixel of a patch may change while the patch counts as the same.
     """

@@ -1,5 +1,5 @@
 import dataclasses
-import importlib
+import pkgutil
 from pathlib import Path
 
 import pytest
@@ -44,10 +44,10 @@ def test_the_default_words_are_the_default_methods() -> None:
     assert choose_annotators(words) == Annotators()
 
 
-def test_every_method_is_there_under_its_own_name() -> None:
+def test_every_method_has_its_own_name() -> None:
     for methods in METHODS.values():
-        for name, (module, kind) in methods.items():
-            made = getattr(importlib.import_module(f"rsjax.ingest.annotators.{module}"), kind)
+        for name, place in methods.items():
+            made = pkgutil.resolve_name(f"rsjax.ingest.annotators.{place}")
             assert made.name == name and dataclasses.is_dataclass(made)
 
 

@@ -57,11 +57,11 @@ def test_filling_changes_holes_only_and_invents_no_depth(depth, holes):
 @settings(deadline=None)
 @given(hnp.arrays(np.float32, (2, 3, 4), elements=st.floats(0, 1000, width=32)))
 def test_relative_depth_can_be_undone(inverse):
-    given = relative_depth(inverse)
-    maps = given.maps.read(range(2))
-    assert given.unit == "relative" and (maps >= 1 - 1e-6).all() and (maps <= RELATIVE_FAR * (1 + 1e-6)).all()
-    spread = given.extent[1] - given.extent[0]
-    np.testing.assert_allclose(inverse_of(given, range(2)), inverse, atol=1e-5 * spread + 1e-6, rtol=1e-5)
+    stretched = relative_depth(inverse)
+    maps = stretched.maps.read(range(2))
+    assert stretched.unit == "relative" and (maps >= 1 - 1e-6).all() and (maps <= RELATIVE_FAR * (1 + 1e-6)).all()
+    spread = stretched.extent[1] - stretched.extent[0]
+    np.testing.assert_allclose(inverse_of(stretched, range(2)), inverse, atol=1e-5 * spread + 1e-6, rtol=1e-5)
 
 
 def test_colours_of_relative_depth_are_even_in_the_networks_output():

@@ -58,7 +58,7 @@ def test_names_differ():
     assert len({annotator.name for annotator in ALL}) == len(ALL)
 
 
-def test_weights_count_by_content_and_the_device_not_at_all(tmp_path):
+def test_parameters_depend_on_weights_and_not_on_the_device(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     for folder in "ab":
@@ -80,7 +80,7 @@ def test_a_folder_counts_by_all_its_files(tmp_path):
 
 
 @given(st.integers(0, 40), st.integers(2, 9), st.integers(0, 1))
-def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap):
+def test_chunks_cover_every_frame_and_overlap(count, size, overlap):
     pictures = np.arange(count, dtype=np.uint8).reshape(-1, 1, 1, 1) * np.ones((1, 1, 1, 3), np.uint8)
     chunks = [(start, part[:, 0, 0, 0].tolist()) for start, part in in_chunks(ArrayFrames(pictures), overlap, size)]
     assert all(part == list(range(start, start + len(part))) and len(part) <= size for start, part in chunks)
@@ -106,6 +106,6 @@ def test_chunks_hold_every_frame_and_share_what_they_should(count, size, overlap
         (lambda: InternVL(HERE, tries=0), "internvl: tries is 0"),
     ],
 )
-def test_a_number_that_makes_no_sense_is_named_at_once(wrong, message):
+def test_an_impossible_number_is_refused(wrong, message):
     with pytest.raises(ConfigError, match=message):
         wrong()

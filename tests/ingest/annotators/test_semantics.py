@@ -26,14 +26,14 @@ def test_text_is_the_data_sets_own():
     ]
 
 
-def test_where_the_data_set_is_silent_there_is_no_text():
+def test_without_language_no_text_is_made_up():
     (part,) = OwnSemantics()(episode(FRAMES), "top").parts
     assert (part.start, part.end, part.text, part.text_by) == (0, 20, "", "")
 
 
 def test_key_frames_are_where_the_gripper_closes_and_opens():
-    given = episode(FRAMES, "tidy up", PARTS, grip((4, 13)))
-    parts = OwnSemantics()(given, "top", np.ones(20)).parts
+    recording = episode(FRAMES, "tidy up", PARTS, grip((4, 13)))
+    parts = OwnSemantics()(recording, "top", np.ones(20)).parts
     assert [(part.key_frames, part.key_by) for part in parts] == [((4,), "gripper"), ((13,), "gripper")]
 
 
@@ -44,7 +44,7 @@ def test_without_a_gripper_the_peak_of_motion_counts_and_without_motion_nothing(
     assert [(part.key_frames, part.key_by) for part in parts] == [((6,), "motion"), ((), "")]
 
 
-def test_what_row_0_says_is_no_change():
+def test_row_0_is_no_change():
     command = grip((0, 20))
     command[0] = 0.0
     assert gripper_changes(episode(FRAMES, grip=command), 0.1) == []

@@ -20,7 +20,7 @@ def test_cuts_are_counted_as_exact_near_or_false():
     assert shot_accuracy(says(), EPISODES) == ShotAccuracy(cuts=3, exact=0, near=0, false=0, inside=0)
 
 
-def test_the_default_finds_what_is_plain_to_see():
+def test_the_default_detects_plain_cuts():
     assert shot_accuracy(HistogramShots(), EPISODES) == ShotAccuracy(cuts=3, exact=3, near=3, false=0, inside=0)
 
 

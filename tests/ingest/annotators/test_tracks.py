@@ -29,7 +29,7 @@ def test_a_point_that_leaves_the_picture_is_not_seen_there():
     assert (places[seen] < 1).all()
 
 
-def test_a_hidden_point_is_lost_and_found_again_where_it_was():
+def test_a_hidden_point_reappears_where_it_was_lost():
     picture = np.repeat(texture(48, 64)[..., None], 3, -1).astype(np.uint8)
     hidden = picture.copy()
     hidden[10:40, 10:40] = 255 - np.repeat(texture(30, 30, 5)[..., None], 3, -1).astype(np.uint8)
@@ -56,25 +56,25 @@ def test_new_points_begin_where_none_is_left_and_the_others_go_on():
 @given(st.integers(1, 40), st.integers(1, 9), st.integers(1, 5), st.integers(0, 2**16))
 def test_spans_cover_every_frame_once_whatever_their_length(count, span, grid, seed):
     rng = np.random.default_rng(seed)
-    asked = []
+    spans = []
 
     def follow(pictures, points, depth):
-        asked.append(pictures[:, 0, 0, 0].tolist())
+        spans.append(pictures[:, 0, 0, 0].tolist())
         seen = rng.random((len(points), len(pictures))) < 0.8
         seen[:, 0] = True
         return np.repeat(points[:, None], len(pictures), 1), seen
 
     pictures = np.broadcast_to(np.arange(count, dtype=np.uint8)[:, None, None, None], (count, 2, 2, 3))
     tracked = track_in_spans(ArrayFrames(pictures), follow, grid, span)
-    assert [t for part in asked for t in part[1:]] == list(range(1, count))
-    assert [part[0] for part in asked] == list(range(0, max(count - 1, 1), span))
+    assert [t for part in spans for t in part[1:]] == list(range(1, count))
+    assert [part[0] for part in spans] == list(range(0, max(count - 1, 1), span))
     assert tracked.visible.any(1).all()
     for start in range(0, max(count - 1, 1), span):
         cells = (tracked.points[tracked.visible[:, start], start] * grid).astype(int)
         assert {*map(tuple, cells.tolist())} == {(x, y) for x in range(grid) for y in range(grid)}
 
 
-def test_a_windows_tracks_are_seen_in_its_first_frame_and_hold_those_that_move_most():
+def test_a_windows_tracks_are_visible_at_first_and_include_those_that_move_most():
     points = np.full((10, 6, 2), 0.5, np.float32)
     points[3, :, 0] = np.linspace(0.1, 0.9, 6)
     visible = np.ones((10, 6), bool)
@@ -86,6 +86,6 @@ def test_a_windows_tracks_are_seen_in_its_first_frame_and_hold_those_that_move_m
     assert repeated.points.shape == (30, 2, 2) and repeated.visible[:, 0].all()
 
 
-def test_a_window_in_which_nothing_is_seen_is_refused():
+def test_a_window_without_visible_points_is_refused():
     with pytest.raises(ValueError, match="frame 1"):
         window_tracks(Tracked(np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), bool)), [1, 2], 4)

@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from rsjax.ingest.annotators.depth import metric_depth, relative_depth
 from rsjax.ingest.annotators.networks.local import Network, checkout_module, library, load_weights, pretrained
 from rsjax.ingest.annotators.protocols import AnnotationError, DepthMaps, Pictures, in_chunks
-from rsjax.ingest.episode import Episode, EpisodeError, Frames
+from rsjax.ingest.episode import Episode
 
 _SIZES: dict[str, dict[str, Any]] = {
     "vits": {"encoder": "vits", "features": 64, "out_channels": [48, 96, 192, 384]},
@@ -46,7 +46,7 @@ class VideoDepthAnything(Network):
     device: str = field(default="cuda", kw_only=True)
 
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
-        frames = _camera(episode, camera)
+        frames = episode.cameras[camera]
         if len(frames) > self.most_frames:
             raise AnnotationError(
                 f"episode {episode.id}: {len(frames)} frames, more than most_frames {self.most_frames}, which Video "
@@ -83,7 +83,7 @@ class DepthAnything(Network):
     batch: int = 8
 
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
-        frames = _camera(episode, camera)
+        frames = episode.cameras[camera]
         model, processor = self.load()
         maps = _on_disk((len(frames), *frames.read([0]).shape[1:3]))
         for start, pictures in in_chunks(frames, size=self.batch):
@@ -100,12 +100,6 @@ class DepthAnything(Network):
             depth = model(**inputs).predicted_depth
             resized = torch.nn.functional.interpolate(depth[:, None].float(), pictures.shape[1:3], mode="bilinear")
         return resized[:, 0].cpu().numpy()
-
-
-def _camera(episode: Episode, name: str) -> Frames:
-    if name not in episode.cameras:
-        raise EpisodeError(f"episode {episode.id}: no camera {name!r}; it has {', '.join(episode.cameras)}")
-    return episode.cameras[name]
 
 
 def _as_maps(maps: Float32[np.ndarray, "N H W"], metric: bool, episode: Episode, camera: str, method: str) -> DepthMaps:

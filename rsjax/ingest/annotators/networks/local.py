@@ -74,7 +74,7 @@ def checkout_module(checkout: Path, name: str, what: str) -> Any:
     try:
         module = importlib.import_module(name)
     except ImportError as error:
-        raise AnnotationError(f"{checkout}: {name} does not import ({error}); check out {what} there") from error
+        raise AnnotationError(f"{checkout}: {name} does not import ({error}); check out {what} in it") from error
     finally:
         sys.path.remove(entry)
     # Checkouts call their packages "models" or "utils": one that was imported before would silently take their place.
@@ -86,14 +86,14 @@ def checkout_module(checkout: Path, name: str, what: str) -> Any:
 def require_weights(path: Path, what: str) -> None:
     """Raises :class:`AnnotationError` where a file of weights is missing."""
     if not path.is_file():
-        raise AnnotationError(f"{path}: no such file; {what} needs its weights there (nothing is downloaded)")
+        raise AnnotationError(f"{path}: no such file; {what} needs its weights (nothing is downloaded)")
 
 
 def load_weights(model: Any, path: Path, device: str, what: str) -> Any:
     """Fills a torch model with the tensors of a local file, all of them and no others; returns it for inference.
 
     Raises:
-        AnnotationError: the file is missing, damaged, or of another model, or there is no such device.
+        AnnotationError: the file is missing, damaged, or of another model, or the device is missing.
     """
     torch = library("torch", what)
     require_weights(path, what)
@@ -110,11 +110,11 @@ def pretrained(kinds: tuple[str, str], path: Path, device: str, what: str, **opt
     """Loads a model and its processor, by their classes in ``transformers``, from a local folder only.
 
     Raises:
-        AnnotationError: the folder is missing or does not contain them, or there is no such device.
+        AnnotationError: the folder is missing or does not contain them, or the device is missing.
     """
     transformers = library("transformers", what)
     if not (path / "config.json").is_file() and not (path / "preprocessor_config.json").is_file():
-        raise AnnotationError(f"{path}: holds no model (config.json); {what} needs it there (nothing is downloaded)")
+        raise AnnotationError(f"{path}: no model (config.json) in it; {what} needs one (nothing is downloaded)")
     if importlib.util.find_spec("torchvision"):  # processors use it if installed, and report a broken one badly
         library("torchvision", what)
     local: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
@@ -132,7 +132,7 @@ def on_device(model: Any, device: str, what: str) -> Any:
     """Moves a model to a device, such as "cuda" or "cpu", and returns it for inference.
 
     Raises:
-        AnnotationError: there is no such device.
+        AnnotationError: the device is missing.
     """
     try:
         return model.to(device).eval()

@@ -1,4 +1,4 @@
-"""Stage "semantics" by InternVL (transformers), which is asked only about parts that have no text.
+"""Stage "semantics" by InternVL (transformers), which describes only the parts that have no text.
 
 The network has to answer with one JSON object. An answer outside the schema is refused with the reason, a few times;
 after that the episode has no answer, which is an error and not a guess.
@@ -17,7 +17,7 @@ from PIL import Image
 from rsjax.ingest.annotators.networks.local import Network, library, pretrained
 from rsjax.ingest.annotators.protocols import AnnotationError, Semantics
 from rsjax.ingest.annotators.semantics import OwnSemantics
-from rsjax.ingest.episode import Episode, EpisodeError
+from rsjax.ingest.episode import Episode
 
 Ask = Callable[[list[UInt8[np.ndarray, "H W 3"]], str], str]  # (pictures, question) to an answer
 
@@ -99,11 +99,9 @@ def complete(known: Semantics, episode: Episode, camera: str, ask: Ask, settings
     """Asks about each part that has no text.
 
     Raises:
-        AnnotationError: there was no valid answer.
-        EpisodeError: there is no such camera.
+        AnnotationError: the network gave no valid answer.
+        EpisodeError: a picture cannot be read.
     """
-    if camera not in episode.cameras:
-        raise EpisodeError(f"episode {episode.id}: no camera {camera!r}; it has {', '.join(episode.cameras)}")
     parts, scene = [], known.scene
     for part in known.parts:
         if not part.text:

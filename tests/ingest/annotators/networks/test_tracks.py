@@ -68,6 +68,6 @@ def test_spatial_tracker_follows_through_fewer_frames_than_its_window(spatial):
 
 
 @pytest.mark.parametrize("depth", [1.0, 0.0, np.nan])
-def test_depth_that_spatial_tracker_would_stop_at_is_refused(spatial, depth):
+def test_depth_that_stops_spatial_tracker_is_refused(spatial, depth):
     with pytest.raises(AnnotationError, match="finite and not the same everywhere"):
         spatial(FRAMES, ArrayDepths(np.full((9, 48, 64), depth, np.float32)))
