@@ -1,8 +1,8 @@
-"""Recorded actions to the actions of a clip: which command led from one *sampled* frame into the next.
+"""Turns recorded actions into the actions of a clip: the command that led from one *sampled* frame into the next.
 
 An :class:`rsjax.ingest.episode.Episode` has a row of actions for each recorded frame, in its data set's units. A clip
-keeps every tenth frame or so; what led from one kept frame into the next is made of the rows between them, in the way
-that :class:`ActionConfig` says and :class:`Layout` allows.
+keeps every tenth frame or so; its actions combine the rows between two kept frames, in the way that
+:class:`ActionConfig` says and :class:`Layout` allows.
 
 Axes: N recorded frames, T sampled frames, K rows between two of these, A recorded and A' resulting action dimensions.
 """
@@ -25,13 +25,13 @@ Compose = Literal["join", "last", "stack"]
 
 @dataclass(frozen=True)
 class Layout:
-    """What the numbers of an action mean; readers leave it in ``episode.meta["actions"]``.
+    """What the numbers of an action mean; readers store it in ``episode.meta["actions"]``.
 
     Attributes:
         kind: absolute: where to be; delta: how far to go, or a velocity or torque of the step.
         quaternions: first of the four dimensions of each unit quaternion, x y z w.
-        held: dimensions that are commands to be in a state (open, closed) whatever ``kind`` says. They have no
-            differences, and of several the last one counts.
+        held: dimensions whose command stays in force until the next one, such as a gripper's open or closed, whatever
+            ``kind`` says. They have no differences, and of several commands the last one counts.
     """
 
     kind: Kind = "delta"
@@ -39,24 +39,24 @@ class Layout:
     held: tuple[int, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """As :meth:`from_json` reads it."""
+        """Returns the fields, JSON-ready."""
         return asdict(self) | {"quaternions": list(self.quaternions), "held": list(self.held)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Layout":
-        """The inverse of :meth:`to_json`; what is not named has its default."""
+        """The inverse of :meth:`to_json`; missing fields have their defaults."""
         return cls(values.get("kind", "delta"), tuple(values.get("quaternions", ())), tuple(values.get("held", ())))
 
 
 @dataclass(frozen=True)
 class ActionConfig:
-    """How a source's actions are handled.
+    """How a source's actions become those of clips.
 
     Attributes:
-        offset: frames by which the commands of this source are recorded too early (> 0) or too late (< 0), beyond its
+        offset: frames by which this source recorded its commands too early (> 0) or too late (< 0), beyond its
             format's documented alignment, which the reader undoes: row t becomes the one recorded at t - offset.
-        compose: what becomes of the rows between two sampled frames. ``join``: one row that does the same: deltas are
-            added, quaternions multiplied, of absolute and held dimensions the last counts. ``last``: the last row.
+        compose: how the rows between two sampled frames become one. ``join``: one row of the same effect: deltas are
+            added, quaternions multiplied, and the last absolute and held value counts. ``last``: the last row.
             ``stack``: all rows, one after the other (A' = K·A); the frames must be evenly spaced.
         kind: what the clip's actions are: ``recorded``, or ``delta`` of what was recorded as ``absolute``.
     """
@@ -72,42 +72,44 @@ class ActionConfig:
 
 
 def check_layout(layout: Layout, width: int, where: Path | str) -> None:
-    """Raises :class:`EpisodeError` where a layout names dimensions that actions of this width do not have.
+    """Raises :class:`EpisodeError` if a layout names dimensions that actions of this width do not have.
 
     Args:
         where: what the message names.
     """
-    named = {
-        "held": layout.held,
-        "quaternions": [dim for first in layout.quaternions for dim in (first, first + 3)],
-    }
-    for name, dims in named.items():
+    ends = [dim for first in layout.quaternions for dim in (first, first + 3)]
+    for name, dims in (("held", layout.held), ("quaternions", ends)):
         for wrong in (dim for dim in dims if not 0 <= dim < width):
-            raise EpisodeError(
-                f"{where}: {name} names dimension {wrong}, but actions have {width} (from 0 on); mend the option {name}"
-            )
+            problem = f"{name} names dimension {wrong}, but actions have {width} (from 0 on)"
+            raise EpisodeError.at(where, problem, f"mend the option {name}")
 
 
-def led_into(commands: Float[np.ndarray, "N A"]) -> Float32[np.ndarray, "N A"]:
-    """Commands given at each frame, aligned with the frame that each led into: row 0 is zeros, the last is dropped."""
-    aligned = np.zeros(commands.shape, np.float32)
-    aligned[1:] = commands[:-1]
+def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float32[np.ndarray, "N A"]:
+    """Aligns actions with the frame that each led into; row 0 becomes zeros.
+
+    Args:
+        rows: an action for each frame.
+        after: whether each frame was recorded after the action of its row, so that rows stay where they are. Otherwise
+            row t leads into frame t+1, and the last row leads nowhere.
+    """
+    aligned = np.zeros(rows.shape, np.float32)
+    aligned[1:] = rows[1:] if after else rows[:-1]
     return aligned
 
 
 def sampled_actions(
     actions: Float32[np.ndarray, "N A"], frames: Int[np.ndarray, " T"], config: ActionConfig, layout: Layout
 ) -> Float32[np.ndarray, "T A2"]:
-    """What led into each of these frames from the one before it in ``frames``; row 0 is zeros.
+    """Returns what led into each of these frames from the one before it in ``frames``; row 0 is zeros.
 
     Args:
         actions: an episode's; row t led into frame t, row 0 means nothing.
         frames: numbers of the sampled frames, increasing, each below N.
-        config: how.
+        config: how rows are combined.
         layout: of ``actions``.
 
     Raises:
-        ConfigError: absolute actions are asked of deltas, or ``stack`` of frames that are not evenly spaced.
+        ConfigError: the configuration wants absolute actions of deltas, or ``stack`` of unevenly spaced frames.
         EpisodeError: the layout names dimensions that the actions do not have.
     """
     check_layout(layout, actions.shape[1], "meta.actions")
@@ -120,55 +122,58 @@ def sampled_actions(
     differences = config.kind == "delta" and layout.kind == "absolute"
     if differences:
         rows = _differences(rows, layout)
-    added = differences or layout.kind == "delta"
-    made = [
-        _composed(rows[before + 1 : after + 1], config.compose, layout, added)
+    steps = differences or layout.kind == "delta"
+    composed = [
+        _composed(rows[before + 1 : after + 1], config.compose, layout, steps)
         for before, after in itertools.pairwise(frames)
     ]
-    width = made[0].size if made else actions.shape[1]
-    return np.stack([np.zeros(width), *made]).astype(np.float32)
+    width = composed[0].size if composed else actions.shape[1]
+    return np.stack([np.zeros(width), *composed]).astype(np.float32)
 
 
-def unflipped(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """The same rotations, each with the sign that is nearer to the one before; q and -q are one rotation."""
+def continuous_signs(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Returns the same rotations, each with the sign nearer to the one before; q and -q are the same rotation."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], -1) < 0
     signs = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
     return quaternions * signs[: len(quaternions), None].astype(quaternions.dtype)
 
 
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
-    """Row t becomes row t - offset. Beyond the ends places and held dimensions stay as they are, steps are none."""
+    """Moves row t - offset to row t. Beyond the ends absolute and held values repeat, deltas are no motion."""
     wanted = np.arange(len(rows)) - offset
-    places = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
-    shifted = rows[places]
+    nearest = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
+    shifted = rows[nearest]
     if layout.kind == "delta":
         still = np.zeros(rows.shape[1])
         still[[first + 3 for first in layout.quaternions]] = 1
         held = np.isin(np.arange(rows.shape[1]), layout.held)
-        shifted = np.where((wanted != places)[:, None] & ~held, still, shifted)
+        shifted = np.where((wanted != nearest)[:, None] & ~held, still, shifted)
     return shifted
 
 
 def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np.ndarray, "N A"]:
-    """Absolute rows as steps from the row before; quaternions as the rotation q₋₁⁻¹ q, in the hand's own frame."""
+    """Turns absolute rows into steps from the row before; quaternions into q₋₁⁻¹ q, in the hand's own frame."""
     steps = np.diff(rows, axis=0, prepend=rows[:1])
     before = np.concatenate([rows[:1], rows[:-1]])
     for first in layout.quaternions:
         part = slice(first, first + 4)
-        turns = _product(_inverse(_unit(before[:, part])), _unit(rows[:, part]))
-        steps[:, part] = np.where(turns[:, 3:] < 0, -turns, turns)  # the shorter way round
+        steps[:, part] = _shorter_way(_product(_inverse(_unit(before[:, part])), _unit(rows[:, part])))
     for held in layout.held:
         steps[:, held] = rows[:, held]
     return steps
 
 
 def _composed(
-    rows: Float64[np.ndarray, "K A"], compose: Compose, layout: Layout, added: bool
+    rows: Float64[np.ndarray, "K A"], compose: Compose, layout: Layout, steps: bool
 ) -> Float64[np.ndarray, " A2"]:
-    """Args: added: whether rows are steps, which add up, rather than places."""
+    """Combines rows into one.
+
+    Args:
+        steps: whether rows are steps, which add up, rather than absolute.
+    """
     if compose == "stack":
         return rows.reshape(-1)
-    if compose == "last" or not added:
+    if compose == "last" or not steps:
         return rows[-1]
     joined = rows.sum(0)
     for first in layout.quaternions:
@@ -176,14 +181,14 @@ def _composed(
         turn = _unit(rows[0, part])
         for row in rows[1:]:
             turn = _product(turn, _unit(row[part]))
-        joined[part] = turn if turn[3] >= 0 else -turn  # the shorter way round
+        joined[part] = _shorter_way(turn)
     for held in layout.held:
         joined[held] = rows[-1, held]
     return joined
 
 
 def _unit(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
-    """Of length 1; zeros, with which damaged data is filled, are no rotation."""
+    """Scales to length 1; zeros, which fill up damaged data, become no rotation."""
     length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.where(length > 0, quaternion / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])
 
@@ -192,8 +197,13 @@ def _inverse(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N
     return quaternion * [-1.0, -1.0, -1.0, 1.0]
 
 
+def _shorter_way(turn: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
+    """Returns the same rotation with w ≥ 0: at most half a turn."""
+    return np.where(turn[..., 3:] < 0, -turn, turn)
+
+
 def _product(left: Float64[np.ndarray, "*N 4"], right: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
-    """Hamilton's, of x y z w."""
+    """Multiplies quaternions x y z w (Hamilton's product)."""
     vector_l, vector_r, w_l, w_r = left[..., :3], right[..., :3], left[..., 3:], right[..., 3:]
     vector = w_l * vector_r + w_r * vector_l + np.cross(vector_l, vector_r)
     return np.concatenate([vector, w_l * w_r - np.sum(vector_l * vector_r, -1, keepdims=True)], -1)

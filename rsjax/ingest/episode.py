@@ -1,7 +1,7 @@
-"""One recorded episode of any data set, before it becomes clips, and what a reader of a format has to offer.
+"""One recorded episode of any data set, the interface of the readers that produce it, and their errors.
 
-A reader (:class:`EpisodeSource`) lists its episodes without decoding a picture, and reads one of them at a time; the
-pictures stay on disk until somebody asks for them, so memory does not grow with the data set.
+A reader (:class:`EpisodeSource`) lists its episodes without decoding pictures and reads one episode at a time. Pictures
+stay on disk until somebody reads them, so memory does not grow with the data set.
 
 Axes: N recorded frames, H×W pixels, A action dimensions, S state dimensions.
 """
@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.errors import UserError
-from rsjax.files import safe_id as safe_id  # readers import it from here
 
-_WHOLE, _EDGE = 2**18, 2**13  # bytes: files up to the first go whole into a fingerprint, others with both ends
+_WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints take files up to the first whole, and both ends of larger ones
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
 MAX_FPS = 10_000.0  # more is a mistake, not a camera
+FETCH_AGAIN = "fetch the file again or leave the episode out"
+LEAVE_OUT = "leave the episode out"
 
 
 class SourceError(UserError):
@@ -31,17 +32,37 @@ class SourceError(UserError):
 
 
 class EpisodeError(UserError):
-    """One episode cannot be read: the message names the file, the field and the cure. A run quarantines it.
+    """An episode that cannot be read, which runs quarantine. The message names the file, the field and the cure.
 
     Attributes:
         kind: one of :data:`rsjax.ingest.checks.KINDS`.
-        option: the command's option that rules the episode out, such as ``--camera``; "" where none does.
+        option: the command's option that rules the episode out, such as ``--camera``; "" if none does.
     """
 
     def __init__(self, message: str, kind: str = "unreadable", option: str = "") -> None:
         super().__init__(message)
         self.kind = kind
         self.option = option
+
+    @classmethod
+    def at(cls, where: Path | str, problem: str, cure: str = FETCH_AGAIN, kind: str = "unreadable") -> "EpisodeError":
+        """Builds the error from its parts.
+
+        Args:
+            where: the file, or the file and the place in it.
+            problem: what is wrong there.
+            cure: what the user can do.
+        """
+        return cls(f"{where}: {problem}; {cure}", kind)
+
+
+def reason(error: Exception) -> str:
+    """Returns why a file could not be read, on one line."""
+    if isinstance(error, FileNotFoundError):
+        return "missing"
+    if isinstance(error, OSError) and error.strerror:
+        return f"cannot be read ({error.strerror})"
+    return f"cannot be read ({' '.join(str(error).split())[:200] or type(error).__name__})"
 
 
 @dataclass(frozen=True)
@@ -51,8 +72,8 @@ class Segment:
     Attributes:
         start: its first frame.
         end: the frame after its last, > start.
-        text: what is done in it.
-        skill: the data set's word for it, "" where there is none.
+        text: what the robot does in it.
+        skill: the data set's word for it, "" if there is none.
     """
 
     start: int
@@ -62,12 +83,12 @@ class Segment:
 
 
 class Frames(Protocol):
-    """The pictures of one camera, decoded when they are asked for. Can be sent to other processes."""
+    """The pictures of one camera, decoded when they are read. Can be sent to other processes."""
 
     def __len__(self) -> int: ...
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """These pictures, 0–255, RGB, upright; any order, repeats allowed.
+        """Returns these pictures, 0–255, RGB, upright; any order, repeats allowed.
 
         Raises:
             EpisodeError: one of them cannot be read.
@@ -76,12 +97,12 @@ class Frames(Protocol):
 
 
 class Depths(Protocol):
-    """The depth maps of one camera, as :class:`Frames`."""
+    """The depth maps of one camera, decoded when they are read. Can be sent to other processes."""
 
     def __len__(self) -> int: ...
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """These maps, in metres along the optical axis; 0 where the camera measured nothing.
+        """Returns these maps, in metres along the optical axis; 0 where the camera measured nothing.
 
         Raises:
             EpisodeError: one of them cannot be read.
@@ -91,12 +112,12 @@ class Depths(Protocol):
 
 @dataclass(frozen=True)
 class EpisodeRef:
-    """Where an episode is, picklable and JSON-ready: it travels to worker processes.
+    """Where an episode is. Can be pickled and written as JSON: it travels to worker processes.
 
     Attributes:
-        id: unique within the source, safe as a file name (see :func:`safe_id`).
-        fingerprint: 16 hex digits of what it would be read from.
-        location: what the source's ``read`` needs.
+        id: unique within the source, safe as a file name (see :func:`rsjax.files.safe_id`).
+        fingerprint: 16 hex digits of what the episode would be read from.
+        location: what the source's ``read`` needs, or ``error``: why the episode cannot be read.
     """
 
     id: str
@@ -111,13 +132,13 @@ class Episode:
     Attributes:
         id: unique within the source, safe as a file name.
         fingerprint: 16 hex digits of what it was read from.
-        task: what the robot is asked to do; "" where the data set names none.
+        task: what the robot is to do; "" if the data set does not say.
         fps: frames per second, > 0.
         timestamps: seconds from the first frame, increasing.
-        actions: row t is what led from frame t-1 into frame t, in the data set's own units; row 0 is zeros.
-        states: what the robot measured of itself at each frame; None where it was not recorded.
+        actions: row t led from frame t-1 into frame t, in the data set's own units; row 0 is zeros.
+        states: what the robot measured of itself at each frame; None if it was not recorded.
         cameras: pictures by the camera's name.
-        depth: depth maps by the same names; empty where none was recorded.
+        depth: depth maps by the same names; empty if none were recorded.
         segments: the data set's own, in order.
         meta: JSON-ready; ``meta["actions"]`` is the :class:`rsjax.ingest.actions.Layout` of the actions.
     """
@@ -141,7 +162,7 @@ class EpisodeSource(Protocol):
     name: str
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Every episode, in a fixed order, without reading pictures.
+        """Lists every episode in a fixed order, without reading pictures.
 
         Raises:
             SourceError: the data set cannot be listed.
@@ -149,7 +170,7 @@ class EpisodeSource(Protocol):
         ...
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """One episode.
+        """Reads one episode.
 
         Raises:
             EpisodeError: it cannot be read, or its parts do not fit together.
@@ -158,45 +179,47 @@ class EpisodeSource(Protocol):
 
 
 def checked(episode: Episode, where: Path | str) -> Episode:
-    """The same episode, if it keeps what :class:`Episode` promises.
+    """Returns the same episode if it keeps what :class:`Episode` promises.
 
     Args:
         where: the file that messages name.
 
     Raises:
-        EpisodeError: no frames, rows or pictures that are not as many as the timestamps, values that are not finite,
-            or time that does not increase.
+        EpisodeError: there are no frames, numbers of rows or pictures differ from the number of timestamps, values are
+            not finite, or time does not increase.
     """
     count = len(episode.timestamps)
     if count == 0:
-        raise EpisodeError(f"{where}: episode {episode.id} has no frames; leave it out", "length")
+        raise EpisodeError.at(where, f"episode {episode.id} has no frames", "leave it out", "length")
     if not episode.cameras:
-        raise EpisodeError(f"{where}: episode {episode.id} has no camera; leave it out or add its pictures", "camera")
+        cure = "leave it out or add its pictures"
+        raise EpisodeError.at(where, f"episode {episode.id} has no camera", cure, "camera")
     arrays = {"actions": episode.actions} | ({} if episode.states is None else {"states": episode.states})
     lengths = {name: len(array) for name, array in arrays.items()}
     lengths |= {f"camera {name}": len(frames) for name, frames in episode.cameras.items()}
     lengths |= {f"depth {name}": len(maps) for name, maps in episode.depth.items()}
     for name, length in lengths.items():
         if length != count:
-            raise EpisodeError(f"{where}: {name} has {length} rows, timestamps {count}; mend or leave it out", "length")
+            problem = f"{name} has {length} rows, timestamps {count}"
+            raise EpisodeError.at(where, problem, "mend or leave it out", "length")
     for name, array in ({"timestamps": episode.timestamps} | arrays).items():
         if not np.isfinite(array).all():
             row = int(np.flatnonzero(~np.isfinite(array.reshape(count, -1)).all(1))[0])
-            told = f"{where}: {name} of frame {row} is not finite; mend the value or leave the episode out"
-            raise EpisodeError(told, "not-finite")
+            cure = "mend the value or leave the episode out"
+            raise EpisodeError.at(where, f"{name} of frame {row} is not finite", cure, "not-finite")
     if (back := np.flatnonzero(np.diff(episode.timestamps) <= 0)).size:
-        told = f"{where}: timestamps do not increase at frame {back[0] + 1}; mend them or leave it out"
-        raise EpisodeError(told, "time")
+        problem = f"timestamps do not increase at frame {back[0] + 1}"
+        raise EpisodeError.at(where, problem, "mend them or leave it out", "time")
     if not np.isfinite(episode.fps) or episode.fps <= 0:
-        raise EpisodeError(f"{where}: fps is {episode.fps}; it must be positive", "time")
+        raise EpisodeError.at(where, f"fps is {episode.fps}", "it must be positive", "time")
     return episode
 
 
-def plain(path: Path) -> Path:
-    """The same path, unless it is a pipe or a device: opening one may wait for ever, and reading it may never end.
+def regular(path: Path) -> Path:
+    """Returns the same path, but refuses pipes and devices: opening or reading one may never end.
 
     Raises:
-        OSError: it is.
+        OSError: it is a pipe or a device, or cannot be looked at.
     """
     mode = path.stat().st_mode
     if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
@@ -205,16 +228,16 @@ def plain(path: Path) -> Path:
 
 
 def _bytes(text: str) -> bytes:
-    """UTF-8; of a file's name also the bytes that are none."""
+    """Encodes as UTF-8, including the bytes of a file's name that are not UTF-8."""
     return text.encode("utf-8", "surrogatepass")
 
 
-def fingerprint(paths: Sequence[Path], *more: object) -> str:
-    """16 hex digits of files and values. A missing file counts too; folders do not, so a data set may be moved.
+def fingerprint(paths: Sequence[Path], *values: object) -> str:
+    """Returns 16 hex digits of files and values. A missing file counts too; folders do not, so a data set may be moved.
 
-    Of files above 256 KiB only size, date and both ends count: a data set's videos are too many to be read for this.
+    Of files above 256 KiB only size, date and both ends count: reading all videos of a data set would take too long.
     """
-    digest = hashlib.sha256(repr(more).encode())
+    digest = hashlib.sha256(repr(values).encode())
     for path in paths:
         digest.update(_file_digest(*_stamp(path)))
     return digest.hexdigest()[:16]
@@ -228,12 +251,12 @@ def _stamp(path: Path) -> tuple[Path, int, int]:
     return path, status.st_size, status.st_mtime_ns
 
 
-@lru_cache(maxsize=1024)  # one file may hold hundreds of episodes
+@lru_cache(maxsize=1024)  # one file may contain hundreds of episodes
 def _file_digest(path: Path, size: int, modified: int) -> bytes:
     large = size > _WHOLE
     digest = hashlib.sha256(_bytes(f"{path.name} {size} {modified if large else ''}"))
     try:
-        with plain(path).open("rb") as file:
+        with regular(path).open("rb") as file:
             digest.update(file.read(_EDGE if large else _WHOLE))
             if large:
                 file.seek(size - _EDGE)

@@ -1,16 +1,62 @@
-"""Pictures and depth maps that lie on disk one by one, behind the same interface as a video's."""
+"""Pictures and depth maps that are stored one by one or are in memory, behind the interface that videos have too."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
-from rsjax.ingest.episode import MAX_PIXELS, EpisodeError
+from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, reason
 
-_CURE = "fetch the file again or leave the episode out"
-_NO_FRAME = (0xC4, 0xC8, 0xCC)  # JPEG markers between those of frame headers: tables
+_NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # JPEG markers of tables, between the markers of frame headers
+
+
+class ArrayFrames:
+    """Pictures in memory, as :class:`rsjax.ingest.episode.Frames`."""
+
+    def __init__(self, pictures: UInt8[np.ndarray, "N H W 3"]) -> None:
+        self._pictures = pictures
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
+        """Returns these pictures."""
+        return self._pictures[np.asarray(indices, np.int64)]
+
+
+class ArrayDepths:
+    """Depth maps in memory, as :class:`rsjax.ingest.episode.Depths`."""
+
+    def __init__(self, maps: Float[np.ndarray, "N H W"]) -> None:
+        self._maps = maps
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
+        """Returns these maps, in the unit of the array."""
+        return self._maps[np.asarray(indices, np.int64)].astype(np.float32)
+
+
+class EncodedFrames:
+    """PNG or JPEG pictures in memory, decoded when they are read, as :class:`rsjax.ingest.episode.Frames`.
+
+    Args:
+        payloads: each frame's PNG or JPEG.
+        where: the file and field that messages name.
+    """
+
+    def __init__(self, payloads: Sequence[bytes], where: str) -> None:
+        self.payloads, self._where = list(payloads), where
+
+    def __len__(self) -> int:
+        return len(self.payloads)
+
+    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
+        """Returns these pictures; :class:`EpisodeError` names one that is damaged or of another size."""
+        return decode_pictures((f"{self._where} frame {index}", self.payloads[index]) for index in indices)
 
 
 class PictureFiles:
@@ -27,8 +73,8 @@ class PictureFiles:
         return len(self._paths)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """These pictures; :class:`EpisodeError` names one that is missing, damaged or of another size."""
-        return _stacked([self._paths[index] for index in indices], lambda path: decode_picture(_bytes(path), path))
+        """Returns these pictures; :class:`EpisodeError` names one that is missing, damaged or of another size."""
+        return decode_pictures((path, _bytes(path)) for path in (self._paths[index] for index in indices))
 
 
 class DepthFiles:
@@ -46,53 +92,70 @@ class DepthFiles:
         return len(self._paths)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """These maps in metres, 0 where nothing was measured; :class:`EpisodeError` as :class:`PictureFiles`."""
-        return _stacked([self._paths[index] for index in indices], self._depth)
+        """Returns these maps in metres, 0 where nothing was measured; raises as :class:`PictureFiles`."""
+        return stack_pictures((path, self._depth(path)) for path in (self._paths[index] for index in indices))
 
     def _depth(self, path: Path) -> Float32[np.ndarray, "H W"]:
         raw = _decode(_bytes(path), cv2.IMREAD_UNCHANGED, path)
         if raw.dtype != np.uint16 or raw.ndim != 2:
-            raise EpisodeError(f"{path}: {raw.dtype} {raw.shape}, a depth map has 16 bits and one channel; {_CURE}")
+            raise EpisodeError.at(path, f"{raw.dtype} {raw.shape}, a depth map has 16 bits and one channel")
         return raw.astype(np.float32) * np.float32(self._unit)
 
 
-def decode_picture(payload: bytes, where: Path | str) -> UInt8[np.ndarray, "H W 3"]:
-    """An encoded picture (PNG or JPEG) as RGB, turned as its EXIF data says.
+def decode_pictures(payloads: Iterable[tuple[Path | str, bytes]]) -> UInt8[np.ndarray, "n H W 3"]:
+    """Decodes PNG or JPEG pictures of one size as RGB, turned as their EXIF data say.
 
     Args:
-        where: what a message names.
+        payloads: what messages name, and the encoded picture.
 
     Raises:
-        EpisodeError: it is damaged, neither PNG nor JPEG, or its sides are impossible.
+        EpisodeError: one is damaged, neither PNG nor JPEG, of impossible size, or of another size than the first.
     """
-    return _decode(payload, cv2.IMREAD_COLOR, where)[..., ::-1].copy()
+    return stack_pictures((where, _decode(data, cv2.IMREAD_COLOR, where)[..., ::-1]) for where, data in payloads)
+
+
+def stack_pictures(pictures: Iterable[tuple[Path | str, np.ndarray]]) -> np.ndarray:
+    """Stacks pictures or maps of one size, each after what messages name.
+
+    Raises:
+        EpisodeError: one is of another size than the first.
+    """
+    stacked: list[np.ndarray] = []
+    for where, picture in pictures:
+        stacked.append(picture)
+        if picture.shape != stacked[0].shape:
+            sizes = " and ".join(f"{one.shape[1]} × {one.shape[0]}" for one in (picture, stacked[0]))
+            raise EpisodeError.at(where, f"pictures of several sizes ({sizes})")
+    if not stacked:
+        raise ValueError("no frames to read")
+    return np.stack(stacked)
 
 
 def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
+    problem = f"not a readable picture ({len(payload)} bytes)"
     sides = _sides(payload)
     if sides is None:
-        told = f"{where}: not a readable picture ({len(payload)} bytes): neither a whole PNG nor a JPEG; {_CURE}"
-        raise EpisodeError(told, "undecodable")
+        raise EpisodeError.at(where, f"{problem}: neither a whole PNG nor a JPEG", kind="undecodable")
     if not 0 < sides[0] * sides[1] <= MAX_PIXELS:
-        raise EpisodeError(f"{where}: its header says {sides[0]} × {sides[1]} pixels; {_CURE}")
+        raise EpisodeError.at(where, f"its header says {sides[0]} × {sides[1]} pixels")
     try:
         picture = cv2.imdecode(np.frombuffer(payload, np.uint8), flags)
     except cv2.error as error:
-        raise EpisodeError(f"{where}: not a readable picture ({error.err}); {_CURE}") from error
+        raise EpisodeError.at(where, f"{problem}: {error.err}") from error
     if picture is None:
-        raise EpisodeError(f"{where}: not a readable picture ({len(payload)} bytes); {_CURE}")
+        raise EpisodeError.at(where, problem)
     return picture
 
 
 def _sides(payload: bytes) -> tuple[int, int] | None:
-    """Width and height of a PNG or JPEG, before memory is taken for it: a few bytes can name a picture of gigabytes."""
+    """Reads width and height of a PNG or JPEG before memory is taken: a few bytes can claim a picture of gigabytes."""
     if payload.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png_sides(payload)
     return _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
 
 
 def _png_sides(payload: bytes) -> tuple[int, int] | None:
-    """None where a chunk is longer than the file: OpenCV takes as much memory as a chunk says that it is long."""
+    """Returns None if a chunk claims to be longer than the file: OpenCV allocates as much as a chunk claims."""
     place = 8
     while place + 12 <= len(payload):
         end = place + 12 + int.from_bytes(payload[place : place + 4], "big")
@@ -105,35 +168,24 @@ def _png_sides(payload: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_sides(payload: bytes) -> tuple[int, int] | None:
-    """Those of the largest frame header: a second one would be decoded in place of the first."""
-    most: tuple[int, int] | None = None
+    """Returns the sides in the largest frame header: the decoder would use a second one in place of the first."""
+    largest: tuple[int, int] | None = None
     place = payload.find(b"\xff", 2)
     while 0 <= place < len(payload) - 9:
         marker = payload[place + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
+        if 0xC0 <= marker <= 0xCF and marker not in _NOT_FRAMES:
             height, width = (int.from_bytes(payload[place + at : place + at + 2], "big") for at in (5, 7))
-            most = max(most or (0, 0), (width, height), key=lambda sides: sides[0] * sides[1])
+            largest = max(largest or (0, 0), (width, height), key=lambda sides: sides[0] * sides[1])
         if marker == 0xDA:
             break
         has_length = marker not in (0x00, 0x01, 0xFF) and not 0xD0 <= marker <= 0xD8
         step = 2 + int.from_bytes(payload[place + 2 : place + 4], "big") if has_length else 1
         place = payload.find(b"\xff", place + step)
-    return most
+    return largest
 
 
 def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise EpisodeError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from error
-
-
-def _stacked(paths: list[Path], decode: Callable[[Path], np.ndarray]) -> np.ndarray:
-    if not paths:
-        raise ValueError("no frames asked for")
-    pictures: list[np.ndarray] = []
-    for path in paths:
-        pictures.append(decode(path))
-        if pictures[-1].shape != pictures[0].shape:
-            raise EpisodeError(f"{path}: {pictures[-1].shape[:2]} pixels, {paths[0].name} has {pictures[0].shape[:2]}")
-    return np.stack(pictures)
+        raise EpisodeError.at(path, reason(error)) from error

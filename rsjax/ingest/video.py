@@ -1,18 +1,18 @@
-"""Pictures out of video files by number or by time, through PyAV (H.264, AV1 and whatever else FFmpeg decodes).
+"""Reads pictures of video files by number or by time, through PyAV (H.264, AV1 and whatever else FFmpeg decodes).
 
 A file is scanned once for the times of its frames, without decoding. Reading seeks to the key frame before the picture
-and decodes on from there, or just decodes on where that is nearer. Each process keeps a few files open, the least
-recently used is closed first.
+and decodes on from there, or just decodes on if that is nearer. Each process keeps a few files open and closes the
+least recently used one first.
 """
 
 import contextlib
-import errno
 import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,33 +21,29 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError
+from rsjax.ingest.pictures import stack_pictures
 
-OPEN_FILES = 8  # decoders that one process keeps; each holds a few decoded pictures
-_CURE = "fetch the file again or leave the episode out"
+OPEN_FILES = 8  # decoders that one process keeps; each has a few decoded pictures in memory
 # A playlist that calls itself .mp4 would otherwise make FFmpeg open the files that it names.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 
 
 @dataclass(frozen=True)
 class VideoIndex:
-    """What a scan of a video's packets tells.
+    """The frames of a video, from a scan of its packets.
 
     Attributes:
         stamps: each frame's presentation time in units of ``time_base``, increasing.
         keys: whether decoding can begin at the frame.
         time_base: seconds.
-        height: of the coded picture, before it is turned upright.
-        width: likewise.
     """
 
     stamps: Int64[np.ndarray, " N"]
     keys: Bool[np.ndarray, " N"]
     time_base: Fraction
-    height: int
-    width: int
 
     def times(self) -> Float[np.ndarray, " N"]:
-        """Seconds of each frame on the file's own clock."""
+        """Returns the seconds of each frame on the file's own clock."""
         return self.stamps * float(self.time_base)
 
 
@@ -66,28 +62,23 @@ class VideoFrames:
         return len(scan(self.path).stamps) if self._numbers is None else len(self._numbers)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """These pictures, 0–255, RGB, turned as the file's display matrix says.
+        """Returns these pictures, 0–255, RGB, turned as the file's display matrix says.
 
         Raises:
             EpisodeError: the file is damaged at one of them.
         """
         chosen = np.asarray(indices, np.int64).reshape(-1)
-        if not chosen.size:
-            raise ValueError("no frames asked for")
-        if chosen.min() < 0 or chosen.max() >= len(self):
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self)):
             raise IndexError(f"{self.path}: frames {chosen.min()} … {chosen.max()} of {len(self)}")
-        wanted, places = np.unique(chosen if self._numbers is None else self._numbers[chosen], return_inverse=True)
+        wanted, order = np.unique(chosen if self._numbers is None else self._numbers[chosen], return_inverse=True)
         with _opened(self.path) as decoder:
-            pictures = [decoder.picture(int(number)) for number in wanted]
-        for number, picture in zip(wanted, pictures, strict=True):
-            if picture.shape != pictures[0].shape:
-                sizes = f"{picture.shape[1]} × {picture.shape[0]}, frame {wanted[0]} {pictures[0].shape[1::-1]}"
-                raise EpisodeError(f"{self.path}: frame {number}: pictures of several sizes ({sizes}); {_CURE}")
-        return np.stack(pictures)[places]
+            return stack_pictures((f"{self.path}: frame {number}", decoder.picture(int(number))) for number in wanted)[
+                order
+            ]
 
 
 def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> VideoFrames:
-    """The frames of a video that are shown at these times on the file's own clock.
+    """Returns the frames of a video that are shown at these times on the file's own clock.
 
     Args:
         seconds: the times, increasing.
@@ -104,26 +95,20 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
     away = np.abs(times[numbers] - seconds)
     if (far := np.flatnonzero(~(away <= tolerance))).size:
         first = far[0]
-        raise EpisodeError(
-            f"{path}: no frame at {seconds[first]:.4f} s, row {first} of the table: the nearest is {away[first]:.2g} s "
-            f"away, {tolerance:.2g} s are allowed; {_CURE}",
-            "time",
+        raise EpisodeError.at(
+            path,
+            f"no frame at {seconds[first]:.4f} s, row {first} of the table: the nearest is {away[first]:.2g} s away, "
+            f"{tolerance:.2g} s are allowed",
+            kind="time",
         )
     if (twice := np.flatnonzero(np.diff(numbers) <= 0)).size:
-        raise EpisodeError(
-            f"{path}: rows {twice[0]} and {twice[0] + 1} of the table show the same frame; {_CURE}", "time"
-        )
+        problem = f"rows {twice[0]} and {twice[0] + 1} of the table show the same frame"
+        raise EpisodeError.at(path, problem, kind="time")
     return VideoFrames(path, numbers.astype(np.int64))
 
 
-_indices: "OrderedDict[tuple[str, int, int], VideoIndex]" = OrderedDict()
-_decoders: "OrderedDict[str, _Decoder]" = OrderedDict()
-_lock = threading.RLock()
-os.register_at_fork(after_in_child=_decoders.clear)  # a forked process would move the parent's place in the files
-
-
 def scan(path: Path) -> VideoIndex:
-    """The index of a video file; it is kept while the file stays the same.
+    """Returns the index of a video file, which is kept while the file stays the same.
 
     Raises:
         EpisodeError: the file is missing, no video, truncated, or has pictures of an impossible size.
@@ -132,51 +117,39 @@ def scan(path: Path) -> VideoIndex:
         status = path.stat()
     except OSError as error:
         raise _unreadable(path, error) from error
-    key = (str(path), status.st_size, status.st_mtime_ns)
-    with _lock:
-        index = _indices.pop(key, None)
-    index = index or _scan(path)
-    with _lock:
-        _indices[key] = index
-        if len(_indices) > 4 * OPEN_FILES:
-            _indices.popitem(last=False)
-    return index
+    return _scan(path, status.st_size, status.st_mtime_ns)
 
 
-def close_all() -> None:
-    """Closes the files that this process keeps open."""
-    with _lock:
-        while _decoders:
-            _decoders.popitem()[1].close()
-
-
-def _scan(path: Path) -> VideoIndex:
+@lru_cache(maxsize=4 * OPEN_FILES)
+def _scan(path: Path, size: int, modified: int) -> VideoIndex:
+    """Scans a file; size and date are there so that a changed file is scanned again."""
     with _container(path) as container:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
         if not 0 < height * width <= MAX_PIXELS:
-            raise EpisodeError(f"{path}: its header says pictures of {width} × {height}; {_CURE}", "undecodable")
+            problem = f"its header says pictures of {width} × {height}"
+            raise EpisodeError.at(path, problem, kind="undecodable")
         promised, time_base = stream.frames, stream.time_base
-        shown = _packets(path, container)
-    if not shown or time_base is None:
-        raise EpisodeError(f"{path}: holds no pictures; {_CURE}", "undecodable")
-    if len(shown) < promised:
+        packets = _packets(path, container)
+    if not packets or time_base is None:
+        raise EpisodeError.at(path, "has no pictures", kind="undecodable")
+    if len(packets) < promised:
         with _container(path, ignore_editlist="1") as container:  # an edit list may hide frames that are there
-            there = len(_packets(path, container))
-        if there < promised:
-            told = f"{path}: truncated: {there} of the {promised} frames that its header names; {_CURE}"
-            raise EpisodeError(told, "undecodable")
-    if any(stamp is None for stamp, _ in shown):
-        raise EpisodeError(f"{path}: has frames without a time, so they cannot be found; rewrite it as MP4")
-    shown.sort()
-    stamps = np.array([stamp for stamp, _ in shown], np.int64)
+            present = len(_packets(path, container))
+        if present < promised:
+            problem = f"truncated: {present} of the {promised} frames that its header names"
+            raise EpisodeError.at(path, problem, kind="undecodable")
+    if any(stamp is None for stamp, _ in packets):
+        raise EpisodeError.at(path, "has frames without a time, so they cannot be found", "rewrite it as MP4")
+    packets.sort()
+    stamps = np.array([stamp for stamp, _ in packets], np.int64)
     if (np.diff(stamps) <= 0).any():
-        raise EpisodeError(f"{path}: two frames have the same time; rewrite the file with increasing times")
-    return VideoIndex(stamps, np.array([key for _, key in shown]), time_base, height, width)
+        raise EpisodeError.at(path, "two frames have the same time", "rewrite the file with increasing times")
+    return VideoIndex(stamps, np.array([key for _, key in packets]), time_base)
 
 
 def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
-    """Time, and whether decoding can begin there, of each packet that becomes a picture which is shown."""
+    """Returns the time of each packet that becomes a visible picture, and whether decoding can begin there."""
     try:
         packets = container.demux(container.streams.video[0])
         return [(packet.pts, packet.is_keyframe) for packet in packets if packet.size and not packet.is_discard]
@@ -185,7 +158,7 @@ def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
 
 
 def _container(path: Path, **options: str) -> Any:
-    """Opens a file; for one that names itself like a protocol of FFmpeg's, still only that file."""
+    """Opens a file; one that is named like a protocol of FFmpeg's is still only that file."""
     try:
         with path.open("rb"):
             container = av.open(
@@ -197,20 +170,31 @@ def _container(path: Path, **options: str) -> Any:
         raise _unreadable(path, error) from error
     if not container.streams.video or container.streams.video[0].codec_context is None:
         container.close()
-        raise EpisodeError(f"{path}: has no video stream that can be decoded; {_CURE}", "undecodable")
+        raise EpisodeError.at(path, "has no video stream that can be decoded", kind="undecodable")
     return container
 
 
 def _unreadable(path: Path, error: Exception) -> EpisodeError:
-    if isinstance(error, OSError) and error.errno == errno.ENOENT:
-        return EpisodeError(f"{path}: missing; {_CURE}", "undecodable")
-    reason = getattr(error, "strerror", None) or str(error)
-    return EpisodeError(f"{path}: not a readable video ({reason}); {_CURE}", "undecodable")
+    missing = isinstance(error, FileNotFoundError)
+    problem = "missing" if missing else f"not a readable video ({getattr(error, 'strerror', None) or error})"
+    return EpisodeError.at(path, problem, kind="undecodable")
+
+
+_decoders: "OrderedDict[str, _Decoder]" = OrderedDict()
+_lock = threading.RLock()
+os.register_at_fork(after_in_child=_decoders.clear)  # a forked process would move the parent's place in the files
+
+
+def close_all() -> None:
+    """Closes the files that this process keeps open."""
+    with _lock:
+        while _decoders:
+            _decoders.popitem()[1].close()
 
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator["_Decoder"]:
-    """The file's decoder, for this thread alone; one that failed is not kept."""
+    """Lends the file's decoder to this thread alone; one that failed is not kept."""
     index = scan(path)
     with _lock:
         decoder = _decoders.pop(str(path), None)
@@ -232,7 +216,7 @@ def _opened(path: Path) -> Iterator["_Decoder"]:
 
 
 class _Decoder:
-    """One open file and where decoding stands in it."""
+    """One open file and the position of decoding in it."""
 
     def __init__(self, path: Path, index: VideoIndex) -> None:
         self.path, self.index = path, index
@@ -252,16 +236,15 @@ class _Decoder:
         self._container.close()
 
     def picture(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
-        """One frame of the file."""
-        found = self._find(number)
-        picture = found.to_ndarray(format="rgb24")
-        turned = np.rot90(picture, round(found.rotation / 90)) if found.rotation else picture
-        return np.ascontiguousarray(turned)
+        """Decodes one frame of the file."""
+        frame = self._decode(number)
+        picture = frame.to_ndarray(format="rgb24")
+        return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
 
-    def _find(self, number: int) -> Any:
-        """Decodes a frame: on from here where that is nearest, from the key frame before it, or from farther back.
+    def _decode(self, number: int) -> Any:
+        """Decodes a frame: on from here if that is nearest, from the key frame before it, or from farther back.
 
-        In an open group of pictures the first frames lean on the group before, so one key frame may not be enough.
+        In an open group of pictures the first frames depend on the group before, so one key frame may not be enough.
         """
         near = self._start(number)
         attempts: list[int | None] = [near, self._start(max(0, near - 1)), 0]
@@ -271,19 +254,20 @@ class _Decoder:
                 if start is not None:
                     self._container.seek(int(self.index.stamps[start]), stream=self._stream, backward=True)
                     self._frames = self._container.decode(self._stream)
-                if (found := self._decode_until(number)) is not None:
-                    return found
+                if (frame := self._decode_until(number)) is not None:
+                    return frame
             except (av.FFmpegError, OSError) as error:
                 reason = error
-        raise self._damaged(number, reason)
+        seconds = float(self.index.stamps[number] * self.index.time_base)
+        raise EpisodeError.at(self.path, f"frame {number} (at {seconds:.3f} s) cannot be decoded: {reason}")
 
     def _start(self, number: int) -> int:
-        """The nearest frame at or before this one at which decoding can begin."""
+        """Returns the nearest frame at or before this one at which decoding can begin."""
         place = int(np.searchsorted(self._starts, number, side="right")) - 1
         return int(self._starts[place]) if place >= 0 else 0
 
     def _decode_until(self, number: int) -> Any:
-        """Decodes on up to this frame; None where the decoder passes it by."""
+        """Decodes on up to this frame; None if the decoder passes it by."""
         stamps = self.index.stamps
         for frame in self._frames:
             if frame.pts is None or frame.pts > stamps[-1]:
@@ -293,7 +277,3 @@ class _Decoder:
             if place >= number:
                 return frame if stamps[number] == frame.pts and not frame.is_corrupt else None
         return None
-
-    def _damaged(self, number: int, reason: object) -> EpisodeError:
-        seconds = float(self.index.stamps[number] * self.index.time_base)
-        return EpisodeError(f"{self.path}: frame {number} (at {seconds:.3f} s) cannot be decoded: {reason}; {_CURE}")

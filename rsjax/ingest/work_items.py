@@ -22,8 +22,8 @@ from rsjax.config import content_key
 from rsjax.data.codec import Record, encode
 from rsjax.data.store import WRITER_OPTIONS, Source
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, write_atomically
-from rsjax.ingest.episode import Episode, EpisodeRef, EpisodeSource, safe_id
+from rsjax.files import disk_guard, safe_id, write_atomically
+from rsjax.ingest.episode import Episode, EpisodeRef, EpisodeSource
 
 Summary = dict[str, Any]  # what a step says about its output, JSON-ready
 # status, stage (the step), episode, key, seconds, cpu_seconds; done: records, bytes, summary; failed: error, option,

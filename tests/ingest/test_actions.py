@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rsjax.config import ConfigError
-from rsjax.ingest.actions import ActionConfig, Layout, led_into, sampled_actions, unflipped
+from rsjax.ingest.actions import ActionConfig, Layout, align_actions, continuous_signs, sampled_actions
 from rsjax.ingest.episode import EpisodeError
 
 FLOATS = st.floats(-10, 10, width=32)
@@ -22,13 +22,14 @@ def turn(axis: int, angle: float) -> np.ndarray:
 
 
 def test_a_command_leads_into_the_next_frame() -> None:
-    np.testing.assert_array_equal(led_into(np.array([[1.0], [2.0], [3.0]])), [[0], [1], [2]])
-    assert led_into(np.array([[7.0]])).tolist() == [[0]]
+    np.testing.assert_array_equal(align_actions(np.array([[1.0], [2.0], [3.0]])), [[0], [1], [2]])
+    assert align_actions(np.array([[7.0]])).tolist() == [[0]]
+    np.testing.assert_array_equal(align_actions(np.array([[1.0], [2.0], [3.0]]), after=True), [[0], [2], [3]])
 
 
 @given(ROWS)
 def test_every_frame_sampled_changes_nothing(rows: np.ndarray) -> None:
-    rows = led_into(rows)
+    rows = align_actions(rows)
     for layout in (Layout("delta"), Layout("absolute"), Layout("delta", held=(0,))):
         np.testing.assert_array_equal(sampled_actions(rows, np.arange(len(rows)), EVERY, layout), rows)
 
@@ -100,7 +101,7 @@ def test_turns_join_to_the_turn_from_end_to_end(turns: list[tuple[int, float]]) 
 def test_flipped_signs_of_a_turning_hand_are_undone(flips: list[bool]) -> None:
     smooth = np.stack([turn(0, 0.2 * step) for step in range(len(flips))])
     signs = np.where(flips, -1.0, 1.0)[:, None]
-    mended = unflipped(smooth * signs)
+    mended = continuous_signs(smooth * signs)
     np.testing.assert_array_equal(mended, smooth * signs[0])
 
 

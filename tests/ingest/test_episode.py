@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.ingest.episode import Episode, EpisodeError, checked, fingerprint, safe_id
+from rsjax.files import safe_id
+from rsjax.ingest.episode import Episode, EpisodeError, checked, fingerprint
 
 
 class Black:

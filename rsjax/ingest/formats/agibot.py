@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from rsjax.ingest.actions import Layout, led_into
-from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, safe_id
+from rsjax.files import safe_id
+from rsjax.ingest.actions import Layout, align_actions
+from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, reason
 from rsjax.ingest.formats.agibot_proprio import Proprio
-from rsjax.ingest.formats.files import broken, inside, is_there, location_of, media, read_json, subfolders
+from rsjax.ingest.formats.files import broken, exists, inside, location_of, media, read_json, subfolders
 from rsjax.ingest.formats.hdf5 import open_file
 from rsjax.ingest.pictures import DepthFiles
 from rsjax.ingest.video import VideoFrames
@@ -27,11 +28,21 @@ from rsjax.ingest.video import VideoFrames
 FPS = 30.0
 CAMERAS = ("head", "hand_left", "hand_right")
 LAYOUT = Layout("absolute", quaternions=(6, 10), held=(14, 15))
-_PARTS = ("observations", "proprio_stats")
+_FOLDERS = ("observations", "proprio_stats")
+
+
+def open_source(path: Path, *, cameras: Sequence[str] = CAMERAS, tasks: Sequence[int | str] = ()) -> "AgiBot":
+    """Opens the data set at ``path``.
+
+    Args:
+        cameras: names of videos without ``_color.mp4``; an episode needs all of them.
+        tasks: their numbers; none: all.
+    """
+    return AgiBot(path, cameras, [str(task) for task in tasks])
 
 
 class AgiBot:
-    """AgiBot-World, as :class:`rsjax.ingest.episode.EpisodeSource`; made by :func:`open_source`."""
+    """AgiBot-World, as :class:`rsjax.ingest.episode.EpisodeSource`; :func:`open_source` builds it."""
 
     name = "agibot"
 
@@ -39,43 +50,43 @@ class AgiBot:
         self._root, self._cameras, self._only = root, tuple(cameras), tuple(tasks)
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Every episode that is on disk or in ``task_info``, task by task; what is not on disk cannot be read."""
+        """Lists every episode on disk or in ``task_info``, task by task; what is not on disk cannot be read."""
         for task in self._tasks():
             path = self._root / "task_info" / f"task_{task}.json"
-            told: dict[str, dict[str, Any]] = {}
+            entries: dict[str, dict[str, Any]] = {}
             try:
-                for place, entry in enumerate(_entries(path) if is_there(path) else ()):
+                for place, entry in enumerate(_entries(path) if exists(path) else ()):
                     identity = str(entry.get("episode_id", ""))
-                    if not identity.isdecimal() or identity in told:
+                    if not identity.isdecimal() or identity in entries:
                         message = f"{path}: episode_id of entry {place} is missing or there already; mend the file"
                         yield broken(safe_id(f"task_{task}-entry_{place}"), message)
                     else:
-                        told[identity] = entry
+                        entries[identity] = entry
             except SourceError as error:
                 yield broken(safe_id(f"task_{task}"), str(error))
-            there: set[str] = set()
-            for part in _PARTS:
-                folder = self._root / part / task
+            on_disk: set[str] = set()
+            for name in _FOLDERS:
+                folder = self._root / name / task
                 try:
-                    there |= {entry.name for entry in subfolders(folder)} if is_there(folder) else set()
+                    on_disk |= {entry.name for entry in subfolders(folder)} if exists(folder) else set()
                 except SourceError as error:
-                    yield broken(safe_id(f"task_{task}-{part}"), str(error))
-            for identity in sorted(there | told.keys(), key=lambda name: (len(name), name)):
-                yield self._ref(task, identity, told.get(identity, {}))
+                    yield broken(safe_id(f"task_{task}-{name}"), str(error))
+            for identity in sorted(on_disk | entries.keys(), key=lambda name: (len(name), name)):
+                yield self._ref(task, identity, entries.get(identity, {}))
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """One episode."""
+        """Reads one episode."""
         location = location_of(ref)
         place = f"{location['task']}/{location['episode']}"
         path = inside(self._root, f"proprio_stats/{place}/proprio_stats.h5")
         with open_file(path) as file:
             proprio = Proprio(file, path)
-            times, states, actions = proprio.seconds(), proprio.states(), self._actions(proprio)
+            times, states, actions = proprio.seconds(), proprio.states(), _actions(proprio)
         folder = inside(self._root, f"observations/{place}")
         segments, bad = _segments(location["segments"], len(times))
         depth, why_not = _depth(folder / "depth", len(times))
-        untold = "" if location["told"] else "names no such episode, so it has no task"
-        notes = {"task_info": untold, "bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
+        unnamed = "" if location["told"] else "names no such episode, so it has no task"
+        notes = {"task_info": unnamed, "bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -97,25 +108,16 @@ class AgiBot:
         )
         return checked(episode, path)
 
-    @staticmethod
-    def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
-        hands = np.concatenate([proprio.command("end/position"), proprio.turns("action/end/orientation")], 1)
-        with np.errstate(over="ignore"):
-            hands = hands.astype(np.float32)
-        arms = np.concatenate([np.zeros_like(hands[:1]), hands[1:]]) if proprio.copied() else led_into(hands)
-        return np.concatenate([arms, led_into(proprio.grippers())], 1)
-
     def _tasks(self) -> list[str]:
         info, observations = self._root / "task_info", self._root / "observations"
-        if not is_there(info) and not is_there(observations):
+        if not exists(info) and not exists(observations):
             raise SourceError(f"{self._root}: has neither task_info nor observations; unpack the data set")
-        found = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
-        for part in _PARTS:
-            if is_there(self._root / part):
-                found |= {path.name for path in subfolders(self._root / part)}
-        if absent := [task for task in self._only if task not in found]:
-            raise SourceError(f"{self._root}: has no task {absent[0]}; it has {', '.join(sorted(found))}")
-        return sorted(self._only or found, key=lambda name: (len(name), name))
+        tasks = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
+        for folder in (self._root / name for name in _FOLDERS):
+            tasks |= {path.name for path in subfolders(folder)} if exists(folder) else set()
+        if absent := [task for task in self._only if task not in tasks]:
+            raise SourceError(f"{self._root}: has no task {absent[0]}; it has {', '.join(sorted(tasks))}")
+        return sorted(self._only or tasks, key=lambda name: (len(name), name))
 
     def _ref(self, task: str, identity: str, entry: dict[str, Any]) -> EpisodeRef:
         labels = entry.get("label_info")
@@ -123,7 +125,7 @@ class AgiBot:
         location = {
             "task": task,
             "episode": identity,
-            "told": bool(entry),
+            "told": bool(entry),  # the fingerprint depends on this name
             "name": str(entry.get("task_name") or ""),
             "scene": str(entry.get("init_scene_text") or ""),
             "segments": segments if isinstance(segments, list) else [],
@@ -134,16 +136,6 @@ class AgiBot:
         return EpisodeRef(safe_id(f"{task}-{identity}"), fingerprint(files, location), location)
 
 
-def open_source(path: Path, *, cameras: Sequence[str] = CAMERAS, tasks: Sequence[int | str] = ()) -> AgiBot:
-    """The data set at ``path``.
-
-    Args:
-        cameras: names of videos without ``_color.mp4``; an episode needs all of them.
-        tasks: their numbers; none: all.
-    """
-    return AgiBot(path, cameras, [str(task) for task in tasks])
-
-
 def _entries(path: Path) -> list[dict[str, Any]]:
     entries = read_json(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
@@ -151,8 +143,15 @@ def _entries(path: Path) -> list[dict[str, Any]]:
     return entries
 
 
+def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
+    hands = np.concatenate([proprio.command("end/position"), proprio.quaternions("action/end/orientation")], 1)
+    with np.errstate(over="ignore"):
+        hands = hands.astype(np.float32)
+    return np.concatenate([align_actions(hands, after=proprio.copied()), align_actions(proprio.grippers())], 1)
+
+
 def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list[Any]]:
-    """The data set's own segmentation within the episode, and the entries that are no part of it."""
+    """Returns the data set's own segmentation within the episode, and the entries that are no part of it."""
     good, bad = [], []
     for entry in entries:
         try:
@@ -166,13 +165,13 @@ def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list
 
 
 def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
-    """The head camera's depth maps in mm, or why they are left out."""
+    """Returns the head camera's depth maps in mm, or why they are left out."""
     try:
         names = [path.name for path in folder.iterdir()]
     except FileNotFoundError:
         return None, ""
     except OSError as error:
-        return None, f"{folder.name} cannot be listed ({error.strerror})"
+        return None, f"{folder.name} {reason(error)}"
     chosen = sorted(fnmatch.filter(names, "head_depth*.png"), key=lambda name: (len(name), name))
     paths = [media(folder / name) for name in chosen]
     if len(paths) != count:

@@ -1,41 +1,34 @@
 """BAIR robot pushing (``softmotion30_44k``): TFRecord files of 256 episodes of 30 steps, pictures as raw bytes.
 
 ``{train,test}/traj_{a}_to_{b}.tfrecords``; of step i ``{i}/image_main/encoded`` and ``{i}/image_aux1/encoded`` (64×64×3
-bytes, RGB), ``{i}/action`` (4) and ``{i}/endeffector_pos`` (3 m). The action of a step is what was done after its
-pictures. Neither times nor tasks are recorded.
+bytes, RGB), ``{i}/action`` (4) and ``{i}/endeffector_pos`` (3 m). The action of a step was done after its pictures.
+Neither times nor tasks are recorded.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
-from rsjax.ingest.actions import Layout, led_into
-from rsjax.ingest.episode import (
-    MAX_FPS,
-    Episode,
-    EpisodeError,
-    EpisodeRef,
-    SourceError,
-    checked,
-    fingerprint,
-    safe_id,
-)
-from rsjax.ingest.formats.tfrecord import Example, Span, read_payload, spans
+from rsjax.files import safe_id
+from rsjax.ingest.actions import Layout, align_actions
+from rsjax.ingest.episode import MAX_FPS, Episode, EpisodeError, EpisodeRef, SourceError, checked
+from rsjax.ingest.formats.files import near
+from rsjax.ingest.formats.tfrecord import Example, read_record, record_refs
+from rsjax.ingest.pictures import ArrayFrames
 
 SIDE = 64
 CAMERAS = {"main": "image_main", "aux1": "image_aux1"}
-_CURE = "fetch the file again or leave the episode out"
 
 
 def open_source(path: Path, fps: float = 5.0) -> "BairSource":
-    """The data set.
+    """Opens the data set.
 
     Args:
-        path: ``softmotion30_44k``, the folder that holds it, one of its two splits, or a single file.
+        path: ``softmotion30_44k``, the folder that contains it, one of its two splits, or a single file.
         fps: steps per second. The files do not say; only times in seconds depend on it.
 
     Raises:
@@ -45,11 +38,10 @@ def open_source(path: Path, fps: float = 5.0) -> "BairSource":
         raise SourceError(f"bair: option fps is {fps}; it must be above 0 and at most {MAX_FPS:g}")
     if path.is_file():
         return BairSource(path.parent, (path.name,), fps)
-    found = [file for depth in ("", "*/", "*/*/") for file in path.glob(f"{depth}*.tfrecords") if file.is_file()]
-    if not found:
+    once = {file.resolve(): file for file in reversed(near(path, "*.tfrecords"))}  # a link may lead back here
+    if not once:
         raise SourceError(f"{path}: no *.tfrecords here or two folders further down; give the folder softmotion30_44k")
-    once = {file.resolve(): file for file in reversed(found)}  # a link may lead back here
-    files = sorted(once.values(), key=lambda file: (str(file.parent), _first(file), file.name))
+    files = sorted(once.values(), key=lambda file: (str(file.parent), _trajectories(file.name)[0], file.name))
     return BairSource(path, tuple(str(file.relative_to(path)) for file in files), fps)
 
 
@@ -69,82 +61,43 @@ class BairSource:
     fps: float
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """From the heads of the records alone. What a damaged file lacks is one entry, which ``read`` refuses."""
+        """Lists every record of every file; one that cannot be read stands for what a damaged file lacks."""
         for file in self.files:
-            stem = safe_id(file.removesuffix(".tfrecords").replace("/", "-"))
-            for number, span in enumerate(_records(self.folder / file)):
-                where = {"file": file, "offset": span.offset, "length": span.length, "damage": span.damage}
-                marks = fingerprint((), file, span.length, span.crc, span.damage, self.fps)
-                yield EpisodeRef(f"{stem}-{number:03d}", marks, where)
+            first, last = _trajectories(Path(file).name)
+            ids = safe_id(file.removesuffix(".tfrecords").replace("/", "-")) + "-{:03d}"
+            expected = max(1, last - first + 1), "its name promises"
+            yield from record_refs(self.folder, file, ids, expected, self.fps)
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """One record."""
-        if ref.location["file"] not in self.files:
-            raise EpisodeError(f"{self.folder}: holds no file {ref.location['file']!r} of its own; list it again")
-        path = self.folder / ref.location["file"]
-        if ref.location["damage"]:
-            raise EpisodeError(f"{path}: {ref.location['damage']}; {_CURE}")
-        where = f"{path}: record {ref.id}"
-        example = Example(read_payload(path, ref.location["offset"], ref.location["length"]), where)
-        count = _steps(example)
+        """Reads one record."""
+        example = read_record(self.folder, ref)
+        count = _count_steps(example)
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
             task="",
             fps=self.fps,
             timestamps=np.arange(count) / self.fps,
-            actions=led_into(_rows(example, "action", count)),
+            actions=align_actions(_rows(example, "action", count)),
             states=_rows(example, "endeffector_pos", count),
             cameras={name: _frames(example, key, count) for name, key in CAMERAS.items()},
             meta={"source": "bair", "file": ref.location["file"], "actions": Layout().to_json(), "fps_assumed": True},
         )
-        return checked(episode, where)
+        return checked(episode, example.where)
 
 
-class RawFrames:
-    """Pictures as raw bytes in memory, as :class:`rsjax.ingest.episode.Frames`.
-
-    Args:
-        payloads: each frame's 64·64·3 bytes.
-    """
-
-    def __init__(self, payloads: Sequence[bytes]) -> None:
-        self._payloads = list(payloads)
-
-    def __len__(self) -> int:
-        return len(self._payloads)
-
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n 64 64 3"]:
-        """These pictures."""
-        chosen = b"".join(self._payloads[index] for index in indices)
-        return np.frombuffer(chosen, np.uint8).reshape(-1, SIDE, SIDE, 3)
-
-
-def _records(path: Path) -> list[Span]:
-    """The records of a file and, where a file without other damage lacks some, one entry that says so."""
-    found, promised = list(spans(path)), _promised(path.name)
-    if len(found) < promised and not (found and found[-1].damage):
-        damage = f"holds {len(found)} of the {promised} records that its name promises"
-        found.append(Span(0, 0, damage=damage))
-    return found
-
-
-def _promised(name: str) -> int:
-    """How many records a file has by its name, ``traj_0_to_255``; one at least."""
+def _trajectories(name: str) -> tuple[int, int]:
+    """Returns the first and last trajectory that a file's name promises; -1 if it promises none."""
     match = re.match(r"traj_(\d+)_to_(\d+)", name)
-    return max(1, int(match[2]) - int(match[1]) + 1) if match else 1
+    return (int(match[1]), int(match[2])) if match else (-1, -1)
 
 
-def _steps(example: Example) -> int:
-    """How many steps there are, from 0 on, without a gap.
-
-    Raises:
-        EpisodeError: a step is missing, or there are none.
-    """
+def _count_steps(example: Example) -> int:
+    """Returns the number of steps; :class:`EpisodeError` if there are none or one is missing."""
     steps = {int(name.partition("/")[0]) for name in example.names() if re.fullmatch(r"\d+/.+", name)}
-    lacking = sorted(set(range(len(steps))) - steps)
-    if not steps or lacking:
-        raise EpisodeError(f"{example.where}: has no step {lacking[0] if lacking else 0}; {_CURE}")
+    lacking = sorted(set(range(max(len(steps), 1))) - steps)
+    if lacking:
+        raise EpisodeError.at(example.where, f"has no step {lacking[0]}")
     return len(steps)
 
 
@@ -152,26 +105,15 @@ def _rows(example: Example, key: str, count: int) -> Float32[np.ndarray, "N n"]:
     rows = [example.numbers(f"{step}/{key}", 1) for step in range(count)]
     for step, row in enumerate(rows):
         if row.shape != rows[0].shape:
-            raise EpisodeError(
-                f"{example.where}: {step}/{key} has {row.size} values, that of step 0 {rows[0].size}; {_CURE}"
-            )
+            problem = f"{step}/{key} has {row.size} values, that of step 0 {rows[0].size}"
+            raise EpisodeError.at(example.where, problem)
     return np.concatenate(rows)
 
 
-def _frames(example: Example, key: str, count: int) -> RawFrames:
+def _frames(example: Example, key: str, count: int) -> ArrayFrames:
     payloads = []
-    for step in range(count):
-        name = f"{step}/{key}/encoded"
-        payload = b"".join(example.blobs(name))
-        if len(payload) != SIDE * SIDE * 3:
-            raise EpisodeError(
-                f"{example.where}: {name} has {len(payload)} bytes, should have {SIDE * SIDE * 3}; {_CURE}"
-            )
-        payloads.append(payload)
-    return RawFrames(payloads)
-
-
-def _first(file: Path) -> int:
-    """The trajectory that a file's name begins with."""
-    match = re.match(r"traj_(\d+)_to_", file.name)
-    return int(match[1]) if match else -1
+    for name in (f"{step}/{key}/encoded" for step in range(count)):
+        payloads.append(b"".join(example.blobs(name)))
+        if (size := len(payloads[-1])) != SIDE * SIDE * 3:
+            raise EpisodeError.at(example.where, f"{name} has {size} bytes, should have {SIDE * SIDE * 3}")
+    return ArrayFrames(np.frombuffer(b"".join(payloads), np.uint8).reshape(count, SIDE, SIDE, 3))

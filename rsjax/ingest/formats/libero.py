@@ -1,7 +1,7 @@
 """LIBERO HDF5 files: robomimic's layout, one file a task, with two traps.
 
 Pictures are upside down, by half a turn, and ``obs[t]`` was recorded *after* ``actions[t]``: that action led into it.
-Tried on files of the documented layout, made by the tests.
+Tested on files of the documented layout that the tests write.
 """
 
 from pathlib import Path
@@ -14,5 +14,5 @@ LIBERO = Convention(
 
 
 def open_source(path: Path, filter: str = "", depth: bool = False) -> DemoSource:
-    """A LIBERO data set. Arguments and errors as in :func:`rsjax.ingest.formats.robomimic.open_source`."""
+    """Opens a LIBERO data set. Arguments and errors as in :func:`rsjax.ingest.formats.robomimic.open_source`."""
     return open_demos(path, LIBERO, filter, depth)

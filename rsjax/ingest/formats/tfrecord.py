@@ -1,7 +1,7 @@
 """TFRecord files and the ``tf.train.Example`` messages in them, without TensorFlow.
 
 A record is: its length (uint64), a checksum of that, the payload, a checksum of that; all little-endian. Checksums are
-CRC-32C, rotated and offset ("masked"). The library that Grain brings reads such files but checks neither.
+CRC-32C, rotated and offset ("masked"). The reader that Grain brings checks neither.
 """
 
 import struct
@@ -11,17 +11,43 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
 
+import google_crc32c
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 from google.protobuf.message import DecodeError
-from jaxtyping import Float32, UInt32
+from jaxtyping import Float32
 
-from rsjax.ingest.episode import EpisodeError, plain
+from rsjax.ingest.episode import FETCH_AGAIN, EpisodeError, EpisodeRef, fingerprint, reason, regular
+from rsjax.ingest.formats.files import broken, inside, location_of
 
 _HEAD, _FOOT = 12, 4  # bytes around a payload
-_POLYNOMIAL = 0x82F63B78  # of CRC-32C, bits reversed
-_BLOCK = 256  # bytes that one lane of the checksum takes
-_CURE = "fetch the file again or leave the episode out"
+_PROTO = """
+name: "rsjax/example.proto" package: "tensorflow" syntax: "proto3"
+message_type { name: "BytesList" field { name: "value" number: 1 type: TYPE_BYTES label: LABEL_REPEATED } }
+message_type { name: "FloatList" field { name: "value" number: 1 type: TYPE_FLOAT label: LABEL_REPEATED } }
+message_type { name: "Int64List" field { name: "value" number: 1 type: TYPE_INT64 label: LABEL_REPEATED } }
+message_type {
+  name: "Feature"
+  oneof_decl { name: "kind" }
+  field { name: "bytes_list" number: 1 type_name: ".tensorflow.BytesList" label: LABEL_OPTIONAL oneof_index: 0 }
+  field { name: "float_list" number: 2 type_name: ".tensorflow.FloatList" label: LABEL_OPTIONAL oneof_index: 0 }
+  field { name: "int64_list" number: 3 type_name: ".tensorflow.Int64List" label: LABEL_OPTIONAL oneof_index: 0 }
+}
+message_type {
+  name: "Features"
+  nested_type {
+    name: "FeatureEntry"
+    options { map_entry: true }
+    field { name: "key" number: 1 type: TYPE_STRING label: LABEL_OPTIONAL }
+    field { name: "value" number: 2 type_name: ".tensorflow.Feature" label: LABEL_OPTIONAL }
+  }
+  field { name: "feature" number: 1 type_name: ".tensorflow.Features.FeatureEntry" label: LABEL_REPEATED }
+}
+message_type {
+  name: "Example"
+  field { name: "features" number: 1 type_name: ".tensorflow.Features" label: LABEL_OPTIONAL }
+}
+"""
 
 
 @dataclass(frozen=True)
@@ -32,7 +58,7 @@ class Span:
         offset: bytes to its head.
         length: bytes of its payload.
         crc: the payload's masked checksum, as it is written in the file.
-        damage: why neither this record nor what follows it in the file can be read; "" where it can.
+        damage: why neither this record nor what follows it in the file can be read; "" if it can.
     """
 
     offset: int
@@ -42,12 +68,12 @@ class Span:
 
 
 def spans(path: Path) -> Iterator[Span]:
-    """Every record of a file, in order, from the heads alone. Where the file is damaged, the last one says how."""
+    """Yields every record of a file, in order, from the heads alone. If the file is damaged, the last one says how."""
     try:
-        with plain(path).open("rb") as file:
+        with regular(path).open("rb") as file:
             yield from _spans(file, path.stat().st_size)
     except OSError as error:
-        yield Span(0, 0, damage=f"cannot be read ({error.strerror})")
+        yield Span(0, 0, damage=reason(error))
 
 
 def _spans(file: IO[bytes], size: int) -> Iterator[Span]:
@@ -71,23 +97,52 @@ def _spans(file: IO[bytes], size: int) -> Iterator[Span]:
         offset = end
 
 
+def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], settings: Any) -> Iterator[EpisodeRef]:
+    """Lists the records of a file as episodes; one that cannot be read stands for what a damaged file lacks.
+
+    Args:
+        root: of the data set.
+        file: relative to ``root``.
+        ids: template of the episodes' ids, in which their number is filled in.
+        expected: how many records there should be, and what says so.
+        settings: what else the episodes depend on, for their fingerprints.
+    """
+    records = list(spans(root / file))
+    if len(records) < expected[0] and not (records and records[-1].damage):
+        records.append(Span(0, 0, damage=f"has {len(records)} of the {expected[0]} records that {expected[1]}"))
+    for number, span in enumerate(records):
+        identity = ids.format(number)
+        if span.damage:
+            yield broken(identity, f"{root / file}: {span.damage}; {FETCH_AGAIN}")
+            continue
+        mark = fingerprint((), file, span.length, span.crc, span.damage, settings)
+        yield EpisodeRef(identity, mark, {"file": file, "offset": span.offset, "length": span.length})
+
+
+def read_record(root: Path, ref: EpisodeRef) -> "Example":
+    """Reads the record of a reference that :func:`record_refs` made; :class:`EpisodeError` if it is damaged."""
+    location = location_of(ref)
+    path = inside(root, location["file"])
+    return Example(read_payload(path, location["offset"], location["length"]), f"{path}: record {ref.id}")
+
+
 def read_payload(path: Path, offset: int, length: int) -> bytes:
-    """The payload of the record that :func:`spans` found there.
+    """Returns the payload of a record whose place :func:`spans` gave.
 
     Raises:
         EpisodeError: the file cannot be read, has changed, or its checksum is wrong.
     """
     try:
-        with plain(path).open("rb") as file:
+        with regular(path).open("rb") as file:
             file.seek(offset)
             record = file.read(_HEAD + length + _FOOT)
     except OSError as error:
-        raise EpisodeError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from error
+        raise EpisodeError.at(path, reason(error)) from error
     if len(record) < _HEAD + length + _FOOT or int.from_bytes(record[:8], "little") != length:
         raise EpisodeError(f"{path}: no record of {length} bytes at byte {offset}: the file has changed; list it again")
     payload = record[_HEAD:-_FOOT]
     if masked_crc(payload) != int.from_bytes(record[-_FOOT:], "little"):
-        raise EpisodeError(f"{path}: the checksum of the record at byte {offset} is wrong; {_CURE}")
+        raise EpisodeError.at(path, f"the checksum of the record at byte {offset} is wrong")
     return payload
 
 
@@ -107,7 +162,7 @@ class Example:
         try:
             self._features = message_class().FromString(payload).features.feature
         except DecodeError as error:
-            raise EpisodeError(f"{where}: no tf.train.Example ({error}); {_CURE}") from error
+            raise EpisodeError.at(where, f"no tf.train.Example ({error})") from error
 
     def __contains__(self, name: str) -> bool:
         return name in self._features
@@ -116,126 +171,48 @@ class Example:
         return sorted(self._features)
 
     def numbers(self, name: str, rows: int) -> Float32[np.ndarray, "T n"]:
-        """A feature of floats or integers, cut into this many rows.
+        """Returns a feature of floats or integers, cut into this many rows.
 
         Raises:
             EpisodeError: there is no such feature, it has other values, or they do not fill the rows.
         """
         values = self._values(name, ("float_list", "int64_list"))
         if rows == 0 or not len(values) or len(values) % rows:
-            raise EpisodeError(f"{self.where}: {name} has {len(values)} values for {rows} steps; {_CURE}")
+            raise EpisodeError.at(self.where, f"{name} has {len(values)} values for {rows} steps")
         return np.array(values, np.float32).reshape(rows, -1)
 
     def blobs(self, name: str) -> list[bytes]:
-        """A feature of byte strings. Raises as :meth:`numbers`."""
+        """Returns a feature of byte strings. Raises as :meth:`numbers`."""
         return list(self._values(name, ("bytes_list",)))
 
-    def holds_bytes(self, name: str) -> bool:
+    def is_bytes(self, name: str) -> bool:
         """Whether a feature's values are byte strings."""
         return self._features[name].WhichOneof("kind") == "bytes_list"
 
     def plain(self, name: str) -> list[str | int | float]:
-        """A feature's values of whatever kind, JSON-ready; byte strings as text."""
+        """Returns a feature's values of whatever kind, JSON-ready; byte strings as text."""
         values = self._values(name, ("bytes_list", "float_list", "int64_list"))
         return [value.decode("utf-8", "replace") if isinstance(value, bytes) else value for value in values]
 
     def _values(self, name: str, kinds: tuple[str, ...]) -> Any:
         if name not in self._features:
-            raise EpisodeError(f"{self.where}: has no {name}; check the key map, or leave the episode out")
+            raise EpisodeError.at(self.where, f"has no {name}", "check the key map, or leave the episode out")
         feature = self._features[name]
         kind = feature.WhichOneof("kind")
         if kind not in kinds:
-            raise EpisodeError(f"{self.where}: {name} is {kind or 'empty'}, should be {' or '.join(kinds)}; {_CURE}")
+            raise EpisodeError.at(self.where, f"{name} is {kind or 'empty'}, should be {' or '.join(kinds)}")
         return getattr(feature, kind).value
 
 
 @lru_cache(maxsize=1)
 def message_class() -> Any:
-    """The message ``tf.train.Example``. In a pool of its own, so that TensorFlow may be imported besides."""
-    kind = descriptor_pb2.FieldDescriptorProto
-    file = descriptor_pb2.FileDescriptorProto(name="rsjax/example.proto", package="tensorflow", syntax="proto3")
-    lists = (("BytesList", kind.TYPE_BYTES), ("FloatList", kind.TYPE_FLOAT), ("Int64List", kind.TYPE_INT64))
-    for name, scalar in lists:
-        file.message_type.add(name=name).field.add(name="value", number=1, type=scalar, label=kind.LABEL_REPEATED)
-    feature = file.message_type.add(name="Feature")
-    feature.oneof_decl.add(name="kind")
-    for number, name in enumerate(("bytes_list", "float_list", "int64_list"), 1):
-        field = _message_field(feature, name, number, lists[number - 1][0])
-        field.oneof_index = 0
-    features = file.message_type.add(name="Features")
-    entry = features.nested_type.add(name="FeatureEntry")
-    entry.options.map_entry = True
-    entry.field.add(name="key", number=1, type=kind.TYPE_STRING, label=kind.LABEL_OPTIONAL)
-    _message_field(entry, "value", 2, "Feature")
-    _message_field(features, "feature", 1, "Features.FeatureEntry").label = kind.LABEL_REPEATED
-    _message_field(file.message_type.add(name="Example"), "features", 1, "Features")
+    """Returns the message class ``tf.train.Example``, of a pool of its own so that TensorFlow can be imported too."""
     pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
+    pool.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("tensorflow.Example"))
 
 
-def _message_field(message: Any, name: str, number: int, of: str) -> Any:
-    kind = descriptor_pb2.FieldDescriptorProto
-    return message.field.add(
-        name=name, number=number, type=kind.TYPE_MESSAGE, label=kind.LABEL_OPTIONAL, type_name=f".tensorflow.{of}"
-    )
-
-
 def masked_crc(data: bytes) -> int:
-    """The checksum as TFRecord files hold it."""
-    crc = crc32c(data)
+    """Returns the checksum as TFRecord files store it."""
+    crc = google_crc32c.value(data)
     return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-def crc32c(data: bytes) -> int:
-    """CRC-32C (Castagnoli), in numpy: many blocks at once, whose checksums are then joined in pairs.
-
-    A checksum is linear in its data but for its start value, which equals inverting the first four bytes; leading
-    zeros change nothing. So data is filled up to a power of two of blocks.
-    """
-    if len(data) < 4:
-        short = 0xFFFFFFFF
-        for byte in data:
-            short = int(_table()[(short ^ byte) & 0xFF]) ^ (short >> 8)
-        return short ^ 0xFFFFFFFF
-    lanes = 1 << max(0, -(-len(data) // _BLOCK) - 1).bit_length()
-    filled = np.zeros(lanes * _BLOCK, np.uint8)
-    filled[-len(data) :] = np.frombuffer(data, np.uint8)
-    filled[-len(data) :][:4] ^= 0xFF
-    register = _feed(np.zeros(lanes, np.uint32), np.ascontiguousarray(filled.reshape(lanes, _BLOCK).T))
-    level = 0
-    while len(register) > 1:
-        register = _apply(_advance(level), register[0::2]) ^ register[1::2]
-        level += 1
-    return int(register[0]) ^ 0xFFFFFFFF
-
-
-@lru_cache(maxsize=1)
-def _table() -> UInt32[np.ndarray, " 256"]:
-    table = np.arange(256, dtype=np.uint32)
-    for _ in range(8):
-        table = np.where(table & 1, (table >> 1) ^ np.uint32(_POLYNOMIAL), table >> 1)
-    return table
-
-
-def _feed(register: UInt32[np.ndarray, " n"], columns: np.ndarray) -> UInt32[np.ndarray, " n"]:
-    """The registers after one byte of each column after the other."""
-    table = _table()
-    for column in columns:
-        register = table[(register ^ column) & 0xFF] ^ (register >> 8)
-    return register
-
-
-@lru_cache(maxsize=64)
-def _advance(level: int) -> UInt32[np.ndarray, "4 256"]:
-    """What ``2 ** level`` blocks of zeros make of each byte of a register."""
-    registers = (np.arange(256, dtype=np.uint32) << np.array([[0], [8], [16], [24]], np.uint32)).reshape(-1)
-    if level == 0:
-        return _feed(registers, np.zeros((_BLOCK, 1), np.uint8)).reshape(4, 256)
-    half = _advance(level - 1)
-    return _apply(half, _apply(half, registers)).reshape(4, 256)
-
-
-def _apply(tables: UInt32[np.ndarray, "4 256"], register: UInt32[np.ndarray, " n"]) -> UInt32[np.ndarray, " n"]:
-    first, second, third, fourth = (tables[place][(register >> (8 * place)) & 0xFF] for place in range(4))
-    return first ^ second ^ third ^ fourth

@@ -89,7 +89,7 @@ def test_a_file_that_ends_between_two_records_is_told_by_its_name(tmp_path: Path
     source = open_source("bair", tmp_path)
     *good, bad = source.episodes()
     assert len(good) == kept
-    with pytest.raises(EpisodeError, match=f"holds {kept} of the 2 records that its name promises"):
+    with pytest.raises(EpisodeError, match=f"has {kept} of the 2 records that its name promises"):
         source.read(bad)
 
 

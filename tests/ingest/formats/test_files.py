@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from rsjax.errors import UserError
 from rsjax.ingest.episode import EpisodeError, SourceError, fingerprint
-from rsjax.ingest.formats import FORMATS, keymap, open_source
+from rsjax.ingest.formats import FORMATS, open_source
 from rsjax.ingest.formats.files import (
     MAX_CELLS,
-    filled,
+    fill,
     inside,
     json_lines,
     load_npy,
@@ -25,8 +25,9 @@ from rsjax.ingest.formats.files import (
     read_json,
     seconds,
 )
-from rsjax.ingest.formats.folder_parts import read_table
+from rsjax.ingest.formats.folder_files import read_table
 from rsjax.ingest.formats.hdf5 import open_file
+from rsjax.ingest.formats.keymap import key_map
 from rsjax.ingest.formats.tfrecord import read_payload, spans
 
 ROOT = Path("/data/set")
@@ -45,17 +46,17 @@ def test_no_name_leads_out(name: str) -> None:
 @given(st.text(alphabet="{}:!.0d3[]ab", max_size=12))
 def test_templates_are_filled_or_refused(template: str) -> None:
     try:
-        made = filled(template, a=7, b="x")
+        made = fill(template, a=7, b="x")
     except EpisodeError:
         return
     assert len(made) < 200
 
 
 def test_templates() -> None:
-    assert filled("c-{a:03d}/{b}_{a:06d}.mp4", a=7, b="top") == "c-007/top_000007.mp4"
+    assert fill("c-{a:03d}/{b}_{a:06d}.mp4", a=7, b="top") == "c-007/top_000007.mp4"
     for template in ("{a.__class__}", "{a!r}", "{a:>9}", "{c}", "{", "{a:0100d}", "{}", "{b:3d}"):
         with pytest.raises(EpisodeError, match="path template"):
-            filled(template, a=7, b="top")
+            fill(template, a=7, b="top")
 
 
 def test_bad_lines_do_not_end_the_file(tmp_path: Path) -> None:
@@ -83,10 +84,10 @@ def test_unknown_formats_are_told(tmp_path: Path) -> None:
         ("lerobot", {"held": [True]}, r"option held is \[True\], should be a list of whole numbers$"),
         ("lerobot", {"kind": "relative"}, "option kind is 'relative', should be absolute or delta$"),
         ("folder", {"fps": "fast"}, "option fps is 'fast', should be a number$"),
-        ("folder", {"rows": "after"}, "option rows is 'after', should be given or led$"),
+        ("folder", {"after": "yes"}, "option after is 'yes', should be true or false$"),
         ("robomimic", {"depth": 1}, "option depth is 1, should be true or false$"),
         ("rlds", {"split": 1}, "option split is 1, should be text$"),
-        ("folder", {"rate": 3}, "no option 'rate'; it has task, fps, rows, kind, held, quaternions"),
+        ("folder", {"xyz": 3}, "no option 'xyz'; it has task, fps, after, kind, held, quaternions"),
     ],
 )
 def test_options_are_checked(tmp_path: Path, name: str, options: dict[str, Any], message: str) -> None:
@@ -133,8 +134,7 @@ def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> 
         lambda path: list(parquet_rows(path, ["x"])),
         lambda path: read_payload(path, 0, 8),
         lambda path: open_file(path).__enter__(),
-        keymap.read_json,
-        lambda path: keymap.key_map(str(path), "", path),
+        lambda path: key_map(str(path), "", path),
         read_table,
         media,
     ],

@@ -97,7 +97,7 @@ def test_flat_episodes_with_any_table(tmp_path: Path, kind: str) -> None:
 
 def test_rows_that_led_into_their_frame(tmp_path: Path) -> None:
     write_episode(tmp_path)
-    (tmp_path / "dataset.json").write_text('{"rows": "led", "task": "go"}')
+    (tmp_path / "dataset.json").write_text('{"after": true, "task": "go"}')
     (episode,) = read_all(tmp_path)
     np.testing.assert_array_equal(episode.actions[1:], ACTIONS[1:])
     assert not episode.actions[0].any()
@@ -150,7 +150,7 @@ def test_a_wrong_table_is_named(tmp_path: Path, table: str, message: str) -> Non
     write_episode(tmp_path)
     (tmp_path / "one/actions.csv").write_text(table)
     if "nan" in table:  # the last row leads nowhere unless it says so
-        (tmp_path / "dataset.json").write_text('{"rows": "led"}')
+        (tmp_path / "dataset.json").write_text('{"after": true}')
     source = open_source("folder", tmp_path)
     with pytest.raises(EpisodeError, match=message):
         source.read(next(source.episodes()))
@@ -180,7 +180,7 @@ def test_arrays_that_are_none(tmp_path: Path) -> None:
     (place / "actions.csv").unlink()
     for array, message in (
         (np.array([{}]), "actions.npy: cannot be read"),
-        (np.array(["left"]), "holds no table of numbers"),
+        (np.array(["left"]), "no table of numbers"),
         (np.zeros(3), "shape \\(3,\\), should be"),
     ):
         np.save(place / "actions.npy", array)
@@ -238,9 +238,9 @@ def test_a_rate_that_no_camera_has_is_told_before_anything_is_read(tmp_path: Pat
 
 def test_settings_that_cannot_be(tmp_path: Path) -> None:
     for text, message in (
-        ('{"row": "led"}', "no field 'row'; did you mean 'rows'"),
-        ('{"rows": "after"}', "rows is 'after'"),
-        ('{"rows": null}', "rows is None, should be given or led"),
+        ('{"afer": true}', "no field 'afer'; did you mean 'after'"),
+        ('{"kind": "relative"}', "kind is 'relative', should be absolute or delta"),
+        ('{"after": null}', "after is None, should be true or false"),
         ('{"held": "2"}', "held is '2', should be a list of whole numbers"),
         ('{"held": [true]}', "held is .True., should be a list of whole numbers"),
         ('{"fps": true}', "fps is True, should be a number"),

@@ -6,7 +6,7 @@ import pytest
 
 from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.formats import open_source
-from rsjax.ingest.formats.hdf5 import H5Depths, H5Frames, open_file, own, rows
+from rsjax.ingest.formats.hdf5 import H5Depths, H5Frames, member, open_file, rows
 from tests.ingest.formats.toy_demos import demo, write_demos
 
 
@@ -22,7 +22,7 @@ def test_rows_are_float32_with_a_row_for_each_frame(path: Path) -> None:
     with open_file(path) as file:
         np.testing.assert_array_equal(rows(file, "rows", path), [[0, 1], [2, 3], [4, 5]])
         np.testing.assert_array_equal(rows(file["group"], "inner", path), [[0], [1], [2]])
-        assert own(file, "nothing", path) is None
+        assert member(file, "nothing", path) is None
 
 
 def link_into_another_file(path: Path) -> None:

@@ -129,7 +129,7 @@ def test_a_table_without_encoded_pictures_is_told(tmp_path: Path) -> None:
         pq.write_table(pa.table(rows(1, 6) | {"picture": cells}), path)
         source = open_source("lerobot", root)
         frames = source.read(list(source.episodes())[1]).cameras["picture"]
-        with pytest.raises(EpisodeError, match=r"000001.parquet: picture of row 2: holds no encoded picture"):
+        with pytest.raises(EpisodeError, match=r"000001.parquet: picture of row 2: has no encoded picture"):
             frames.read([2])
 
 

@@ -1,0 +1,169 @@
+"""The files of one episode in a folder of videos: its cameras, its table and its JSON."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+from jaxtyping import Float32
+
+from rsjax.ingest.episode import LEAVE_OUT, MAX_FPS, Depths, EpisodeError, Frames, Segment, SourceError, reason, regular
+from rsjax.ingest.formats.files import exists, load_npy, matrix, media, parquet_columns, read_json
+from rsjax.ingest.pictures import DepthFiles, PictureFiles
+from rsjax.ingest.video import VideoFrames
+
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+PICTURES = (".png", ".jpg", ".jpeg")
+TABLES = (".csv", ".parquet", ".npy")
+_DEPTH = ".depth"
+_MOST_BYTES = 2**28  # of a table that is text
+
+
+@dataclass(frozen=True)
+class Description:
+    """What an episode's JSON says; the defaults if there is none.
+
+    Attributes:
+        path: of the JSON.
+        task: None: not named.
+        fps: 0: not named.
+        entries: its segments.
+    """
+
+    path: Path
+    task: str | None = None
+    fps: float = 0.0
+    entries: tuple[Any, ...] = ()
+
+    def segments(self, count: int) -> tuple[Segment, ...]:
+        """Returns the segments in the order of their starts.
+
+        Raises:
+            EpisodeError: one is not within ``count`` frames, or a field is wrong.
+        """
+        segments = []
+        for place, entry in enumerate(self.entries):
+            try:
+                text, skill = str(entry["text"]), str(entry.get("skill") or "")
+                segment = Segment(int(entry["start"]), int(entry["end"]), text, skill)
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                problem = f"segment {place}: field missing or wrong ({error})"
+                raise EpisodeError.at(self.path, problem, "mend it") from error
+            if not 0 <= segment.start < segment.end <= count:
+                problem = f"segment {place} is {segment.start} … {segment.end}, there are {count} frames"
+                raise EpisodeError.at(self.path, problem, "mend it")
+            segments.append(segment)
+        return tuple(sorted(segments, key=lambda segment: segment.start))
+
+
+def read_description(path: Path) -> Description:
+    """Reads an episode's JSON; :class:`EpisodeError` if the file is damaged or a field is wrong."""
+    try:
+        values = read_json(path) if exists(path) else {}
+    except SourceError as error:
+        raise EpisodeError(str(error)) from error
+    try:
+        fps, task = float(values.get("fps") or 0), values.get("task")
+        if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
+            raise ValueError(f"fps {fps}, task {task!r}")
+        return Description(path, task, fps, tuple(values.get("segments") or ()))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise EpisodeError.at(path, f"task, fps or segments are wrong ({error})", "mend the file") from error
+
+
+def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], dict[str, Depths]]:
+    """Returns pictures and depth maps by camera; the camera of a flat episode is called ``main``."""
+    cameras: dict[str, Frames] = {}
+    depth: dict[str, Depths] = {}
+    frames: Frames
+    for path in files:
+        if path.suffix.lower() in VIDEOS:
+            name, frames = "main" if flat else path.stem, VideoFrames(media(path))
+        elif path.is_dir() and path.suffix == _DEPTH:
+            depth[path.stem] = DepthFiles(_pictures(path, (".png",)))
+            continue
+        elif path.is_dir() and (pictures := _pictures(path, PICTURES)):
+            name, frames = path.name, PictureFiles(pictures)
+        else:
+            continue
+        if name in cameras:
+            raise EpisodeError.at(path, f"a second camera {name!r}", "rename or remove one")
+        cameras[name] = frames
+    for name in depth:
+        if name not in cameras:
+            where = f"{files[0].parent / name}{_DEPTH}"
+            raise EpisodeError.at(where, "depth of a camera that is not there", "rename it")
+    return cameras, depth
+
+
+def find_table(files: Sequence[Path], place: Path) -> Path:
+    """Returns the episode's table; :class:`EpisodeError` if there is none, or more than one."""
+    tables = [path for path in files if path.suffix.lower() in TABLES]
+    if len(tables) != 1:
+        names = ", ".join(path.name for path in tables) or "none"
+        raise EpisodeError(f"{place}: needs one table of actions ({', '.join(TABLES)}), there is {names}")
+    return tables[0]
+
+
+def read_table(path: Path) -> pa.Table:
+    """Reads the table; a ``.npy`` becomes a column ``action`` of lists.
+
+    Raises:
+        EpisodeError: it is damaged, or its columns have no names.
+    """
+    if path.suffix.lower() == ".npy":
+        array = load_npy(path)
+        if array.ndim != 2 or not array.size:
+            problem = f"shape {array.shape}, should be (frames, action dimensions)"
+            raise EpisodeError.at(path, problem, "save it again")
+        return pa.table({"action": array.astype(np.float32).tolist()})
+    if path.suffix.lower() == ".parquet":
+        return parquet_columns(path)
+    try:
+        if (size := path.stat().st_size) > _MOST_BYTES:
+            raise ValueError(f"{size} bytes are more than an episode's table can have")
+        with regular(path).open("rb") as file:
+            table = pa_csv.read_csv(file)
+        names = table.column_names  # decoded here, not before
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise EpisodeError.at(path, reason(error), "save it again") from error
+    if len(set(names)) < len(names) or all(map(_is_number, names)):
+        raise EpisodeError(f"{path}: its first line must name the columns, each once; it has {names}")
+    return table
+
+
+def action_columns(table: pa.Table) -> list[str]:
+    """Returns the columns that begin with ``action``; if none does, all but time and states."""
+    named = [name for name in table.column_names if name.startswith("action")]
+    return named or [name for name in table.column_names if name != "timestamp" and not name.startswith("state")]
+
+
+def state_columns(table: pa.Table) -> list[str]:
+    """Returns the columns that begin with ``state``."""
+    return [name for name in table.column_names if name.startswith("state")]
+
+
+def columns(table: pa.Table, names: Sequence[str], path: Path) -> Float32[np.ndarray, "N A"]:
+    """Returns columns side by side; :class:`EpisodeError` if there are none or they are not numbers."""
+    if not names:
+        raise EpisodeError(f"{path}: has no column of actions; it has {', '.join(table.column_names)}")
+    return np.concatenate([matrix(table, name, path) for name in names], 1)
+
+
+def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
+    try:
+        paths = [media(path) for path in folder.iterdir() if path.suffix.lower() in endings]
+    except OSError as error:
+        raise EpisodeError.at(folder, f"cannot be listed ({error.strerror})", LEAVE_OUT) from error
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
