@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
@@ -12,9 +12,6 @@ from tyro.conf import Positional, arg
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
 from rsjax.runtime import tune_process
-
-if TYPE_CHECKING:
-    from rsjax.data.store import Store
 
 PROG = "python -m experiments.store"
 USAGE = (
@@ -71,14 +68,14 @@ def main() -> None:
         print(f"{store.path.absolute()}: {', '.join(f'{name} {count}' for name, count in store.counts().items())}")
 
 
-def merge(options: Merge) -> "list[Store]":
+def merge(options: Merge) -> list[Any]:
     """Returns the merged store."""
     from rsjax.data.merge import merge
 
     return [merge(options.stores, options.out)]
 
 
-def split(options: Split) -> "list[Store]":
+def split(options: Split) -> list[Any]:
     """Returns the parts."""
     from rsjax.data.merge import by_label, into_parts, split
 
@@ -89,8 +86,8 @@ def split(options: Split) -> "list[Store]":
     return list(split(place, parts).values())
 
 
-def tokenize(options: Tokenize) -> "list[Store]":
-    """Returns the store of tokens."""
+def tokenize(options: Tokenize) -> list[Any]:
+    """Returns the store of tokens, which lies beside the clips."""
     tune_process()
     from rsjax.data.store import open_store
     from rsjax.pipeline.generator import load_config, load_tokenizer
@@ -101,7 +98,7 @@ def tokenize(options: Tokenize) -> "list[Store]":
     return [open_store(tokenize_store(clips, config, tokenizer, options.store / "tokens"))]
 
 
-ACTIONS: dict[str, tuple[Any, str, Callable[[Any], "list[Store]"]]] = {
+ACTIONS: dict[str, tuple[Any, str, Callable[[Any], list[Any]]]] = {
     "merge": (Merge(), "Merges stores into one.", merge),
     "split": (Split(), "Splits a store into several.", split),
     "tokenize": (Tokenize(), "Tokenizes every clip of a store; the tokens are kept beside the clips.", tokenize),

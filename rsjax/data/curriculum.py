@@ -11,7 +11,7 @@ import numpy as np
 from rsjax.config import LoopConfig, PartConfig, StageConfig
 from rsjax.config.stages import format_stage
 from rsjax.data.labels import Labels
-from rsjax.data.loader import Loader, staged_batches
+from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.store import Store, StoreError, open_store
@@ -19,10 +19,6 @@ from rsjax.data.store import Store, StoreError, open_store
 LABELS = ("task", "difficulty")
 SPLIT = "train"
 EVERYTHING = StageConfig()
-
-
-class CurriculumError(StoreError):
-    """Stages do not fit the data. The message names the component and what the store has."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class LoaderFactory:
     def __call__(self, state: dict[str, Any] | None) -> Loader:
         loop = self.loop
         listed = Quarantine(self.quarantine, _distinct(self.stages), loop.max_damaged)
-        return staged_batches(self.stages, loop.batch_size, loop.seed, listed, workers=loop.workers, state=state)
+        return Loader(self.stages, loop.batch_size, loop.seed, listed, workers=loop.workers, state=state)
 
     def replay(self, state: dict[str, Any]) -> Arrays:
         """Returns the whole batch, over all processes, that a loader in this state gives next."""
@@ -105,7 +101,7 @@ def choose(part: PartConfig, store: Store) -> np.ndarray | None:
     """Returns the numbers of the records that pass a component's patterns; None if every record does.
 
     Raises:
-        CurriculumError: none passes; the message lists the store's tasks and difficulties.
+        StoreError: none passes; the message lists the store's tasks and difficulties.
     """
     patterns = {"task": part.tasks, "difficulty": part.difficulties}
     if all("*" in allowed for allowed in patterns.values()):
@@ -113,7 +109,7 @@ def choose(part: PartConfig, store: Store) -> np.ndarray | None:
     labels = store.labels(SPLIT)
     chosen = np.flatnonzero(labels.matching(patterns))
     if not len(chosen):
-        raise CurriculumError(
+        raise StoreError(
             f"{store.path}: no {SPLIT} record has a difficulty like {' or '.join(part.difficulties)} and a task like "
             f"{' or '.join(part.tasks)}; it has {_listed(labels)}: change the stage's patterns"
         )
@@ -139,7 +135,7 @@ def _resolve(
 
 
 def _check_mixable(store: Store, component: MixtureComponent, own: Store, own_component: MixtureComponent) -> None:
-    """Raises :class:`CurriculumError` where batches cannot hold records of both stores."""
+    """Raises :class:`StoreError` where batches cannot hold records of both stores."""
     theirs, ours = ({name: one.manifest.get(name) for name in ("kind", "tokenizer")} for one in (store, own))
     _require_alike(store, own, theirs, ours, needs="records of one kind, made with the same tokenizer")
     _require_alike(store, own, _shapes(component), _shapes(own_component), needs="clips of one length and size")
@@ -148,7 +144,7 @@ def _check_mixable(store: Store, component: MixtureComponent, own: Store, own_co
 def _require_alike(store: Store, own: Store, theirs: dict[str, Any], ours: dict[str, Any], needs: str) -> None:
     for name in theirs | ours:
         if theirs.get(name) != ours.get(name):
-            raise CurriculumError(
+            raise StoreError(
                 f"{store.path}: its {name} is {theirs.get(name)}, that of {own.path} is {ours.get(name)}; a mixture "
                 f"needs {needs}"
             )

@@ -30,41 +30,46 @@ _log = logging.getLogger(__name__)
 
 
 class Loader:
-    """An endless iterator of batches, made by :func:`batches`. Close it, or use it as a context manager.
+    """An endless iterator over the batches of a curriculum. Close it, or use it as a context manager.
 
-    The order of the batches is the same for any number of processes and workers. Grain's ``ElasticIterator`` cuts and
-    batches alike, but takes no function that its workers run at their start.
+    The order of the batches is the same for any number of processes and workers; batches cross the borders of epochs.
+    Grain's ``ElasticIterator`` cuts and batches alike, but takes no function that its workers run at their start.
 
     Args:
-        dataset: one element per record, endless, from :func:`rsjax.data.order.ordered`.
-        sources: the sources that a batch's ``part`` counts.
-        batch_size: records per batch, over all processes.
+        stages: stages of the curriculum, one after another; the last one goes on for ever.
+        batch_size: records per batch, over all processes of a multi-host run.
+        seed: seed of the order and of the transforms' generators.
+        quarantine: the list of damaged records, which are replaced as in :class:`rsjax.data.order.Readable`.
         workers: processes that read and transform; 0: threads of this one.
-        shard: the share of each batch that this process gets.
-        quarantine: the list of damaged records.
         state: :meth:`state` of an earlier loader.
+        shard: the share of each batch that this process gets; None: by its place among jax's processes.
 
     Raises:
+        StoreError: a component has no records.
         ConfigError: the batch does not divide over the processes.
     """
 
     def __init__(
         self,
-        dataset: grain.MapDataset,
-        sources: Sequence[RecordSource],
+        stages: Sequence[CurriculumStage],
         batch_size: int,
-        *,
-        workers: int,
-        shard: grain.sharding.ShardOptions,
+        seed: int,
         quarantine: Quarantine,
-        state: dict[str, Any] | None,
+        *,
+        workers: int = 0,
+        state: dict[str, Any] | None = None,
+        shard: grain.sharding.ShardOptions | None = None,
     ) -> None:
-        if batch_size % shard.shard_count:
-            raise ConfigError(
-                f"batch_size {batch_size} does not divide over {shard.shard_count} processes; make it a multiple"
-            )
-        self._dataset, self._sources, self._batch_size = dataset, sources, batch_size
-        self._workers, self._shard, self._quarantine = workers, shard, quarantine
+        self._components = [component for stage in stages for component in stage.parts]
+        if not all(map(len, self._components)):
+            raise StoreError("the split has no records; collect or tokenize again")
+        self._shard = shard or grain.sharding.ShardByJaxProcess()
+        if batch_size % self._shard.shard_count:
+            count = self._shard.shard_count
+            raise ConfigError(f"batch_size {batch_size} does not divide over {count} processes; make it a multiple")
+        self._dataset = ordered(stages, seed, quarantine)
+        self._stages, self._batch_size, self._seed, self._quarantine = stages, batch_size, seed, quarantine
+        self._workers = workers
         self._place = 0 if state is None else int(state[PLACE])
         self._iterator: Any = None
         self._restarts = 0
@@ -125,21 +130,14 @@ class Loader:
         ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
         """
         return [
-            _describe(self._sources[part], int(record))
+            _describe(self._components[part].source, int(record))
             for part, record in zip(arrays["part"], arrays["record"], strict=True)
         ]
 
     def whole(self, state: dict[str, Any]) -> "Loader":
         """Returns a loader from this state on that reads the rows of all processes alone, to look at a batch again."""
-        return Loader(
-            self._dataset,
-            self._sources,
-            self._batch_size,
-            workers=0,
-            shard=grain.sharding.NoSharding(),
-            quarantine=self._quarantine,
-            state=state,
-        )
+        shard = grain.sharding.NoSharding()
+        return Loader(self._stages, self._batch_size, self._seed, self._quarantine, state=state, shard=shard)
 
     @property
     def shared(self) -> bool:
@@ -163,56 +161,20 @@ def batches(
     batch_size: int,
     seed: int,
     *,
-    workers: int = 0,
-    state: dict[str, Any] | None = None,
     quarantine: Path | None = None,
     max_damaged: float = MAX_DAMAGED,
-    shard: grain.sharding.ShardOptions | None = None,
+    **options: Any,
 ) -> Loader:
-    """Returns an endless loader that shuffles every epoch anew; batches cross the borders of epochs.
+    """Returns a loader of one source without stages, which shuffles every epoch anew.
 
     Args:
-        source: the records; a damaged one is replaced as in :class:`rsjax.data.order.Readable`.
         transform: record → arrays, see :mod:`rsjax.data.order`.
-        batch_size: records per batch, over all processes of a multi-host run.
-        seed: seed of the order and of the transform's generator.
-        workers: processes that read and transform; 0 uses threads of this one.
-        state: :meth:`Loader.state` of an earlier loader.
         quarantine: the file that lists damaged records; None: none is written.
         max_damaged: share of the records that may be damaged.
-        shard: the share of each batch that this process gets; None: by its place among jax's processes.
-
-    Raises:
-        StoreError: the source is empty.
+        options: ``workers``, ``state`` and ``shard`` of :class:`Loader`.
     """
-    listed = Quarantine(quarantine, len(source), max_damaged)
     stages = [CurriculumStage((MixtureComponent(source, transform),), 0)]
-    return staged_batches(stages, batch_size, seed, listed, workers=workers, state=state, shard=shard)
-
-
-def staged_batches(
-    stages: Sequence[CurriculumStage],
-    batch_size: int,
-    seed: int,
-    quarantine: Quarantine,
-    *,
-    workers: int = 0,
-    state: dict[str, Any] | None = None,
-    shard: grain.sharding.ShardOptions | None = None,
-) -> Loader:
-    """Returns the loader of a curriculum. Arguments and errors as in :func:`batches`."""
-    parts = [part for stage in stages for part in stage.parts]
-    if not all(map(len, parts)):
-        raise StoreError("the split has no records; collect or tokenize again")
-    return Loader(
-        ordered(stages, seed, quarantine),
-        [part.source for part in parts],
-        batch_size,
-        workers=workers,
-        shard=shard or grain.sharding.ShardByJaxProcess(),
-        quarantine=quarantine,
-        state=state,
-    )
+    return Loader(stages, batch_size, seed, Quarantine(quarantine, len(source), max_damaged), **options)
 
 
 def _describe(source: RecordSource, record: int) -> dict[str, Any]:

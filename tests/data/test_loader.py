@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
-from rsjax.data.loader import Loader, batches, staged_batches
+from rsjax.data.loader import Loader, batches
 from rsjax.data.order import CurriculumStage, MixtureComponent, ordered
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Source, StoreError
@@ -68,7 +68,7 @@ def curricula(draw: st.DrawFn) -> tuple[list[CurriculumStage], int]:
 def loader(stages: list[CurriculumStage], size: int, place: int = 0, shard: tuple[int, int] = (0, 1)) -> Loader:
     options = grain.sharding.ShardOptions(*shard)
     state = {"global_next_index": place * size}
-    return staged_batches(stages, size, 3, UNLISTED, shard=options, state=state)
+    return Loader(stages, size, 3, UNLISTED, shard=options, state=state)
 
 
 @settings(max_examples=15, deadline=None)
@@ -118,7 +118,7 @@ def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(
 
 def test_one_stage_of_one_part_is_the_loader_without_stages_and_cut_as_grain_cuts() -> None:
     stage = CurriculumStage((MixtureComponent(Numbers(7), jitter),), 8)
-    with staged_batches([stage], 4, 5, UNLISTED) as staged, batches(Numbers(7), jitter, 4, seed=5) as plain:
+    with Loader([stage], 4, 5, UNLISTED) as staged, batches(Numbers(7), jitter, 4, seed=5) as plain:
         taken = take(staged, 6)
         assert_same(taken, take(plain, 6))
     elastic = grain.experimental.ElasticIterator(ordered([stage], 5, UNLISTED), 4, grain.sharding.NoSharding())
@@ -160,10 +160,10 @@ def test_processes_change_nothing_whether_told_to_stop_or_killed(tmp_path: Path)
     )
     stages = [CurriculumStage((whole, chosen), 16), CurriculumStage((chosen,), 8)]
     listed = Quarantine(tmp_path / "quarantine.jsonl", 11)
-    with staged_batches(stages, 4, 1, Quarantine(None, 11)) as alone:
+    with Loader(stages, 4, 1, Quarantine(None, 11)) as alone:
         expected = take(alone, 9)
     assert 3 not in expected["i"]
-    with staged_batches(stages, 4, 1, listed, workers=2) as loader:
+    with Loader(stages, 4, 1, listed, workers=2) as loader:
         first = [next(loader) for _ in range(2)]  # then both are under way
         workers = multiprocessing.active_children()
         assert len(workers) == 2
