@@ -4,11 +4,8 @@ Each episode is checked by itself (:mod:`rsjax.ingest.checks`) and then against 
 memory does not depend on the pictures.
 """
 
-import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,9 +18,9 @@ from rsjax.errors import did_you_mean
 from rsjax.ingest.checks import KINDS, EpisodeStats, Finding, Thresholds, check_episode
 from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError
 from rsjax.ingest.formats import FORMATS, open_source
+from rsjax.processes import WorkerDied, run_items
 
 FEWEST = 5  # episodes below which nothing counts as usual
-_CHUNK = 8  # episodes that a process takes at a time
 
 Checked = tuple[EpisodeRef, list[Finding], EpisodeStats | None, str]  # the last: what the reader mended
 
@@ -102,7 +99,7 @@ def diagnose(
         workers: processes; 1: this one.
 
     Raises:
-        SourceError: the data set cannot be listed, an ignored kind does not exist, or a process died.
+        SourceError: the data set cannot be listed, or an ignored kind does not exist.
     """
     for kind in ignored:
         if kind not in KINDS:
@@ -111,7 +108,7 @@ def diagnose(
     findings: dict[str, list[Finding]] = {}  # by episode, in their order
     stats: dict[str, EpisodeStats] = {}
     mended: list[tuple[str, str]] = []
-    for ref, problems, own, notes in _check_all(source, limits, workers):
+    for ref, problems, own, notes in _check_all(source, limits, workers, progress):
         if ref.id in findings:
             findings[ref.id].append(Finding(ref.id, "duplicate", "another episode has the same id"))
         findings.setdefault(ref.id, []).extend(problems)
@@ -120,7 +117,6 @@ def diagnose(
         if notes:
             mended.append((ref.id, notes))
         refs.append((ref.id, ref.fingerprint))
-        progress(len(refs))
     if not refs:
         raise SourceError(f"{source.name}: the data set has no episodes; check the path and the options")
     for finding in compare(stats, limits.unusual):
@@ -129,22 +125,26 @@ def diagnose(
     return Diagnosis(tuple(refs), tuple(kept), tuple(mended))
 
 
-def _check_all(source: EpisodeSource, limits: Thresholds, workers: int) -> Iterator[Checked]:
-    check = partial(_check, source, limits)
-    if workers <= 1:
-        yield from map(check, source.episodes())
-        return
-    done = 0
-    context = multiprocessing.get_context("spawn")  # the readers' libraries have threads, which a fork would break
-    try:
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            for done, checked in enumerate(pool.map(check, source.episodes(), chunksize=_CHUNK), 1):  # noqa: B007
-                yield checked
-    except BrokenProcessPool as error:
-        raise SourceError(
-            f"{source.name}: a process died after {done} episodes, for lack of memory or in a library; run again with "
-            f"fewer workers (now {workers})"
-        ) from error
+def _check_all(
+    source: EpisodeSource, limits: Thresholds, workers: int, progress: Callable[[int], None]
+) -> list[Checked]:
+    """Checks every episode and returns the results in the order of the episodes."""
+    checked: dict[int, Checked] = {}
+
+    def settle(numbered: tuple[int, EpisodeRef], result: Checked | WorkerDied) -> None:
+        number, ref = numbered
+        if isinstance(result, WorkerDied):
+            result = ref, [Finding(ref.id, "unreadable", str(result))], None, ""
+        checked[number] = result
+        progress(len(checked))
+
+    numbered = enumerate(source.episodes())
+    run_items(partial(_open_check, source, limits), numbered, workers if workers > 1 else 0, settle)
+    return [checked[number] for number in range(len(checked))]
+
+
+def _open_check(source: EpisodeSource, limits: Thresholds) -> Callable[[tuple[int, EpisodeRef]], Checked]:
+    return lambda numbered: _check(source, limits, numbered[1])
 
 
 def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checked:

@@ -4,16 +4,12 @@ Each finished episode is a file in ``<out>.partial``, so that an interrupted col
 packed into one store. An episode that the simulator fails at is left out and named in the manifest.
 """
 
+import functools
 import importlib.metadata
-import multiprocessing
 import os
 import shutil
-import signal
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +20,7 @@ from rsjax.config import SimConfig, content_key, to_dict
 from rsjax.data.store import Record, complete_key, decode, encode, encode_clip, write_store
 from rsjax.errors import UserError
 from rsjax.files import disk_guard, write_atomically
+from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.sim.expert import MODES, Expert, difficulty, draw_manner
 from rsjax.sim.gl import GLError, choose_gl
 from rsjax.sim.lift import TASK, LiftSim
@@ -96,7 +93,7 @@ def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) ->
     Raises:
         GLError: there is no usable OpenGL library.
         FileError: ``out`` cannot be written, e.g. on a full disk.
-        CollectError: worker processes die, or more than ``MAX_FAILURES`` of the episodes fail.
+        CollectError: two worker processes die over an episode, or more than ``MAX_FAILURES`` of the episodes fail.
     """
     if complete_key(out) == collection_key(config):
         report(config.episodes, config.episodes)
@@ -126,49 +123,30 @@ def _prepare(partial: Path, key: str) -> None:
 
 
 def _simulate(config: SimConfig, partial: Path, todo: list[int], report: Callable[[int, int], None]) -> None:
-    workers = min(config.workers or _cores(), len(todo))
-    done = config.episodes - len(todo)
-    context = multiprocessing.get_context("spawn")  # a forked OpenGL or JAX does not work
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(workers,)) as pool:
-        futures = [pool.submit(_work, config, partial, episode) for episode in todo]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                done += 1
-                report(done, config.episodes)
-        except BrokenProcessPool as error:
+    workers, done = min(config.workers or count_cores(), len(todo)), config.episodes - len(todo)
+
+    def settle(episode: int, died: WorkerDied | None) -> None:
+        nonlocal done
+        if died is not None:  # leaving the episode out would make the store depend on this machine's memory
             raise CollectError(
-                f"a simulator process died after {done} of {config.episodes} episodes, most likely for lack of memory; "
-                f"run again with fewer sim.workers (now {workers}), finished episodes are kept"
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+                f"simulator processes died over episode {episode}, most likely for lack of memory, after {done} of "
+                f"{config.episodes} episodes; run again with fewer sim.workers (now {workers}), finished episodes "
+                f"are kept"
+            )
+        done += 1
+        report(done, config.episodes)
+
+    run_items(functools.partial(_open_simulator, config, partial, workers), todo, workers, settle)
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
+def _open_simulator(config: SimConfig, partial: Path, workers: int) -> Callable[[int], None]:
+    """Opens a worker's simulator, on its share of the cores: more threads of Mesa's renderer would be in the way."""
+    os.environ.setdefault("LP_NUM_THREADS", str(max(1, count_cores() // workers)))
+    return functools.partial(_work, LiftSim(config.camera, config.image_size), config, partial)
 
 
-_sim: dict[tuple[str, int], LiftSim] = {}  # this worker's simulator, by camera and image size
-
-
-def _start_worker(workers: int) -> None:
-    """Leaves Ctrl-C to the parent and gives Mesa's software renderer this worker's share of the cores."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ.setdefault("LP_NUM_THREADS", str(max(1, _cores() // workers)))
-
-
-def _worker_sim(config: SimConfig) -> LiftSim:
-    key = (config.camera, config.image_size)
-    if key not in _sim:
-        _sim[key] = LiftSim(*key)
-        Finalize(None, _sim[key].close, exitpriority=1)
-    return _sim[key]
-
-
-def _work(config: SimConfig, partial: Path, episode: int) -> None:
-    """Simulates one episode in a worker process and writes its clip, or the reason of failure, into ``partial``."""
-    sim = _worker_sim(config)
+def _work(sim: LiftSim, config: SimConfig, partial: Path, episode: int) -> None:
+    """Simulates one episode and leaves its clip, or why there is none, in ``partial``."""
     try:
         payload = encode(encode_clip(run_episode(sim, config, episode)))
     except (GLError, OSError, MemoryError):

@@ -1,5 +1,6 @@
 import errno
 import multiprocessing
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
 from rsjax.data.store import complete_key, decode_clip, encode, encode_clip, open_store
 from rsjax.files import FileError
+from rsjax.processes import WorkerDied
 from rsjax.sim import collect as collect_module
 from rsjax.sim.collect import CollectError, collect, collection_key, run_episode
 from rsjax.sim.lift import LiftSim
@@ -50,17 +52,16 @@ def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
         np.testing.assert_array_equal(view.depth, clip.depth[t])
 
 
-def test_collect_resumes_after_a_crash_and_packs(sim: LiftSim, tmp_path: Path) -> None:
+def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_path: Path) -> None:
     out, partial = tmp_path / "lift", tmp_path / "lift.partial"
 
-    def crash_after_one(done: int, total: int) -> None:
+    def interrupt_after_one(done: int, total: int) -> None:
         assert total == 4
         if done == 1:
-            for child in multiprocessing.active_children():
-                child.kill()
+            raise KeyboardInterrupt
 
-    with pytest.raises(CollectError, match=r"simulator process died.*fewer sim.workers \(now 1\)"):
-        collect(replace(CONFIG, workers=1), out, crash_after_one)
+    with pytest.raises(KeyboardInterrupt):
+        collect(replace(CONFIG, workers=1), out, interrupt_after_one)
     kept = list(partial.glob("*.clip"))
     assert kept
     assert not out.exists()
@@ -71,7 +72,14 @@ def test_collect_resumes_after_a_crash_and_packs(sim: LiftSim, tmp_path: Path) -
     mark.write_bytes(encode(encode_clip(clip) | {"task": "marked"}))
 
     seen: list[int] = []
-    collect(CONFIG, out, lambda done, total: seen.append(done))
+
+    def kill_at_once(done: int, total: int) -> None:
+        """A worker that dies costs its episode another try and the collection nothing."""
+        seen.append(done)
+        for child in multiprocessing.active_children() if len(seen) == 2 else ():
+            child.kill()
+
+    collect(CONFIG, out, kill_at_once)
     assert seen[0] >= 1
     assert seen[-1] == 4
     assert not partial.exists()
@@ -149,10 +157,8 @@ def test_episodes_of_another_configuration_are_not_reused(tmp_path: Path) -> Non
 
 
 def test_a_simulator_failure_costs_one_episode_but_a_full_disk_stops(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sim: LiftSim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collect_module, "_worker_sim", lambda config: None)
-
     def raising(error: Exception) -> None:
         def run(*_: object) -> None:
             raise error
@@ -160,12 +166,24 @@ def test_a_simulator_failure_costs_one_episode_but_a_full_disk_stops(
         monkeypatch.setattr(collect_module, "run_episode", run)
 
     raising(ArithmeticError("it diverged"))
-    collect_module._work(CONFIG, tmp_path, 2)
+    collect_module._work(sim, CONFIG, tmp_path, 2)
     assert (tmp_path / "000002.error").read_text() == "ArithmeticError: it diverged"
     raising(OSError(errno.ENOSPC, "No space left on device"))
     with pytest.raises(OSError, match=r"No space"):
-        collect_module._work(CONFIG, tmp_path, 3)
+        collect_module._work(sim, CONFIG, tmp_path, 3)
     assert not (tmp_path / "000003.error").exists()
+
+
+def test_an_episode_that_kills_two_workers_stops_and_keeps_the_others(
+    gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_items(make: object, items: list[int], workers: int, settle: Callable[[int, WorkerDied], None]) -> None:
+        settle(items[0], WorkerDied())
+
+    monkeypatch.setattr(collect_module, "run_items", run_items)
+    with pytest.raises(CollectError, match=r"died over episode 0.*fewer sim.workers \(now 2\)"):
+        collect(CONFIG, tmp_path / "lift", lambda done, total: None)
+    assert (tmp_path / "lift.partial").exists()
 
 
 def test_full_disk_is_one_clear_line(gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
