@@ -1,4 +1,4 @@
-"""A list of episodes that are left out of a data set, with reasons, and a source that heeds it."""
+"""A list of the episodes of a data set to keep and to leave out, with reasons, and a source that follows it."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -18,7 +18,7 @@ def write_selection(
 
     Args:
         path: the list, JSON.
-        about: what data set it is about, for its readers.
+        about: the data set, for human readers of the list.
         refs: every episode's id and fingerprint.
         reasons: of those left out, by id.
 
@@ -26,7 +26,7 @@ def write_selection(
         How many are kept, how many are left out.
 
     Raises:
-        StoreError: the file cannot be written.
+        FileError: the file cannot be written.
     """
     kept = [{"id": name, "fingerprint": mark} for name, mark in refs if name not in reasons]
     out = [{"id": name, "fingerprint": mark, "reasons": reasons[name]} for name, mark in refs if name in reasons]
@@ -38,9 +38,9 @@ def write_selection(
 
 @dataclass
 class Selected:
-    """A source whose episodes are refused where a list leaves them out: they are still counted, and told why.
+    """A source that refuses the episodes that a list leaves out: they still count, and the error has the reasons.
 
-    An episode that is no longer as it was when the list was written is read again.
+    An episode that has changed since the list was written is read.
 
     Attributes:
         source: what is read.
@@ -53,7 +53,7 @@ class Selected:
     name: str
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """All of them; one that is left out has a fingerprint of its own, so that earlier work on it is not used."""
+        """Lists all; one that is left out has a fingerprint of its own, so that earlier work on it is not used."""
         for ref in self.source.episodes():
             why = self.reasons.get((ref.id, ref.fingerprint))
             if why is None:
@@ -62,14 +62,14 @@ class Selected:
                 yield EpisodeRef(ref.id, fingerprint((), ref.fingerprint, why), {"left_out": why})
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """One episode; :class:`EpisodeError` with the reasons where it is left out."""
+        """Reads one episode; :class:`EpisodeError` with the reasons if it is left out."""
         if "left_out" in ref.location:
-            raise EpisodeError(f"{ref.id}: left out by the manifest: {ref.location['left_out']}")
+            raise EpisodeError(f"{ref.id}: left out by the list: {ref.location['left_out']}")
         return self.source.read(ref)
 
 
 def select(source: EpisodeSource, path: Path) -> Selected:
-    """The source without what the list at ``path`` leaves out.
+    """Returns the source without what the list at ``path`` leaves out.
 
     Raises:
         SourceError: the list cannot be read, or is about other episodes or about these with other options.
@@ -78,17 +78,12 @@ def select(source: EpisodeSource, path: Path) -> Selected:
         content = json.loads(path.read_text())
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']}, this code reads format {FORMAT}")
-        listed = {(str(entry["id"]), str(entry["fingerprint"])) for entry in [*content["kept"], *content["left_out"]]}
-        reasons = {
-            (str(entry["id"]), str(entry["fingerprint"])): "; ".join(map(str, entry["reasons"]))
-            for entry in content["left_out"]
-        }
+        reasons = {_key(entry): "; ".join(map(str, entry["reasons"])) for entry in content["left_out"]}
+        listed = {*reasons, *map(_key, content["kept"])}
     except FileNotFoundError as error:
         raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise SourceError(
-            f"{path}: not a manifest of experiments.doctor ({error}); make it again with --fix"
-        ) from error
+        raise SourceError(f"{path}: not a list of experiments.doctor ({error}); make it again with --fix") from error
     names, known = {name for name, _ in listed}, False
     for ref in source.episodes():
         known = known or ref.id in names
@@ -99,4 +94,8 @@ def select(source: EpisodeSource, path: Path) -> Selected:
             f"{path}: the data set was read with other options then, or all its files have changed; run "
             f"experiments.doctor --fix again, with the same --option"
         )
-    raise SourceError(f"{path}: names no episode of this data set; give the manifest that was made for it")
+    raise SourceError(f"{path}: names no episode of this data set; give the list that was made for it")
+
+
+def _key(entry: Mapping[str, object]) -> tuple[str, str]:
+    return str(entry["id"]), str(entry["fingerprint"])

@@ -92,9 +92,9 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
     assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in told
     rows = [json.loads(row) for row in (tmp_path / "store.work" / "quarantine.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == ["episode_02"]
-    assert "left out by the manifest: duplicate" in rows[0]["error"]
+    assert "left out by the list: duplicate" in rows[0]["error"]
     manifest = open_store(tmp_path / "store").manifest
-    assert "left out by the manifest" in manifest["quarantine"]["episode_02"]
+    assert "left out by the list" in manifest["quarantine"]["episode_02"]
     assert "episodes  4 = 4 with clips" in command(ingest, *line)
 
 

@@ -230,7 +230,7 @@ def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: 
     refs = list(chosen.episodes())
     assert [ref.id for ref in refs] == [f"episode-{number}" for number in range(8)]
     assert [chosen.read(ref).id for ref in refs if ref.id != "episode-6"] == [r.id for r in refs if r.id != "episode-6"]
-    with pytest.raises(EpisodeError, match="episode-6: left out by the manifest: no-task: its task is empty"):
+    with pytest.raises(EpisodeError, match="episode-6: left out by the list: no-task: its task is empty"):
         chosen.read(refs[6])
     plain = {ref.id: ref.fingerprint for ref in data_set.episodes()}
     assert [ref.id for ref in refs if ref.fingerprint != plain[ref.id]] == ["episode-6"]
@@ -248,7 +248,7 @@ def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
 def test_another_file_is_no_manifest(tmp_path: Path, content: str) -> None:
     for text in (content, "[" * 100_000 + content):
         (tmp_path / "m.json").write_text(text)
-        with pytest.raises(SourceError, match="m.json: not a manifest"):
+        with pytest.raises(SourceError, match="m.json: not a list of"):
             select(source(), tmp_path / "m.json")
 
 

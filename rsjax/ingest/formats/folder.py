@@ -128,13 +128,15 @@ class Folder:
         config, files = self._config, self._files(name, flat)
         cameras, depth = parts.find_cameras(files, flat)
         table_path = parts.find_table(files, place)
-        description = parts.read_description(place.with_name(f"{name}.json") if flat else place / "episode.json")
         if not cameras:
             problem = f"has no video ({', '.join(parts.VIDEOS)}) and no folder of pictures"
             raise EpisodeError.at(place, problem, "add one or leave it out")
         count = len(next(iter(cameras.values())))
+        description = parts.read_description(place.with_name(f"{name}.json") if flat else place / "episode.json", count)
         table, fps = parts.read_table(table_path), description.fps or config.fps
-        actions, states = parts.action_columns(table), parts.state_columns(table)
+        states = [column for column in table.column_names if column.startswith("state")]
+        actions = [column for column in table.column_names if column.startswith("action")]
+        actions = actions or [column for column in table.column_names if column not in ("timestamp", *states)]
         commands = parts.columns(table, actions, table_path)
         layout = Layout(config.kind, config.quaternions, config.held)
         check_layout(layout, commands.shape[1], table_path)
@@ -152,7 +154,7 @@ class Folder:
             states=parts.columns(table, states, table_path) if states else None,
             cameras=cameras,
             depth=depth,
-            segments=description.segments(count),
+            segments=description.segments,
             meta={"actions": layout.to_json(), "action_names": actions},
         )
         return checked(episode, table_path)

@@ -1,9 +1,8 @@
 """The files of one episode in a folder of videos: its cameras, its table and its JSON."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -22,56 +21,45 @@ _DEPTH = ".depth"
 _MOST_BYTES = 2**28  # of a table that is text
 
 
-@dataclass(frozen=True)
-class Description:
-    """What an episode's JSON says; the defaults if there is none.
+class Description(NamedTuple):
+    """What an episode's JSON says; the task is None and the rate 0 if it does not name them."""
 
-    Attributes:
-        path: of the JSON.
-        task: None: not named.
-        fps: 0: not named.
-        entries: its segments.
+    task: str | None
+    fps: float
+    segments: tuple[Segment, ...]
+
+
+def read_description(path: Path, count: int) -> Description:
+    """Reads an episode's JSON; there may be none.
+
+    Args:
+        count: the episode's frames.
+
+    Raises:
+        EpisodeError: the file is damaged, a field is wrong, or a segment is not within the frames.
     """
-
-    path: Path
-    task: str | None = None
-    fps: float = 0.0
-    entries: tuple[Any, ...] = ()
-
-    def segments(self, count: int) -> tuple[Segment, ...]:
-        """Returns the segments in the order of their starts.
-
-        Raises:
-            EpisodeError: one is not within ``count`` frames, or a field is wrong.
-        """
-        segments = []
-        for place, entry in enumerate(self.entries):
-            try:
-                text, skill = str(entry["text"]), str(entry.get("skill") or "")
-                segment = Segment(int(entry["start"]), int(entry["end"]), text, skill)
-            except (AttributeError, KeyError, TypeError, ValueError) as error:
-                problem = f"segment {place}: field missing or wrong ({error})"
-                raise EpisodeError.at(self.path, problem, "mend it") from error
-            if not 0 <= segment.start < segment.end <= count:
-                problem = f"segment {place} is {segment.start} … {segment.end}, there are {count} frames"
-                raise EpisodeError.at(self.path, problem, "mend it")
-            segments.append(segment)
-        return tuple(sorted(segments, key=lambda segment: segment.start))
-
-
-def read_description(path: Path) -> Description:
-    """Reads an episode's JSON; :class:`EpisodeError` if the file is damaged or a field is wrong."""
     try:
         values = read_json(path) if exists(path) else {}
-    except SourceError as error:
-        raise EpisodeError(str(error)) from error
-    try:
         fps, task = float(values.get("fps") or 0), values.get("task")
         if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
             raise ValueError(f"fps {fps}, task {task!r}")
-        return Description(path, task, fps, tuple(values.get("segments") or ()))
+        segments = [_segment(path, place, entry, count) for place, entry in enumerate(values.get("segments") or ())]
+    except SourceError as error:
+        raise EpisodeError(str(error)) from error
     except (AttributeError, TypeError, ValueError) as error:
         raise EpisodeError.at(path, f"task, fps or segments are wrong ({error})", "mend the file") from error
+    return Description(task, fps, tuple(sorted(segments, key=lambda segment: segment.start)))
+
+
+def _segment(path: Path, place: int, entry: Any, count: int) -> Segment:
+    try:
+        segment = Segment(int(entry["start"]), int(entry["end"]), str(entry["text"]), str(entry.get("skill") or ""))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise EpisodeError.at(path, f"segment {place}: field missing or wrong ({error})", "mend it") from error
+    if not 0 <= segment.start < segment.end <= count:
+        problem = f"segment {place} is {segment.start} … {segment.end}, there are {count} frames"
+        raise EpisodeError.at(path, problem, "mend it")
+    return segment
 
 
 def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], dict[str, Depths]]:
@@ -133,17 +121,6 @@ def read_table(path: Path) -> pa.Table:
     if len(set(names)) < len(names) or all(map(_is_number, names)):
         raise EpisodeError(f"{path}: its first line must name the columns, each once; it has {names}")
     return table
-
-
-def action_columns(table: pa.Table) -> list[str]:
-    """Returns the columns that begin with ``action``; if none does, all but time and states."""
-    named = [name for name in table.column_names if name.startswith("action")]
-    return named or [name for name in table.column_names if name != "timestamp" and not name.startswith("state")]
-
-
-def state_columns(table: pa.Table) -> list[str]:
-    """Returns the columns that begin with ``state``."""
-    return [name for name in table.column_names if name.startswith("state")]
 
 
 def columns(table: pa.Table, names: Sequence[str], path: Path) -> Float32[np.ndarray, "N A"]:

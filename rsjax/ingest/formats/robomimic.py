@@ -146,7 +146,7 @@ class DemoSource:
             problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
             raise EpisodeError.at(path, problem)
         observed = group["obs"]
-        cameras = picture_keys(observed, how)
+        cameras = _picture_keys(observed, how)
         if not cameras:
             raise EpisodeError.at(path, f"{observed.name} has no pictures (*{how.endings[0]})", _RENDER)
         depths = [camera for camera in cameras if self.depth and f"{camera}_depth" in observed]
@@ -178,7 +178,7 @@ class DemoSource:
             try:
                 demos = self._demos(path)
                 with open_file(path) as file:
-                    if demos and not picture_keys(file[f"data/{demos[0]}/obs"], self.convention):
+                    if demos and not _picture_keys(file[f"data/{demos[0]}/obs"], self.convention):
                         ending = self.convention.endings[0]
                         raise SourceError(f"{path}: data/{demos[0]}/obs has no *{ending}; {_RENDER}")
                 return
@@ -209,7 +209,7 @@ class DemoSource:
         return sorted((name.decode() if isinstance(name, bytes) else str(name) for name in listed), key=_number)
 
 
-def picture_keys(observed: Any, how: Convention) -> dict[str, str]:
+def _picture_keys(observed: Any, how: Convention) -> dict[str, str]:
     """Returns the key of each camera's pictures in a group ``obs``, by the camera's name."""
     return {
         key.removesuffix(ending): key
