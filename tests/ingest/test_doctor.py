@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from experiments import doctor as command
 from rsjax.config import ConfigError
+from rsjax.ingest import doctor
 from rsjax.ingest.checks import KINDS, Thresholds, quaternions
 from rsjax.ingest.doctor import diagnose, open_any
 from rsjax.ingest.episode import Episode, EpisodeError, Segment, SourceError
 from rsjax.ingest.formats import open_source
 from rsjax.ingest.selection import select, write_selection
+from rsjax.processes import WorkerDied
 from tests.ingest.formats.test_folder import write_episode
 from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.ingest.toy_source import COUNT, Pictures, ToySource, episode, pictures, source
@@ -123,6 +125,18 @@ def test_all_pictures_can_be_decoded() -> None:
 def test_several_processes_find_the_same() -> None:
     data_set = source(EpisodeError("a.h5: truncated"), replace(episode(7), task=""), episode(2), fine=4)
     assert diagnose(data_set, Thresholds(), workers=2) == diagnose(data_set, Thresholds())
+
+
+def test_an_episode_over_which_workers_die_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_items(make: Any, items: Any, workers: int, settle: Any) -> None:
+        for item in reversed(list(items)):
+            settle(item, WorkerDied() if item[0] == 2 else make()(item))
+
+    monkeypatch.setattr(doctor, "run_items", run_items)
+    diagnosis = diagnose(source(), Thresholds(), workers=2)
+    assert [name for name, _ in diagnosis.refs] == [f"episode-{number}" for number in range(6)]
+    ((name, detail),) = diagnosis.reasons().items()
+    assert name == "episode-2" and detail[0].startswith("unreadable: 2 workers died over it")
 
 
 @pytest.mark.parametrize("limits", [{"frames": -1}, {"gap": 0.5}, {"unusual": 1}])
