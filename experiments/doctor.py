@@ -39,7 +39,7 @@ class Options:
     workers: int = 1
     """Processes; -1: one per core."""
     fix: Path | None = None
-    """Writes a list here, for experiments.ingest --manifest, that leaves out every episode with a finding."""
+    """Writes a list here, for experiments.ingest --selection, that leaves out every episode with a finding."""
 
 
 @main_errors()

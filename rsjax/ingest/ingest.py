@@ -1,11 +1,13 @@
 """Ingests a data set of any format into a store of clips: runs the steps on every episode, then packs their clips."""
 
 import hashlib
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
+
+import cv2
 
 from rsjax.config import content_key
 from rsjax.data.store import MANIFEST, StoreError, open_store
@@ -20,18 +22,9 @@ from rsjax.processes import WorkerDied, count_cores, run_items
 LOCK = "lock"
 Settle = Callable[[EpisodeRef, int, int], None]  # an episode, the work items that were run on it, and their clips
 Progress = Callable[[int, int], None]  # done, of how many
-
-
-class Runner(Protocol):
-    """Runs the work items that have no mark, on workers that may die; every episode has its marks at the end."""
-
-    def __call__(self, plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Settle) -> None:
-        """Calls ``settle`` after each episode.
-
-        Raises:
-            UserError: no work item could be run: a full disk, a missing package.
-        """
-        ...
+# Runs the work items that have no mark, on workers that may die, and settles every episode; raises a UserError where no
+# work item could be run: a full disk, a missing package.
+Runner = Callable[[IngestPlan, Sequence[EpisodeRef], Settle], None]
 
 
 def run_on_this_machine(plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Settle, workers: int = 0) -> None:
@@ -149,10 +142,6 @@ def forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
 
 def limit_threads(count: int) -> None:
     """Limits the threads of libraries in a worker, whose cores others share. Called before a network is loaded."""
-    import os
-
-    import cv2
-
     os.environ["OMP_NUM_THREADS"] = str(count)  # PyTorch
     cv2.setNumThreads(count)
 

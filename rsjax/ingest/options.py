@@ -6,12 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from rsjax.config import content_key, require, to_dict
-from rsjax.config.fields import ConfigError
+from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.ingest.actions import ActionConfig
 from rsjax.ingest.windows import WindowConfig
+
+if TYPE_CHECKING:  # loaded when they are needed, as --help needs none of them
+    from rsjax.ingest.episode import EpisodeSource
+    from rsjax.ingest.ingest import Runner
+    from rsjax.ingest.work_items import IngestPlan
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,8 @@ class IngestOptions:
     """Side of a clip in pixels."""
     points: int = 256
     """Tracks of a clip."""
-    manifest: Path | None = None
-    """A file written by experiments.doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
+    selection: Path | None = None
+    """A list written by experiments.doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
     camera: str = ""
     """The camera to use; the episode's first by default."""
     difficulty: tuple[str, ...] = ()
@@ -82,8 +86,8 @@ class IngestOptions:
                 require(getattr(self, name) == default, f"{flag} is for Ray alone; add --runner ray or leave it out")
 
 
-def make_plan(source: str, path: Path, options: IngestOptions) -> Any:
-    """Returns the :class:`rsjax.ingest.work_items.IngestPlan` for a data set of the format ``source`` at ``path``.
+def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
+    """Returns the plan for a data set of the format ``source`` at ``path``.
 
     Raises:
         UserError: an option is impossible, or the source is unknown or not at its path.
@@ -114,16 +118,16 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> Any:
     steps = annotation_steps(choose_annotators(methods), config.camera, options.cpus, options.gpus)
     steps = (*steps, clip_step(config, tuple(step.name for step in steps), options.cpus))
     settings = source_options(options.option)
-    episodes: Any = open_source(source, path.absolute(), **settings)
-    if options.manifest is not None:
-        episodes = select(episodes, options.manifest)
+    episodes: EpisodeSource = open_source(source, path.absolute(), **settings)
+    if options.selection is not None:
+        episodes = select(episodes, options.selection)
     reading = content_key(json.dumps(settings, sort_keys=True))
     meta = {"config": to_dict(config) | {"methods": methods, "source": settings}}
     return IngestPlan(episodes, steps, out, options.test_share, reading, meta)
 
 
-def make_runner(options: IngestOptions) -> Any:
-    """Returns the :class:`rsjax.ingest.ingest.Runner` that the options ask for.
+def make_runner(options: IngestOptions) -> "Runner":
+    """Returns what runs the work items: processes of this machine, or a Ray cluster.
 
     Raises:
         UserError: more workers than this machine has work for.

@@ -45,7 +45,11 @@ def run_on_ray(
     Raises:
         RayError: Ray is missing, the cluster cannot be reached, or it cannot place one actor of each step at once.
     """
-    ray = load_ray()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise RayError("--runner ray needs Ray: pip install 'rsjax[ray]'") from error
     here = not ray.is_initialized()
     if here:
         _connect(ray, plan, address, cpus)
@@ -55,20 +59,6 @@ def run_on_ray(
     finally:
         if here:
             ray.shutdown()
-
-
-def load_ray() -> Any:
-    """Imports the package.
-
-    Raises:
-        RayError: it is not installed.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise RayError("--runner ray needs Ray: pip install 'rsjax[ray]'") from error
-    return ray
 
 
 def _connect(ray: Any, plan: IngestPlan, address: str, cpus: float | None) -> None:
@@ -118,7 +108,7 @@ def count_actors(steps: Sequence[Step], cluster: Mapping[str, float], most: int 
 
 
 class _Actors:
-    """The actors, and who of them is idle. An actor that dies is replaced."""
+    """The actors of each step, and which of them are idle. An actor that dies is replaced."""
 
     def __init__(self, ray: Any, plan: IngestPlan, patience: float) -> None:
         self._ray, self._plan, self._patience = ray, plan, patience
@@ -129,6 +119,7 @@ class _Actors:
         self._running = 0  # work items
 
     async def run(self, refs: Sequence[EpisodeRef], counts: Mapping[str, int], settle: Settle) -> None:
+        """Runs the work items of these episodes on ``counts`` actors of each step, and stops those."""
         for step in self._plan.steps:
             for _ in range(counts[step.name]):
                 self._begin_start(step)

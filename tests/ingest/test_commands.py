@@ -88,7 +88,7 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
     with pytest.raises(SystemExit, match="1"):
         command(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL]
-    told = command(ingest, *line, "--manifest", tmp_path / "fixed.json")
+    told = command(ingest, *line, "--selection", tmp_path / "fixed.json")
     assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in told
     rows = [json.loads(row) for row in (tmp_path / "store.work" / "quarantine.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == ["episode_02"]
@@ -178,13 +178,16 @@ def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Comman
         (ingest, ["folder", ".", "--difficulty", "simple"], "--difficulty 'simple': write PATTERN=WORD"),
         (ingest, ["folder", ".", "--tracks", "magic"], "tracks: no method 'magic'"),
         (ingest, ["folder", ".", "--test-share", "1"], "--test-share is 1.0"),
+        (ingest, ["folder", ".", "--workers", "-7"], "--workers is -7"),
+        (ingest, ["folder", ".", "--runner", "ray", "--workers", "-7"], "--workers is -7"),
+        (ingest, ["folder", ".", "--workers", "100000"], "--workers is 100000"),
         (ingest, ["folder", ".", "--gpus", "0.5"], "--gpus is for Ray alone; add --runner ray"),
         (ingest, ["folder", ".", "--runner", "ray", "--cpus", "0"], "--cpus is 0.0"),
         (ingest, ["folder", ".", "--out", "/"], "--out is /; name a directory"),
         (ingest, ["folder", ".", "--depth", "recorded:most_holes=2"], "most_holes is 2.0"),
         (
             ingest,
-            ["folder", ".", "--manifest", "nowhere.json"],
+            ["folder", ".", "--selection", "nowhere.json"],
             "nowhere.json: not there; make it with experiments.doctor",
         ),
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
