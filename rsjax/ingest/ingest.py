@@ -77,8 +77,8 @@ def ingest(
     up_to_date = is_up_to_date(plan, refs)
     if up_to_date and not retry:
         return None
-    with lock(plan.folder / LOCK) as held:
-        if not held:
+    with lock(plan.folder / LOCK) as locked:
+        if not locked:
             raise StoreError(f"{plan.out}: another process is making it; wait for that one or stop it")
         if retry and not forget_failures(plan, refs) and up_to_date:
             return None

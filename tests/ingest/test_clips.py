@@ -22,24 +22,24 @@ CONFIG = ClipConfig(WindowConfig(frames=4, rate=2), image_size=8, tracks=6)
 
 
 class Records(list):
-    """Records in memory, for what is a :class:`rsjax.data.store.Source`."""
+    """Records in memory, in place of a :class:`rsjax.data.store.Source`."""
 
 
 def clips(made: Episode, config: ClipConfig = CONFIG, **annotations: Any) -> tuple[list[Record], dict[str, Any]]:
-    generator, found = cut(Annotated(made, task=made.task, segments=made.segments, **annotations), config), []
+    generator, kept = cut(Annotated(made, task=made.task, segments=made.segments, **annotations), config), []
     while True:
         try:
-            found.append(next(generator))
+            kept.append(next(generator))
         except StopIteration as stop:
-            return found, stop.value
+            return kept, stop.value
 
 
 def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
-    found, summary = clips(
+    kept, summary = clips(
         episode("a", depth=True), ClipConfig(CONFIG.windows, 8, 6, actions=ActionConfig(compose="last"))
     )
-    assert summary["windows"] == {"kept": 5} and len(found) == 5
-    for number, record in enumerate(found):
+    assert summary["windows"] == {"kept": 5} and len(kept) == 5
+    for number, record in enumerate(kept):
         frames = np.array([0, 5, 10, 15]) + 5 * number
         clip = decode_clip(record)
         assert record["provenance"]["frames"] == frames.tolist()
@@ -53,8 +53,8 @@ def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
 
 
 def test_actions_between_frames_are_joined() -> None:
-    found, _ = clips(episode("a"))
-    assert found[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]
+    kept, _ = clips(episode("a"))
+    assert kept[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]
 
 
 @settings(deadline=None, max_examples=40)
@@ -67,9 +67,9 @@ def test_actions_between_frames_are_joined() -> None:
 def test_joined_actions_are_the_sums_over_the_frames_between(fps: float, rate: float, count: int, seed: int) -> None:
     actions = np.random.default_rng(seed).normal(size=(160, 3)).astype(np.float32)
     made = episode("a", 160, fps=fps, timestamps=np.arange(160) / fps, actions=actions)
-    found, summary = clips(made, ClipConfig(WindowConfig(frames=count, rate=rate, hop=5), 8, 1))
-    assert len(found) == summary["windows"]["kept"] > 0
-    for record in (found[0], found[-1]):
+    kept, summary = clips(made, ClipConfig(WindowConfig(frames=count, rate=rate, hop=5), 8, 1))
+    assert len(kept) == summary["windows"]["kept"] > 0
+    for record in (kept[0], kept[-1]):
         at = record["provenance"]["frames"]
         between = [actions[before + 1 : after + 1].sum(0) for before, after in pairwise(at)]
         np.testing.assert_allclose(record["actions"], [np.zeros(3), *between], rtol=1e-4, atol=1e-4)
@@ -82,9 +82,9 @@ def test_no_clip_reaches_across_a_cut(cuts: list[int], rate: float, within: bool
     shots = list(pairwise(edges))
     made = episode("a", 120, segments=(Segment(10, 50, "reach"), Segment(50, 110, "grasp")))
     config = ClipConfig(WindowConfig(frames=4, rate=rate, within_segments=within), 8, 1)
-    found, summary = clips(made, config, shots=shots)
-    assert len(found) == sum(summary["windows"].values())
-    for record in found:
+    kept, summary = clips(made, config, shots=shots)
+    assert len(kept) == sum(summary["windows"].values())
+    for record in kept:
         at = record["provenance"]["frames"]
         assert not any(at[0] < cut <= at[-1] for cut in edges[1:-1])
         assert not within or (at[0] >= 10 and at[-1] < 50) or (at[0] >= 50 and at[-1] < 110)
@@ -93,16 +93,16 @@ def test_no_clip_reaches_across_a_cut(cuts: list[int], rate: float, within: bool
 def test_without_depth_a_clip_has_none() -> None:
     unread = ClipConfig(CONFIG.windows, 8, 6, recorded_depth=False)
     for made, config in ((episode("a"), CONFIG), (episode("a", depth=True), unread)):
-        found, summary = clips(made, config)
-        assert found[0]["depth"] is None and summary["depth"] is None and summary["depth_unit"] is None
-        assert found[0]["provenance"]["depth_unit"] == ""
+        kept, summary = clips(made, config)
+        assert kept[0]["depth"] is None and summary["depth"] is None and summary["depth_unit"] is None
+        assert kept[0]["provenance"]["depth_unit"] == ""
 
 
-def test_estimated_depth_is_found_in_its_parts() -> None:
+def test_estimated_depth_is_read_from_its_parts() -> None:
     maps = np.arange(40, dtype=np.float16)[:, None, None] + np.ones((40, 5, 5), np.float16)
     parts = Records({"first": first, "depth": maps[first : first + 7], "unit": "relative"} for first in range(0, 40, 7))
-    found, _ = clips(episode("a"), depth=parts)
-    for record in found:
+    kept, _ = clips(episode("a"), depth=parts)
+    for record in kept:
         np.testing.assert_array_equal(record["depth"][:, 0, 0], np.array(record["provenance"]["frames"]) + 1)
         assert record["provenance"]["depth_unit"] == "relative"
     with pytest.raises(EpisodeError, match=r"depth: no map of frame 35 of episode a"):
@@ -115,14 +115,14 @@ def test_tracks_are_those_of_the_windows_shot() -> None:
     points = np.broadcast_to(np.arange(20)[None, :, None], (3, 20, 2)).astype(np.float16)
     shots = [(0, 20), (20, 40)]
     records = Records({"first": first, "points": points, "visible": seen} for first, _ in shots)
-    found, summary = clips(episode("a"), shots=shots, tracks=records)
+    kept, summary = clips(episode("a"), shots=shots, tracks=records)
     assert summary["windows"] == {"kept": 2}
-    for record, first in zip(found, (0, 20), strict=True):
+    for record, first in zip(kept, (0, 20), strict=True):
         assert record["tracks"].shape == (6, 4, 2) and record["visible"].all()
         np.testing.assert_array_equal(record["tracks"][0, :, 0], np.array(record["provenance"]["frames"]) - first)
     seen[:, 0] = False
-    found, summary = clips(episode("a"), shots=shots, tracks=records)
-    assert not found and summary["windows"] == {"kept": 0, "no track": 2}
+    kept, summary = clips(episode("a"), shots=shots, tracks=records)
+    assert not kept and summary["windows"] == {"kept": 0, "no track": 2}
 
 
 def test_the_tracks_of_a_shot_are_read_once() -> None:
@@ -136,30 +136,30 @@ def test_the_tracks_of_a_shot_are_read_once() -> None:
     points = np.zeros((3, 20, 2), np.float16)
     shots = [(0, 20), (20, 40)]
     records = Counting({"first": first, "points": points, "visible": np.ones((3, 20), bool)} for first, _ in shots)
-    found, _ = clips(episode("a"), ClipConfig(WindowConfig(frames=4, rate=0), 8, 6), shots=shots, tracks=records)
-    assert len(found) == 34 and read == [0, 1]
+    kept, _ = clips(episode("a"), ClipConfig(WindowConfig(frames=4, rate=0), 8, 6), shots=shots, tracks=records)
+    assert len(kept) == 34 and read == [0, 1]
 
 
-def test_words_are_the_tasks_and_the_segments() -> None:
+def test_labels_are_the_tasks_and_the_segments() -> None:
     config = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("pick*", "simple"),)))
-    found, _ = clips(episode("a"), config, motion=np.arange(40.0), scene="kitchen")
+    kept, _ = clips(episode("a"), config, motion=np.arange(40.0), scene="kitchen")
     named = {"task": "pick a cup", "difficulty": "simple", "scene": "kitchen"}
-    assert clip_labels(found[0]) == named | {"segment": "reach", "skill": "unknown"}
-    assert clip_labels(found[4]) == named | {"segment": "grasp", "skill": "Grasp"}
-    assert [record["provenance"]["segment"] for record in found] == ["reach", "reach", "reach", "grasp", "grasp"]
-    assert found[0]["provenance"]["motion"] == np.mean(np.arange(1, 16))
+    assert clip_labels(kept[0]) == named | {"segment": "reach", "skill": "unknown"}
+    assert clip_labels(kept[4]) == named | {"segment": "grasp", "skill": "Grasp"}
+    assert [record["provenance"]["segment"] for record in kept] == ["reach", "reach", "reach", "grasp", "grasp"]
+    assert kept[0]["provenance"]["motion"] == np.mean(np.arange(1, 16))
     unnamed, _ = clips(episode("a", task=""), config)
     assert unnamed[4]["task"] == "grasp"
     by_skill = ClipConfig(CONFIG.windows, 8, 6, categories=CategoryConfig((("Grasp", "difficult"),)))
-    told = [record["provenance"]["difficulty"] for record in clips(episode("a", task="tidy up"), by_skill)[0]]
-    assert told == ["unknown"] * 3 + ["difficult"] * 2
+    words = [record["provenance"]["difficulty"] for record in clips(episode("a", task="tidy up"), by_skill)[0]]
+    assert words == ["unknown"] * 3 + ["difficult"] * 2
 
 
 def test_success_is_the_data_sets_by_frame_or_for_the_whole() -> None:
     by_frame = {"success": [False] * 39 + [True]}
     assert [bool(record["success"][-1]) for record in clips(episode("a", meta=by_frame))[0]] == [False] * 5
-    found, summary = clips(episode("a", meta={"success": True}))
-    assert found[0]["success"].all() and summary["success"] == 5
+    kept, summary = clips(episode("a", meta={"success": True}))
+    assert kept[0]["success"].all() and summary["success"] == 5
 
 
 def test_overlapping_windows_read_each_frame_once() -> None:
@@ -181,16 +181,16 @@ def test_an_episode_as_long_as_a_window_is_said_to_take_gives_one(
 ) -> None:
     config = ClipConfig(WindowConfig(frames, rate, most_gap=3), 8, 1)
     made = episode("a", count, fps=fps, timestamps=np.arange(count) / fps)
-    found, summary = clips(made, config)
+    kept, summary = clips(made, config)
     needed = int(summary["short"]["window"].partition(" take ")[2].split()[0])
-    assert bool(found) == (count >= needed)
+    assert bool(kept) == (count >= needed)
     more = WindowConfig(frames, min(fps, 2 * rate), most_gap=3)
-    assert more.rate == rate or clips(made, ClipConfig(more, 8, 1))[1]["windows"]["kept"] >= len(found)
+    assert more.rate == rate or clips(made, ClipConfig(more, 8, 1))[1]["windows"]["kept"] >= len(kept)
 
 
 def test_a_short_episode_gives_nothing_and_says_so() -> None:
-    found, summary = clips(episode("a", count=5))
-    assert not found and summary["windows"] == {"kept": 0}
+    kept, summary = clips(episode("a", count=5))
+    assert not kept and summary["windows"] == {"kept": 0}
     assert summary["short"] == {
         "spans": 1,
         "longest": 5,
@@ -220,5 +220,5 @@ def test_what_does_not_fit_is_named(config: ClipConfig, annotations: dict[str, A
 
 
 def test_a_record_is_a_clip() -> None:
-    found, _ = clips(episode("a", depth=True))
-    assert isinstance(decode_clip(found[0]), Clip) and Path(found[0]["provenance"]["episode"]).name == "a"
+    kept, _ = clips(episode("a", depth=True))
+    assert isinstance(decode_clip(kept[0]), Clip) and Path(kept[0]["provenance"]["episode"]).name == "a"

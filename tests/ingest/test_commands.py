@@ -37,9 +37,9 @@ class Command:
         """The one line on standard error of a command that cannot be carried out."""
         with pytest.raises(SystemExit, match="2"):
             self(module, *arguments)
-        told = self._capsys.readouterr().err
-        assert told.startswith("error: ") and told.count("\n") == 1
-        return told
+        text = self._capsys.readouterr().err
+        assert text.startswith("error: ") and text.count("\n") == 1
+        return text
 
 
 @pytest.fixture
@@ -52,17 +52,17 @@ def test_the_bundled_bridge_episodes_become_a_store(command: Command, tmp_path: 
     out = tmp_path / "bridge"
     line = ["rlds", BRIDGE, "--out", out, "--windows.frames", 4, "--windows.rate", 0, "--windows.hop", 4]
     line += ["--workers", 0, "--difficulty", "put*=simple", "*=difficult", "--shots", "none", "--motion", "none"]
-    told = command(ingest, *line)
-    assert "episodes  25 = 25 with clips + 0 without + 0 quarantined" in told and str(out) in told
+    text = command(ingest, *line)
+    assert "episodes  25 = 25 with clips + 0 without + 0 quarantined" in text and str(out) in text
     opened = open_store(out)
     counts = opened.labels("train").counts()["difficulty"]
     assert set(counts) == {"simple", "difficult"}
     assert f"{out} is up to date" in command(ingest, *line)
     assert "nothing is quarantined" in command(ingest, *line, "--retry")
 
-    assert "what was left out" not in told  # nothing was
-    told = command(inspect, out)
-    assert "float32 (4, 7)" in told and "put carrot on plate" in told
+    assert "what was left out" not in text  # nothing was
+    text = command(inspect, out)
+    assert "float32 (4, 7)" in text and "put carrot on plate" in text
     sheet = cv2.imread(str(tmp_path / "bridge-sheet.png"))
     assert sheet is not None and sheet.shape[1] == 8 * 100 and sheet.std() > 20
 
@@ -88,8 +88,8 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
     with pytest.raises(SystemExit, match="1"):
         command(doctor, "folder", source, "--fix", tmp_path / "fixed.json")
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL]
-    told = command(ingest, *line, "--selection", tmp_path / "fixed.json")
-    assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in told
+    text = command(ingest, *line, "--selection", tmp_path / "fixed.json")
+    assert "episodes  4 = 3 with clips + 0 without + 1 quarantined" in text
     rows = [json.loads(row) for row in (tmp_path / "store.work" / "quarantine.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == ["episode_02"]
     assert "left out by the list: duplicate" in rows[0]["error"]
@@ -108,38 +108,38 @@ def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, num
             assert process.poll() is None
             time.sleep(0.01)
         process.send_signal(number)
-        _, told = process.communicate()
-    assert process.returncode == status and told.count("\n") == 1 and "the same command resumes" in told
+        _, text = process.communicate()
+    assert process.returncode == status and text.count("\n") == 1 and "the same command resumes" in text
     marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/**/*.json")}
     assert 0 < len(marks) < 200 and not (tmp_path / "store").exists()
-    told = command(ingest, *line, "--workers", 0, "--keep-clips")
-    assert f"this run  {200 - len(marks)} work items" in told
+    text = command(ingest, *line, "--workers", 0, "--keep-clips")
+    assert f"this run  {200 - len(marks)} work items" in text
     assert {path: path.stat().st_mtime_ns for path in marks} == marks
 
 
 def test_the_help_says_what_source_and_path_are(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         command(ingest, "--help")
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert (
-        "agibot, lerobot, robomimic, libero, rlds, bair, folder, sim" in told and "PATH is the folder or file" in told
+        "agibot, lerobot, robomimic, libero, rlds, bair, folder, sim" in text and "PATH is the folder or file" in text
     )
 
 
-def test_recordings_that_are_too_short_are_told_in_numbers_with_a_cure(command: Command, tmp_path: Path) -> None:
+def test_recordings_that_are_too_short_are_reported_in_numbers_with_a_cure(command: Command, tmp_path: Path) -> None:
     source = folder_of_episodes(tmp_path / "source", 2)
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, "--shots", "none"]
-    told = command.refused(ingest, *line)
-    assert "16 frames at 2 Hz take 76 of 10 fps; the longest has 12" in told
-    assert "raise --windows.rate or lower --windows.frames" in told and QUARANTINE not in told
+    text = command.refused(ingest, *line)
+    assert "16 frames at 2 Hz take 76 of 10 fps; the longest has 12" in text
+    assert "raise --windows.rate or lower --windows.frames" in text and QUARANTINE not in text
     cured = command(ingest, *line, "--windows.rate", 10, "--windows.frames", 12)
     assert "2 = 2 with clips" in cured
 
 
 def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:
     clip_store(tmp_path / "a")
-    told = command(store, "split", tmp_path / "a", "--into", tmp_path / "parts", "--by", "difficulty")
-    assert told.splitlines()[0] == f"{tmp_path}/parts/simple: train 3, test 1"
+    text = command(store, "split", tmp_path / "a", "--into", tmp_path / "parts", "--by", "difficulty")
+    assert text.splitlines()[0] == f"{tmp_path}/parts/simple: train 3, test 1"
     command(store, "merge", tmp_path / "b", tmp_path / "parts" / "simple", tmp_path / "parts" / "difficult")
     shutil.move(tmp_path / "b", tmp_path / "c")
     assert sorted(numbers(open_store(tmp_path / "c"))) == list(range(6))
@@ -153,11 +153,11 @@ def test_without_the_viewer_both_of_its_options_are_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     clip_store(tmp_path / "a")
-    told = command.refused(inspect, tmp_path / "a", option)
-    assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in told
+    text = command.refused(inspect, tmp_path / "a", option)
+    assert "--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'" in text
 
 
-def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Command, tmp_path: Path) -> None:
+def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, tmp_path: Path) -> None:
     clip_store(tmp_path / "a", size=32)
     shard = tmp_path / "a" / "test-00000.array_record"
     payload = np.fromfile(shard, np.uint8)
@@ -193,14 +193,14 @@ def test_a_damaged_store_is_inspected_and_tells_it_by_its_status(command: Comman
         (ingest, ["folder", ".", "--windows.frames", "1"], "windows.frames is 1"),
         (ingest, ["folder", ".", "--image-size", "1000000"], "--image-size is 1000000"),
         (ingest, ["folder", ".", "--points", "0"], "--points is 0"),
-        (inspect, [], "missing store"),
+        (inspect, [], "missing STORE"),
         (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
         (inspect, ["nowhere"], "nowhere: not there; give a store"),
         (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
         (doctor, [], "usage: python -m experiments.doctor STORE, or python -m experiments.doctor SOURCE PATH"),
         (store, [], "usage"),
         (store, ["merge", "a", "b"], "merging takes two stores or more"),
-        (store, ["split", "--by", "task"], "missing store"),
+        (store, ["split", "--by", "task"], "missing STORE"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(
@@ -210,6 +210,6 @@ def test_what_cannot_be_done_is_one_line(
 
 
 def test_source_options_are_json_where_they_can_be() -> None:
-    found = source_options(("fps=5", "held=[6]", "keys=bridge", "task=a=b"))
-    assert found == {"fps": 5, "held": [6], "keys": "bridge", "task": "a=b"}
-    json.dumps(found)
+    settings = source_options(("fps=5", "held=[6]", "keys=bridge", "task=a=b"))
+    assert settings == {"fps": 5, "held": [6], "keys": "bridge", "task": "a=b"}
+    json.dumps(settings)

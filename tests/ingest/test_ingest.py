@@ -154,7 +154,7 @@ def test_where_only_the_test_split_has_depth_none_is_kept(tmp_path: Path) -> Non
 
 
 def test_a_network_that_cannot_be_loaded_ends_the_ingest_and_quarantines_nothing(tmp_path: Path) -> None:
-    plan = clip_plan(tmp_path, Source(2), Annotators(None, None, Relative(there=False), None, None))
+    plan = clip_plan(tmp_path, Source(2), Annotators(None, None, Relative(loads=False), None, None))
     with pytest.raises(AnnotationError, match=r"relative.pt: no such file"):
         ingested(plan)
     assert not list(tmp_path.rglob("units/**/*.json"))

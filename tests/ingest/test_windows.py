@@ -30,11 +30,11 @@ FPS = st.sampled_from([5.0, 7.5, 10, 15, 24, 25, 29.97, 30, 60])
 def spans(draw: st.DrawFn) -> list[Span]:
     """In order, without overlap."""
     lengths = draw(st.lists(st.tuples(st.integers(0, 9), st.integers(1, 400)), max_size=5))
-    found, at = [], 0
+    parts, at = [], 0
     for gap, length in lengths:
-        found.append((at + gap, at + gap + length))
+        parts.append((at + gap, at + gap + length))
         at += gap + length
-    return found
+    return parts
 
 
 def test_the_papers_windows_span_226_recorded_frames() -> None:
@@ -95,8 +95,8 @@ def test_no_window_reaches_across_a_cut_or_out_of_a_segment(
     edges = sorted(set(edges))
     segments = [Segment(a, b, f"{a}") for a, b in itertools.pairwise(edges)][::2]
     for within in (False, True):
-        asked = dataclasses.replace(config, within_segments=within)
-        index = index_windows(fps, cut_spans(300, list(itertools.pairwise(bounds)), segments, asked), asked)
+        changed = dataclasses.replace(config, within_segments=within)
+        index = index_windows(fps, cut_spans(300, list(itertools.pairwise(bounds)), segments, changed), changed)
         for number in range(len(index)):
             first, last = index.frames(number)[[0, -1]]
             assert first >= 0 and last < 300

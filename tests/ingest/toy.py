@@ -162,10 +162,10 @@ def runs(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Relative(Annotator):
-    """A depth network that says 3 of everything, without a unit; where ``there`` is False it cannot be loaded."""
+    """A depth network that returns 3 everywhere, without a unit; unless ``loads``, it cannot be loaded."""
 
     name: ClassVar[str] = "relative"
-    there: bool = True
+    loads: bool = True
     device: str = "cpu"
 
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
@@ -173,7 +173,7 @@ class Relative(Annotator):
         return DepthMaps(ArrayDepths(np.full((frames, 12, 16), 3, np.float32)), "relative", (0.0, 1.0))
 
     def load(self) -> None:
-        if not self.there:
+        if not self.loads:
             raise AnnotationError("relative.pt: no such file")
 
 

@@ -73,5 +73,5 @@ class ToySource:
 
 
 def source(*odd: Episode | Exception, fine: int = 6) -> ToySource:
-    """``fine`` good episodes, then those given."""
+    """``fine`` good episodes, then ``odd`` ones."""
     return ToySource((*(episode(seed) for seed in range(fine)), *odd))
