@@ -16,14 +16,14 @@ class ArrayFrames:
     """Pictures in memory, as :class:`rsjax.ingest.episode.Frames`."""
 
     def __init__(self, pictures: UInt8[np.ndarray, "N H W 3"]) -> None:
-        self._pictures = pictures
+        self.pictures = pictures
 
     def __len__(self) -> int:
-        return len(self._pictures)
+        return len(self.pictures)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
         """Returns these pictures."""
-        return self._pictures[np.asarray(indices, np.int64)]
+        return self.pictures[np.asarray(indices, np.int64)]
 
 
 class ArrayDepths:

@@ -115,7 +115,7 @@ def test_signs_of_quaternions_do_not_change_what_leads_from_one_to_the_other(fli
     np.testing.assert_allclose(made, sampled_actions(smooth, frames, config, layout), atol=1e-6)
 
 
-def test_what_does_not_fit_is_told() -> None:
+def test_what_does_not_fit_is_reported() -> None:
     rows = np.zeros((3, 2), np.float32)
     with pytest.raises(ConfigError, match="actions.compose is 'sum'; choose one of join, last, stack"):
         ActionConfig(compose="sum")  # type: ignore[arg-type]

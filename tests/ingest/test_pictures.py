@@ -74,7 +74,7 @@ def test_chunks_that_claim_to_be_enormous_take_no_memory() -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**19  # KiB
 
 
-def test_other_kinds_of_pictures_are_told() -> None:
+def test_other_kinds_of_pictures_are_reported() -> None:
     for ending in (".bmp", ".tiff", ".webp"):
         payload = cv2.imencode(ending, np.zeros((16, 16, 3), np.uint8))[1].tobytes()
         with pytest.raises(EpisodeError, match=r"^p: not a readable picture .*: neither a whole PNG nor a JPEG"):
@@ -83,7 +83,7 @@ def test_other_kinds_of_pictures_are_told() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data(), st.sampled_from([".jpg", ".png"]))
-def test_a_damaged_picture_is_told_or_keeps_its_shape(data: st.DataObject, ending: str) -> None:
+def test_a_damaged_picture_is_reported_or_keeps_its_shape(data: st.DataObject, ending: str) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (24, 16, 3), np.uint8)
     payload = bytearray(cv2.imencode(ending, noise)[1].tobytes())
     if data.draw(st.booleans()):

@@ -92,7 +92,7 @@ def test_a_file_that_changes_is_scanned_again(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 0.999))
-def test_a_truncated_file_is_told_or_read_right(tmp_path: Path, clip: Path, share: float) -> None:
+def test_a_truncated_file_is_reported_or_read_right(tmp_path: Path, clip: Path, share: float) -> None:
     payload = clip.read_bytes()
     short = tmp_path / "short.mp4"
     short.write_bytes(payload[: int(share * len(payload))])
@@ -106,7 +106,7 @@ def test_a_truncated_file_is_told_or_read_right(tmp_path: Path, clip: Path, shar
     assert read == list(range(30))
 
 
-def test_a_truncated_file_whose_header_comes_first_is_told(tmp_path: Path, clip: Path) -> None:
+def test_a_truncated_file_whose_header_comes_first_is_reported(tmp_path: Path, clip: Path) -> None:
     with av.open(str(clip)) as source, av.open(str(tmp_path / "f.mp4"), "w", options={"movflags": "faststart"}) as out:
         stream = out.add_stream_from_template(source.streams.video[0])
         for packet in source.demux(video=0):
@@ -120,7 +120,7 @@ def test_a_truncated_file_whose_header_comes_first_is_told(tmp_path: Path, clip:
         scan(tmp_path / "f.mp4")
 
 
-def test_damage_in_the_middle_is_told(tmp_path: Path) -> None:
+def test_damage_in_the_middle_is_reported(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mp4", range(30))
     payload = bytearray(path.read_bytes())
     middle = payload.index(b"mdat") + (len(payload) - payload.index(b"mdat")) // 3
@@ -158,7 +158,7 @@ def test_a_playlist_opens_no_other_file(tmp_path: Path, clip: Path) -> None:
         scan(tmp_path / "list.mp4")
 
 
-def test_pictures_of_several_sizes_are_told(tmp_path: Path) -> None:
+def test_pictures_of_several_sizes_are_reported(tmp_path: Path) -> None:
     streams = []
     for side in (32, 64):
         with av.open(str(tmp_path / f"{side}.h264"), "w", format="h264") as out:
@@ -183,14 +183,14 @@ def test_pictures_of_several_sizes_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"not a video", b"\x00" * 5000])
-def test_what_is_no_video_is_told(tmp_path: Path, payload: bytes) -> None:
+def test_what_is_no_video_is_reported(tmp_path: Path, payload: bytes) -> None:
     path = tmp_path / "concat:x.mp4"
     path.write_bytes(payload)
     with pytest.raises(EpisodeError, match=r"concat:x.mp4: not a readable video"):
         len(VideoFrames(path))
 
 
-def test_missing_and_forbidden_files_are_told(tmp_path: Path) -> None:
+def test_missing_and_forbidden_files_are_reported(tmp_path: Path) -> None:
     with pytest.raises(EpisodeError, match=r"gone.mp4: missing"):
         len(VideoFrames(tmp_path / "gone.mp4"))
     (tmp_path / "loop.mp4").symlink_to(tmp_path / "loop.mp4")

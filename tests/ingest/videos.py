@@ -1,38 +1,10 @@
 """Small videos of known motion, and episodes around them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rsjax.ingest.episode import Episode, Segment
-
-
-@dataclass(frozen=True)
-class ArrayFrames:
-    """Pictures in memory."""
-
-    pictures: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def read(self, indices: Sequence[int]) -> NDArray[np.uint8]:
-        return self.pictures[np.asarray(indices, int)]
-
-
-@dataclass(frozen=True)
-class ArrayDepths:
-    """Depth maps in memory."""
-
-    maps: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    def read(self, indices: Sequence[int]) -> NDArray[np.float32]:
-        return self.maps[np.asarray(indices, int)]
+from rsjax.ingest.pictures import ArrayDepths, ArrayFrames
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.float32]:

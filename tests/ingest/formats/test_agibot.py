@@ -1,5 +1,4 @@
 import json
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,9 @@ import numpy as np
 import pytest
 
 from rsjax.ingest.actions import Layout
-from rsjax.ingest.episode import Episode, EpisodeError, SourceError
+from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import error_of, read_first
 from tests.ingest.formats.videos import numbers_of, write_video
 
 COUNT = 8
@@ -51,8 +51,8 @@ def info(episode: str = EPISODE) -> dict[str, Any]:
         {"start_frame": 4, "end_frame": 99, "action_text": "place the cup", "skill": "Place"},
         {"start_frame": 0, "end_frame": 4, "action_text": "pick up the cup", "skill": "Pick"},
     ]
-    told = {"episode_id": int(episode), "task_name": "Tidy up", "init_scene_text": "a table"}
-    return told | {"label_info": {"action_config": config}}
+    entry = {"episode_id": int(episode), "task_name": "Tidy up", "init_scene_text": "a table"}
+    return entry | {"label_info": {"action_config": config}}
 
 
 def write_h5(root: Path, edit: Edit = lambda made: None) -> Path:
@@ -78,21 +78,8 @@ def write_agibot(root: Path, edit: Edit = lambda made: None) -> Path:
     return root
 
 
-def read_one(root: Path, **options: Any) -> Episode:
-    source = pickle.loads(pickle.dumps(open_source("agibot", root, **options)))
-    (ref,) = source.episodes()
-    return source.read(pickle.loads(pickle.dumps(ref)))
-
-
-def error_of(root: Path, **options: Any) -> str:
-    with pytest.raises(EpisodeError) as caught:
-        read_one(root, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def test_a_whole_episode(tmp_path: Path) -> None:
-    episode = read_one(write_agibot(tmp_path))
+    episode = read_first("agibot", write_agibot(tmp_path))
     assert (episode.id, episode.task, episode.fps) == ("327-648642", "Tidy up", 30)
     assert list(episode.cameras) == ["head", "hand_left", "hand_right"]
     assert numbers_of(episode.cameras["hand_left"].read([7, 0])) == [7, 0]
@@ -123,7 +110,7 @@ def test_commands_that_copy_the_state_tell_how_the_arm_came_there(tmp_path: Path
         for name in ("end/position", "end/orientation"):
             made[f"action/{name}"] = made[f"state/{name}"]
 
-    episode = read_one(write_agibot(tmp_path, copy))
+    episode = read_first("agibot", write_agibot(tmp_path, copy))
     np.testing.assert_array_equal(episode.actions[1:, 0], np.arange(1, COUNT))
     np.testing.assert_array_equal(episode.actions[:, 14], np.arange(COUNT) > 4)  # grippers' are commands all the same
     assert not episode.actions[0].any()
@@ -146,9 +133,9 @@ def test_fewer_commands_than_frames_are_put_where_they_were_sent(tmp_path: Path,
             made["action/end/index"] = np.zeros(0)
             del made["action/effector/index"]
 
-    episode = read_one(write_agibot(tmp_path, edit))
+    episode = read_first("agibot", write_agibot(tmp_path, edit))
     np.testing.assert_array_equal(episode.actions[:, 0], [0, 0, 1.5, 2.5, 3, 4, 5.5, 6])
-    # a gripper keeps what it was told, open at first; frame 5's command leads into frame 6
+    # a gripper keeps its last command, open at first; frame 5's command leads into frame 6
     np.testing.assert_array_equal(episode.actions[:, 14], [0, 0, 0, 0, 0, 0, 1, 1])
     assert episode.meta["notes"]["scattered"] == {"end/position": 3, "end/orientation": 3, "effector/position": 3}
 
@@ -158,7 +145,7 @@ def test_flipped_quaternions_are_turned_back(tmp_path: Path) -> None:
         made["action/end/orientation"][3:5, 0] *= -1
         made["state/end/orientation"][2, 1] *= -1
 
-    episode = read_one(write_agibot(tmp_path, flip))
+    episode = read_first("agibot", write_agibot(tmp_path, flip))
     np.testing.assert_allclose(episode.actions[1:, 6:14], turning(COUNT, 0.1)[:-1].reshape(-1, 8), atol=1e-6)
     assert episode.states is not None
     np.testing.assert_allclose(episode.states[:, 6:14], turning(COUNT).reshape(-1, 8), atol=1e-6)
@@ -168,7 +155,7 @@ def test_flipped_quaternions_are_turned_back(tmp_path: Path) -> None:
 def test_an_episode_that_task_info_does_not_name_has_no_task_and_says_so(tmp_path: Path) -> None:
     root = write_agibot(tmp_path)
     (root / "task_info/task_327.json").write_text("[]")
-    episode = read_one(root)
+    episode = read_first("agibot", root)
     assert (episode.task, episode.segments) == ("", ())
     assert episode.meta["notes"]["task_info"] == "names no such episode, so it has no task"
 
@@ -179,7 +166,7 @@ def test_empty_fields_are_zeros_and_noted(tmp_path: Path) -> None:
         made["state/waist/position"] = np.zeros(0)
         del made["state/head/position"]
 
-    episode = read_one(write_agibot(tmp_path, empty))
+    episode = read_first("agibot", write_agibot(tmp_path, empty))
     assert not episode.actions[:, 14:].any()
     assert episode.states is not None
     assert not episode.states[:, 30:].any()
@@ -227,7 +214,7 @@ def both(*edits: Edit) -> Edit:
 def test_damage_is_named(tmp_path: Path, edit: Edit, message: str) -> None:
     root = write_agibot(tmp_path, edit)
     with pytest.raises(EpisodeError, match=rf"proprio_stats.h5: .*{message}"):
-        read_one(root)
+        read_first("agibot", root)
 
 
 def test_missing_and_truncated_files_are_named(tmp_path: Path) -> None:
@@ -235,23 +222,23 @@ def test_missing_and_truncated_files_are_named(tmp_path: Path) -> None:
     video = root / f"observations/{TASK}/{EPISODE}/videos/head_color.mp4"
     payload = video.read_bytes()
     video.write_bytes(payload[: len(payload) // 2])
-    assert error_of(root).startswith(f"{video}: not a readable video")
+    assert error_of("agibot", root).startswith(f"{video}: not a readable video")
     write_video(video, range(5))
-    assert "camera head has 5 rows, timestamps 8" in error_of(root)
+    assert "camera head has 5 rows, timestamps 8" in error_of("agibot", root)
     video.unlink()
-    assert error_of(root).startswith(f"{video}: missing")
-    assert read_one(root, cameras=["hand_left"]).depth == {}
+    assert error_of("agibot", root).startswith(f"{video}: missing")
+    assert read_first("agibot", root, cameras=["hand_left"]).depth == {}
     path = write_h5(root)
     path.write_bytes(path.read_bytes()[:3000])
-    assert error_of(root).startswith(f"{path}: not a readable HDF5")
+    assert error_of("agibot", root).startswith(f"{path}: not a readable HDF5")
     path.unlink()
-    assert error_of(root).startswith(f"{path}: missing")
+    assert error_of("agibot", root).startswith(f"{path}: missing")
 
 
 def test_incomplete_depth_is_left_out_and_noted(tmp_path: Path) -> None:
     root = write_agibot(tmp_path)
     (root / f"observations/{TASK}/{EPISODE}/depth/head_depth_000003.png").unlink()
-    episode = read_one(root)
+    episode = read_first("agibot", root)
     assert not episode.depth
     assert episode.meta["notes"]["depth_left_out"] == "7 depth maps for 8 frames"
 

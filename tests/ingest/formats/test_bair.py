@@ -54,7 +54,7 @@ def test_files_come_in_the_order_of_their_trajectories(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"2/image_main/encoded": [bytes(100)]}, "2/image_main/encoded has 100 bytes, should have 12288"),
         ({"1/action": None}, "has no 1/action"),
@@ -63,12 +63,12 @@ def test_files_come_in_the_order_of_their_trajectories(tmp_path: Path) -> None:
         ({"1/endeffector_pos": np.full(3, np.inf)}, "states of frame 1 is not finite"),
     ],
 )
-def test_one_broken_episode_leaves_the_others(tmp_path: Path, change: dict, said: str) -> None:
+def test_one_broken_episode_leaves_the_others(tmp_path: Path, change: dict, message: str) -> None:
     write(tmp_path, episode_bytes(**change), episode_bytes())
     source = open_source("bair", tmp_path)
     bad, good = source.episodes()
     assert len(source.read(good).timestamps) == STEPS
-    with pytest.raises(EpisodeError, match=said):
+    with pytest.raises(EpisodeError, match=message):
         source.read(bad)
 
 
@@ -83,7 +83,7 @@ def test_a_truncated_file_is_one_more_entry_that_is_refused(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("kept", [1, 0])
-def test_a_file_that_ends_between_two_records_is_told_by_its_name(tmp_path: Path, kept: int) -> None:
+def test_a_file_that_ends_between_two_records_is_reported_by_its_name(tmp_path: Path, kept: int) -> None:
     path = write(tmp_path, episode_bytes(), episode_bytes())
     write_records(path, [episode_bytes()] * kept)
     source = open_source("bair", tmp_path)
@@ -104,7 +104,7 @@ def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -> Non
     assert path.stat().st_size > 5e6 and most < 2e6
 
 
-def test_nothing_to_read_is_told(tmp_path: Path) -> None:
+def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no .*tfrecords"):
         open_source("bair", tmp_path)
     write(tmp_path, episode_bytes())

@@ -69,7 +69,7 @@ def test_bad_lines_do_not_end_the_file(tmp_path: Path) -> None:
         list(json_lines(tmp_path / "gone"))
 
 
-def test_unknown_formats_are_told(tmp_path: Path) -> None:
+def test_unknown_formats_are_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="unknown format 'lerobo'; did you mean 'lerobot'"):
         open_source("lerobo", tmp_path)
     assert len(set(FORMATS)) == len(FORMATS)

@@ -1,8 +1,6 @@
 import json
 import os
-import pickle
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +10,9 @@ import pytest
 
 from rsjax.data.codec import decode, encode
 from rsjax.ingest.actions import Layout
-from rsjax.ingest.episode import Episode, EpisodeError, SourceError
+from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import error_of, read_all, read_first
 from tests.ingest.formats.videos import numbers_of, picture, write_video
 
 COUNT = 8
@@ -33,35 +32,21 @@ def write_episode(root: Path, name: str = "one") -> Path:
     return root / name
 
 
-def read_all(root: Path, **options: Any) -> list[Episode]:
-    source = pickle.loads(pickle.dumps(open_source("folder", root, **options)))
-    return [source.read(ref) for ref in source.episodes()]
-
-
-def error_of(root: Path, **options: Any) -> str:
-    source = open_source("folder", root, **options)
-    (ref,) = source.episodes()
-    with pytest.raises(EpisodeError) as caught:
-        source.read(ref)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9")
     write_episode(tmp_path, name)
-    (episode,) = read_all(tmp_path)
+    (episode,) = read_all("folder", tmp_path)
     assert episode.id.isascii() or episode.id == name
     assert decode(encode({"id": episode.id, "n": np.zeros(1)}))["id"] == episode.id
     write_episode(tmp_path, os.fsdecode(b"caf\xea"))
-    assert len({episode.id for episode in read_all(tmp_path)}) == 2
+    assert len({episode.id for episode in read_all("folder", tmp_path)}) == 2
 
 
 def test_an_episode_in_a_folder(tmp_path: Path) -> None:
     write_episode(tmp_path)
     segments = [{"start": 3, "end": 8, "text": "put"}, {"start": 0, "end": 3, "text": "take", "skill": "pick"}]
     (tmp_path / "one/episode.json").write_text(json.dumps({"task": "tidy up", "segments": segments}))
-    (episode,) = read_all(tmp_path, kind="absolute", held=[1])
+    (episode,) = read_all("folder", tmp_path, kind="absolute", held=[1])
     assert (episode.id, episode.task, list(episode.cameras)) == ("one", "tidy up", ["front", "wrist"])
     assert episode.fps == pytest.approx(10)
     assert numbers_of(episode.cameras["front"].read(range(COUNT))) == list(range(COUNT))
@@ -88,7 +73,7 @@ def test_flat_episodes_with_any_table(tmp_path: Path, kind: str) -> None:
     else:
         np.save(tmp_path / "a b.npy", ACTIONS[: -1 if kind == "one row less" else None])
     (tmp_path / "a b.json").write_text('{"task": "go"}')
-    (episode,) = read_all(tmp_path)
+    (episode,) = read_all("folder", tmp_path)
     np.testing.assert_array_equal(episode.actions[1:], ACTIONS[:-1])
     assert (episode.task, list(episode.cameras), episode.states) == ("go", ["main"], None)
     assert episode.id.startswith("a-b-")
@@ -98,7 +83,7 @@ def test_flat_episodes_with_any_table(tmp_path: Path, kind: str) -> None:
 def test_rows_that_led_into_their_frame(tmp_path: Path) -> None:
     write_episode(tmp_path)
     (tmp_path / "dataset.json").write_text('{"after": true, "task": "go"}')
-    (episode,) = read_all(tmp_path)
+    (episode,) = read_all("folder", tmp_path)
     np.testing.assert_array_equal(episode.actions[1:], ACTIONS[1:])
     assert not episode.actions[0].any()
     assert episode.task == "go"
@@ -111,14 +96,14 @@ def test_pictures_and_depth_maps(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"one/top/{number}.png"), picture(number)[..., ::-1])
         cv2.imwrite(str(tmp_path / f"one/top.depth/{number}.png"), np.full((4, 6), 1000 + number, np.uint16))
     np.save(tmp_path / "one/actions.npy", np.zeros((12, 3)))
-    assert "how fast are its pictures" in error_of(tmp_path)
-    (episode,) = read_all(tmp_path, fps=5)
+    assert "how fast are its pictures" in error_of("folder", tmp_path)
+    (episode,) = read_all("folder", tmp_path, fps=5)
     assert numbers_of(episode.cameras["top"].read([11, 2])) == [11, 2]
     depth = episode.depth["top"].read([10, 0])
     assert (depth.dtype, depth.shape) == (np.float32, (2, 4, 6))
     np.testing.assert_allclose(depth[:, 0, 0], [1.01, 1.0])
     (tmp_path / "one/top.depth/5.png").unlink()
-    assert "depth top has 11 rows, timestamps 12" in error_of(tmp_path, fps=5)
+    assert "depth top has 11 rows, timestamps 12" in error_of("folder", tmp_path, fps=5)
 
 
 def test_a_picture_that_claims_to_be_enormous(tmp_path: Path) -> None:
@@ -127,7 +112,7 @@ def test_a_picture_that_claims_to_be_enormous(tmp_path: Path) -> None:
     png[16:24] = (2**30).to_bytes(4, "big") * 2
     (tmp_path / "one/top/0.png").write_bytes(png)
     np.save(tmp_path / "one/actions.npy", np.zeros((1, 3)))
-    (episode,) = read_all(tmp_path, fps=5)
+    (episode,) = read_all("folder", tmp_path, fps=5)
     with pytest.raises(EpisodeError, match=r"0.png: its header says 1073741824 × 1073741824 pixels"):
         episode.cameras["top"].read([0])
 
@@ -151,28 +136,28 @@ def test_a_wrong_table_is_named(tmp_path: Path, table: str, message: str) -> Non
     (tmp_path / "one/actions.csv").write_text(table)
     if "nan" in table:  # the last row leads nowhere unless it says so
         (tmp_path / "dataset.json").write_text('{"after": true}')
-    source = open_source("folder", tmp_path)
     with pytest.raises(EpisodeError, match=message):
-        source.read(next(source.episodes()))
+        read_first("folder", tmp_path)
 
 
 def test_what_an_episode_lacks_is_named(tmp_path: Path) -> None:
     place = write_episode(tmp_path)
     np.save(place / "more.npy", ACTIONS)
-    assert "needs one table of actions (.csv, .parquet, .npy), there is actions.csv, more.npy" in error_of(tmp_path)
+    several = "needs one table of actions (.csv, .parquet, .npy), there is actions.csv, more.npy"
+    assert several in error_of("folder", tmp_path)
     (place / "more.npy").unlink()
     (place / "episode.json").write_text('{"segments": [{"start": 0, "end": 99, "text": "far"}]}')
-    assert "episode.json: segment 0 is 0 … 99, there are 8 frames" in error_of(tmp_path)
+    assert "episode.json: segment 0 is 0 … 99, there are 8 frames" in error_of("folder", tmp_path)
     (place / "episode.json").write_text('{"fps": "fast"}')
-    assert "episode.json: task, fps or segments are wrong" in error_of(tmp_path)
+    assert "episode.json: task, fps or segments are wrong" in error_of("folder", tmp_path)
     (place / "episode.json").write_text("{")
-    assert "episode.json: cannot be read" in error_of(tmp_path)
+    assert "episode.json: cannot be read" in error_of("folder", tmp_path)
     (place / "episode.json").unlink()
     write_video(place / "wrist.mp4", range(5), 10)
-    assert "camera wrist has 5 rows, timestamps 8" in error_of(tmp_path)
+    assert "camera wrist has 5 rows, timestamps 8" in error_of("folder", tmp_path)
     for name in ("front", "wrist"):
         (place / f"{name}.mp4").unlink()
-    assert "has no video" in error_of(tmp_path)
+    assert "has no video" in error_of("folder", tmp_path)
 
 
 def test_arrays_that_are_none(tmp_path: Path) -> None:
@@ -185,7 +170,7 @@ def test_arrays_that_are_none(tmp_path: Path) -> None:
     ):
         np.save(place / "actions.npy", array)
         with pytest.raises(EpisodeError, match=message):
-            read_all(tmp_path)
+            read_all("folder", tmp_path)
 
 
 def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
@@ -198,40 +183,39 @@ def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
         source.read(loop)
     (tmp_path / "loop").unlink()
     (tmp_path / "one/loop.mp4").symlink_to(tmp_path / "one/loop.mp4")
-    assert "loop.mp4: not a readable video (Too many levels of symbolic links)" in error_of(tmp_path)
+    assert "loop.mp4: not a readable video (Too many levels of symbolic links)" in error_of("folder", tmp_path)
 
 
 @pytest.mark.parametrize("name", ["one/front.mp4", "one/actions.csv", "one/episode.json", "one/top/0.png"])
-def test_a_pipe_among_the_files_is_told_and_not_waited_for(tmp_path: Path, name: str) -> None:
+def test_a_pipe_among_the_files_is_reported_and_not_waited_for(tmp_path: Path, name: str) -> None:
     write_episode(tmp_path)
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.unlink(missing_ok=True)
     os.mkfifo(path)
-    assert "a pipe or device, not a file" in (told := error_of(tmp_path)) and path.name in told
+    assert "a pipe or device, not a file" in (message := error_of("folder", tmp_path)) and path.name in message
 
 
-def test_a_flat_pipe_is_told_and_not_waited_for(tmp_path: Path) -> None:
+def test_a_flat_pipe_is_reported_and_not_waited_for(tmp_path: Path) -> None:
     write_csv(tmp_path / "one.csv")
     os.mkfifo(tmp_path / "one.mp4")
-    assert "one.mp4: cannot be read (a pipe or device, not a file)" in error_of(tmp_path)
+    assert "one.mp4: cannot be read (a pipe or device, not a file)" in error_of("folder", tmp_path)
 
 
-@pytest.mark.parametrize(("name", "first"), [("held", 2), ("held", -1), ("quaternions", 0), ("quaternions", 99)])
-def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str, first: int) -> None:
+def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> None:
     write_episode(tmp_path)
-    told = error_of(tmp_path, **{name: [first]})
-    assert f"actions.csv: {name} names dimension {first + 3 if first == 0 else first}, but actions have 2" in told
+    message = error_of("folder", tmp_path, held=[2])
+    assert "actions.csv: held names dimension 2, but actions have 2" in message
 
 
-def test_a_folder_of_nothing_is_told(tmp_path: Path) -> None:
+def test_a_folder_of_nothing_is_reported(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(SourceError, match=f"^{tmp_path}: holds no episode"):
         list(open_source("folder", tmp_path).episodes())
 
 
-@pytest.mark.parametrize("fps", [-1, 1e-400 - 1, 10_001, float("inf"), float("nan"), 10**400])
-def test_a_rate_that_no_camera_has_is_told_before_anything_is_read(tmp_path: Path, fps: float) -> None:
+@pytest.mark.parametrize("fps", [-1, 10_001, float("nan"), 10**400])
+def test_a_rate_that_no_camera_has_is_reported_before_anything_is_read(tmp_path: Path, fps: float) -> None:
     with pytest.raises(SourceError, match=r": fps is .*, should be a number from 0 to 10000; mend it"):
         open_source("folder", tmp_path, fps=fps)
 
@@ -261,12 +245,12 @@ def test_times_that_count_from_1970(tmp_path: Path) -> None:
     place = write_episode(tmp_path)
     lines = ["timestamp,x", *(f"{1.7e9 + row / 10:.3f},{row}" for row in range(COUNT))]
     (place / "actions.csv").write_text("\n".join(lines))
-    (episode,) = read_all(tmp_path)
+    (episode,) = read_all("folder", tmp_path)
     assert episode.fps == pytest.approx(10, rel=1e-3)
     np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10, atol=1e-4)
 
 
-def test_times_that_stand_still_are_told(tmp_path: Path) -> None:
+def test_times_that_stand_still_are_reported(tmp_path: Path) -> None:
     place = write_episode(tmp_path)
     (place / "actions.csv").write_text("timestamp,x\n" + "5,1\n" * COUNT)
-    assert "timestamps do not increase at frame 1" in error_of(tmp_path)
+    assert "timestamps do not increase at frame 1" in error_of("folder", tmp_path)

@@ -71,7 +71,7 @@ def test_a_demo_of_another_file_is_refused(tmp_path: Path) -> None:
             source.read(ref)
 
 
-def test_links_that_lead_in_a_circle_are_told(path: Path) -> None:
+def test_links_that_lead_in_a_circle_are_reported(path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["one"], file["two"] = h5py.SoftLink("/two"), h5py.SoftLink("/one")
     with pytest.raises(EpisodeError, match=r"a.h5: "), open_file(path) as file:
@@ -86,7 +86,7 @@ def test_chunks_of_gigantic_size_are_refused(path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["group", "nothing", "rows"])
-def test_what_is_no_picture_is_told(path: Path, key: str) -> None:
+def test_what_is_no_picture_is_reported(path: Path, key: str) -> None:
     for kind in (H5Frames, H5Depths):
         with pytest.raises(EpisodeError, match=rf"a.h5: {key} is "):
             kind(path, key)

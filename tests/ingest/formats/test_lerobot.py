@@ -1,5 +1,4 @@
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +8,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rsjax.ingest.episode import Episode
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import read_all
 from tests.ingest.formats.videos import numbers_of, picture, write_video
 
 LENGTHS = (6, 9, 5)
@@ -107,14 +106,10 @@ def write_v3(root: Path, codec: str = "libx264") -> Path:
 WRITERS = {"v2.1": write_v2, "v3.0": write_v3}
 
 
-def read_all(root: Path, **options: Any) -> list[Episode]:
-    source = pickle.loads(pickle.dumps(open_source("lerobot", root, **options)))
-    return [source.read(pickle.loads(pickle.dumps(ref))) for ref in source.episodes()]
-
-
 @pytest.mark.parametrize("version", WRITERS)
 def test_every_picture_action_and_state_is_where_it_belongs(tmp_path: Path, version: str) -> None:
-    for episode, (number, first) in zip(read_all(WRITERS[version](tmp_path)), enumerate((0, 6, 15)), strict=True):
+    episodes = read_all("lerobot", WRITERS[version](tmp_path))
+    for episode, (number, first) in zip(episodes, enumerate((0, 6, 15)), strict=True):
         count = LENGTHS[number]
         assert episode.id == f"episode_{number:06d}"
         assert list(episode.cameras) == ["top"]
@@ -135,12 +130,13 @@ def test_every_picture_action_and_state_is_where_it_belongs(tmp_path: Path, vers
 
 @pytest.mark.parametrize("version", WRITERS)
 def test_av1(tmp_path: Path, version: str) -> None:
-    episode = read_all(WRITERS[version](tmp_path, "libsvtav1"))[1]
+    episode = read_all("lerobot", WRITERS[version](tmp_path, "libsvtav1"))[1]
     assert numbers_of(episode.cameras["top"].read([8, 0, 3])) == [14, 6, 9]
 
 
 def test_both_versions_give_the_same(tmp_path: Path) -> None:
-    for old, new in zip(read_all(write_v2(tmp_path / "2")), read_all(write_v3(tmp_path / "3")), strict=True):
+    versions = [read_all("lerobot", write(tmp_path / name)) for name, write in WRITERS.items()]
+    for old, new in zip(*versions, strict=True):
         np.testing.assert_array_equal(old.actions, new.actions)
         assert (old.task, old.segments, old.meta) == (new.task, new.segments, new.meta)
 
@@ -168,4 +164,4 @@ def test_pictures_in_the_table(tmp_path: Path) -> None:
         ]
         path = root / f"data/chunk-{episode // 2:03d}/episode_{episode:06d}.parquet"
         pq.write_table(pa.table(rows(episode, first) | {"observation.image": encoded}), path)
-    assert numbers_of(read_all(root)[1].cameras["image"].read([8, 1])) == [14, 7]
+    assert numbers_of(read_all("lerobot", root)[1].cameras["image"].read([8, 1])) == [14, 7]

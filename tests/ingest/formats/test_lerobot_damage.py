@@ -12,20 +12,8 @@ import pytest
 
 from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import error_of, read_first
 from tests.ingest.formats.test_lerobot import FPS, KEY, V2_PATHS, rows, write_info, write_v2, write_v3
-
-
-def only_error(root: Path, number: int = 1) -> str:
-    """The message of the one episode that cannot be read."""
-    source, failed = open_source("lerobot", root), {}
-    for place, ref in enumerate(source.episodes()):
-        try:
-            source.read(ref)
-        except EpisodeError as error:
-            failed[place] = str(error)
-    assert list(failed) == [number]
-    assert "\n" not in failed[number]
-    return failed[number]
 
 
 def rewrite(path: Path, column: str, values: Any) -> None:
@@ -51,7 +39,7 @@ def rewrite(path: Path, column: str, values: Any) -> None:
 def test_a_wrong_column_is_named(tmp_path: Path, column: str, values: Any, message: str) -> None:
     root = write_v2(tmp_path)
     rewrite(root / "data/chunk-000/episode_000001.parquet", column, values)
-    error = only_error(root)
+    error = error_of("lerobot", root, 1)
     assert error.startswith(str(root))
     assert re.search(message, error), error
 
@@ -60,13 +48,15 @@ def test_shared_files_are_checked_against_the_ranges(tmp_path: Path) -> None:
     root = write_v3(tmp_path)
     meta = root / "meta/episodes/chunk-000/file-000.parquet"
     rewrite(meta, "dataset_from_index", [0, 5, 15])
-    assert "episode 1 is 5 … 15 of the rows, but has 9" in only_error(root)
+    assert "episode 1 is 5 … 15 of the rows, but has 9" in error_of("lerobot", root, 1)
     rewrite(meta, "dataset_from_index", [0, 6, 15])
     rewrite(meta, "length", [6, 8, 5])
-    assert "9 rows of episode 1, metadata say 8" in only_error(root)
+    assert "9 rows of episode 1, metadata say 8" in error_of("lerobot", root, 1)
     rewrite(meta, "length", [6, 9, 5])
     rewrite(meta, f"videos/{KEY}/from_timestamp", [0.0, 0.6002, 0.0])
-    assert "no frame at 0.6002 s, row 0 of the table: the nearest is 0.0002 s away, 0.0001 s" in only_error(root)
+    assert "no frame at 0.6002 s, row 0 of the table: the nearest is 0.0002 s away, 0.0001 s" in error_of(
+        "lerobot", root, 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -76,9 +66,9 @@ def test_missing_and_truncated_files_are_named(tmp_path: Path, name: str) -> Non
     root = write_v2(tmp_path)
     payload = (root / name).read_bytes()
     (root / name).write_bytes(payload[: len(payload) // 2])
-    assert only_error(root).startswith(f"{root / name}: ")
+    assert error_of("lerobot", root, 1).startswith(f"{root / name}: ")
     (root / name).unlink()
-    assert only_error(root).startswith(f"{root / name}: missing")
+    assert error_of("lerobot", root, 1).startswith(f"{root / name}: missing")
 
 
 def test_bad_entries_are_counted_not_dropped(tmp_path: Path) -> None:
@@ -93,7 +83,7 @@ def test_bad_entries_are_counted_not_dropped(tmp_path: Path) -> None:
             source.read(ref)
 
 
-def test_episodes_that_the_metadata_lack_are_told(tmp_path: Path) -> None:
+def test_episodes_that_the_metadata_lack_are_reported(tmp_path: Path) -> None:
     root = write_v2(tmp_path)
     lines = (root / "meta/episodes.jsonl").read_text().splitlines(keepends=True)
     (root / "meta/episodes.jsonl").write_text("".join(lines[:2]))
@@ -118,10 +108,10 @@ def test_late_times_are_as_exact_as_float32_is(tmp_path: Path) -> None:
     root = write_v2(tmp_path)
     late = pa.array(np.float32(5000) + np.arange(9, dtype=np.float32) / FPS, pa.float32())
     rewrite(root / "data/chunk-000/episode_000001.parquet", "timestamp", late)
-    assert "no frame at 5000.0000 s, row 0" in only_error(root)  # not: unevenly spaced
+    assert "no frame at 5000.0000 s, row 0" in error_of("lerobot", root, 1)  # not: unevenly spaced
 
 
-def test_a_table_without_encoded_pictures_is_told(tmp_path: Path) -> None:
+def test_a_table_without_encoded_pictures_is_reported(tmp_path: Path) -> None:
     root = write_v2(tmp_path)
     write_info(root, "v2.0", V2_PATHS, features={"action": {"dtype": "float32"}, "picture": {"dtype": "image"}})
     path = root / "data/chunk-000/episode_000001.parquet"
@@ -151,7 +141,7 @@ def test_paths_lead_nowhere_else(tmp_path: Path, template: str, message: str) ->
             source.read(ref)
 
 
-def test_an_unreadable_data_set_is_told(tmp_path: Path) -> None:
+def test_an_unreadable_data_set_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"meta/info.json: missing; .*or give the folder that has meta/"):
         open_source("lerobot", tmp_path)
     write_info(write_v2(tmp_path), "v1.6", V2_PATHS)
@@ -173,17 +163,15 @@ def test_an_unreadable_data_set_is_told(tmp_path: Path) -> None:
         open_source("lerobot", tmp_path)
 
 
-@pytest.mark.parametrize(("name", "wrong"), [("held", 99), ("held", -1), ("quaternions", 99)])
-def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str, wrong: int) -> None:
+def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> None:
     write_v2(tmp_path)
-    source = open_source("lerobot", tmp_path, **{name: [wrong]})
-    with pytest.raises(EpisodeError, match=rf"parquet: {name} names dimension {wrong}, but actions have"):
-        source.read(next(source.episodes()))
+    with pytest.raises(EpisodeError, match="parquet: held names dimension 99, but actions have"):
+        read_first("lerobot", tmp_path, held=[99])
 
 
-def test_a_pipe_in_place_of_a_video_is_told_and_not_waited_for(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_a_video_is_reported_and_not_waited_for(tmp_path: Path) -> None:
     write_v2(tmp_path)
     video = next(tmp_path.rglob("episode_000001.mp4"))
     video.unlink()
     os.mkfifo(video)
-    assert "a pipe or device, not a file" in only_error(tmp_path)
+    assert "a pipe or device, not a file" in error_of("lerobot", tmp_path, 1)

@@ -5,6 +5,7 @@ import pytest
 
 from rsjax.ingest.episode import SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import read_first
 from tests.ingest.formats.toy_demos import SIDE, demo, write_demos
 
 
@@ -14,15 +15,13 @@ def libero_demo(count: int = 4) -> dict[str, np.ndarray]:
 
 def test_pictures_are_turned_upright(tmp_path: Path) -> None:
     write_demos(tmp_path / "libero_goal" / "open_the_drawer_demo.hdf5", {"demo_0": libero_demo()})
-    source = open_source("libero", tmp_path)
-    frames = source.read(next(source.episodes())).cameras["agentview"].read([1])
+    frames = read_first("libero", tmp_path).cameras["agentview"].read([1])
     assert frames[0, 0, 0, 0] == 255 and frames[0, SIDE - 1, SIDE - 1, 0] == 11
 
 
 def test_an_action_stands_with_the_frame_that_was_recorded_after_it(tmp_path: Path) -> None:
     path = write_demos(tmp_path / "a_demo.hdf5", {"demo_0": libero_demo()})
-    source = open_source("libero", path)
-    episode = source.read(next(source.episodes()))
+    episode = read_first("libero", path)
     assert episode.cameras["agentview"].read(range(4))[:, 3, 3, 0].tolist() == [10, 11, 12, 13]
     # Action t of the file is t + 1 and led into frame t; the first one's start was not recorded.
     np.testing.assert_array_equal(episode.actions[:, 0], [0, 2, 3, 4])
@@ -34,8 +33,7 @@ def test_the_same_file_is_one_off_from_robomimic(tmp_path: Path) -> None:
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": libero_demo() | demo()})
     rows = []
     for name in ("robomimic", "libero"):
-        source = open_source(name, path)
-        rows.append(source.read(next(source.episodes())).actions)
+        rows.append(read_first(name, path).actions)
     np.testing.assert_array_equal(rows[1][1:], rows[0][1:] + 1)
 
 

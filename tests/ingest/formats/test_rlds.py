@@ -12,6 +12,7 @@ from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
 from rsjax.ingest.formats.keymap import MAPS
 from tests.bridge import BRIDGE, needs_bridge
+from tests.ingest.formats.reading import read_first
 from tests.ingest.formats.toy_tfrecord import bridge_episode, encoded, picture, step, write_bridge, write_records
 
 
@@ -32,8 +33,7 @@ def test_an_action_stands_with_the_frame_that_it_led_into(tmp_path: Path) -> Non
 
 def test_placeholder_cameras_are_left_out_and_named(tmp_path: Path) -> None:
     write_bridge(tmp_path, [bridge_episode()])
-    source = open_source("rlds", tmp_path)
-    episode = source.read(next(source.episodes()))
+    episode = read_first("rlds", tmp_path)
     assert list(episode.cameras) == ["image_0"] and episode.meta["blank"] == ["image_1", "image_2", "image_3"]
 
 
@@ -51,30 +51,27 @@ def test_references_and_sources_travel(tmp_path: Path) -> None:
 def test_text_that_changes_on_the_way_makes_segments(tmp_path: Path) -> None:
     texts = [b"reach", b"reach", b"", b"lift", b"lift"]
     write_bridge(tmp_path, [bridge_episode(5, changes={"steps/language_instruction": texts})])
-    source = open_source("rlds", tmp_path)
-    segments = source.read(next(source.episodes())).segments
+    segments = read_first("rlds", tmp_path).segments
     assert [(part.start, part.end, part.text) for part in segments] == [(0, 2, "reach"), (3, 5, "lift")]
 
 
 def test_text_as_numbers_is_read(tmp_path: Path) -> None:
     codes = [*b"go", 0, 0] * 5
     write_bridge(tmp_path, [bridge_episode(5, changes={"steps/language_instruction": codes})])
-    source = open_source("rlds", tmp_path)
-    assert source.read(next(source.episodes())).task == "go"
+    assert read_first("rlds", tmp_path).task == "go"
 
 
 def test_a_key_map_of_ones_own(tmp_path: Path) -> None:
     write_bridge(tmp_path / "data", [bridge_episode()])
     keys = {"cameras": {"front": "observation/image_0"}, "action": ["action"], "fps": 2, "after": True}
     (tmp_path / "map.json").write_text(json.dumps(keys))
-    source = open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
-    episode = source.read(next(source.episodes()))
+    episode = read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
     assert list(episode.cameras) == ["front"] and episode.fps == 2 and episode.states is None
     np.testing.assert_array_equal(episode.actions[:, 0], [0, 2, 3, 4, 5])  # recorded with the frame they led into
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"cameras": {"a": "observation/image_9"}}, "no steps/observation/image_9.*did you mean 'observation/image_"),
         ({"cameras": {"a": "action"}}, "steps/action is of kind tensor"),
@@ -85,22 +82,20 @@ def test_a_key_map_of_ones_own(tmp_path: Path) -> None:
         ({"kind": "relative"}, "kind is 'relative'"),
     ],
 )
-def test_a_key_map_that_does_not_fit_is_told(tmp_path: Path, change: dict, said: str) -> None:
+def test_a_key_map_that_does_not_fit_is_reported(tmp_path: Path, change: dict, message: str) -> None:
     write_bridge(tmp_path / "data", [bridge_episode()])
     keys = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2} | change
     (tmp_path / "map.json").write_text(json.dumps(keys))
-    with pytest.raises(SourceError, match=said):
+    with pytest.raises(SourceError, match=message):
         open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
 
 
-@pytest.mark.parametrize("name", ["held", "quaternions"])
-def test_dimensions_that_actions_do_not_have_are_told(tmp_path: Path, name: str) -> None:
+def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> None:
     write_bridge(tmp_path / "data", [bridge_episode()])
-    keys = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2, name: [99]}
+    keys = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2, "quaternions": [99]}
     (tmp_path / "map.json").write_text(json.dumps(keys))
-    source = open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
-    with pytest.raises(EpisodeError, match=f"key map: {name} names dimension 99, but actions have 7"):
-        source.read(next(source.episodes()))
+    with pytest.raises(EpisodeError, match="key map: quaternions names dimension 99, but actions have 7"):
+        read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
 
 
 def test_every_named_map_is_whole() -> None:
@@ -117,7 +112,7 @@ def test_an_unknown_data_set_asks_for_a_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("broken", "said"),
+    ("broken", "message"),
     [
         (bridge_episode(5, changes={"steps/action": np.zeros(34)}), "steps/action has 34 values for 5 steps"),
         (bridge_episode(5, changes={"steps/action": np.full(35, np.nan)}), "actions of frame 1 is not finite"),
@@ -129,22 +124,21 @@ def test_an_unknown_data_set_asks_for_a_map(tmp_path: Path) -> None:
         (b"\xff\xff\xff", "no tf.train.Example"),
     ],
 )
-def test_one_broken_episode_leaves_the_others(tmp_path: Path, broken: bytes, said: str) -> None:
+def test_one_broken_episode_leaves_the_others(tmp_path: Path, broken: bytes, message: str) -> None:
     write_bridge(tmp_path, [bridge_episode(), broken, bridge_episode(3)])
     source = open_source("rlds", tmp_path)
     first, second, third = source.episodes()
     assert [len(source.read(ref).timestamps) for ref in (first, third)] == [5, 3]
-    with pytest.raises(EpisodeError, match=said):
+    with pytest.raises(EpisodeError, match=message):
         source.read(second)
 
 
-def test_a_picture_that_is_cut_off_is_told_when_it_is_read(tmp_path: Path) -> None:
+def test_a_picture_that_is_cut_off_is_reported_when_it_is_read(tmp_path: Path) -> None:
     pictures = [encoded(picture(step(t))) for t in range(5)]
     write_bridge(
         tmp_path, [bridge_episode(5, changes={"steps/observation/image_0": [*pictures[:4], pictures[4][:20]]})]
     )
-    source = open_source("rlds", tmp_path)
-    frames = source.read(next(source.episodes())).cameras["image_0"]
+    frames = read_first("rlds", tmp_path).cameras["image_0"]
     assert len(frames.read([0, 3])) == 2
     with pytest.raises(EpisodeError, match="image_0 frame 4"):
         frames.read([0, 4])
@@ -161,7 +155,7 @@ def test_a_truncated_shard_is_one_more_entry_that_is_refused(tmp_path: Path, cut
         source.read(bad)
 
 
-def test_a_shard_that_lacks_records_is_told(tmp_path: Path) -> None:
+def test_a_shard_that_lacks_records_is_reported(tmp_path: Path) -> None:
     write_bridge(tmp_path, [bridge_episode()], promised=3)
     source = open_source("rlds", tmp_path)
     _, bad = source.episodes()
@@ -209,7 +203,7 @@ def test_damage_that_no_checksum_shows_is_refused_or_harmless(
 
 
 @pytest.mark.parametrize("content", ['{"featuresDict": 3}', '{"featuresDict": {"features": {"steps": []}}}', "[]"])
-def test_another_features_file_is_told(tmp_path: Path, content: str) -> None:
+def test_another_features_file_is_reported(tmp_path: Path, content: str) -> None:
     write_bridge(tmp_path, [bridge_episode()])
     (tmp_path / "features.json").write_text(content)
     with pytest.raises(SourceError, match="features.json: "):
@@ -219,9 +213,8 @@ def test_another_features_file_is_told(tmp_path: Path, content: str) -> None:
 def test_an_episode_of_placeholders_is_refused(tmp_path: Path) -> None:
     white = [encoded(np.full((8, 8, 3), 255, np.uint8))] * 5
     write_bridge(tmp_path, [bridge_episode(changes={"steps/observation/image_0": white})])
-    source = open_source("rlds", tmp_path)
     with pytest.raises(EpisodeError, match="image_0, image_1, image_2, image_3 hold placeholders"):
-        source.read(next(source.episodes()))
+        read_first("rlds", tmp_path)
 
 
 def test_a_path_out_of_the_folder_is_refused(tmp_path: Path) -> None:
@@ -233,7 +226,7 @@ def test_a_path_out_of_the_folder_is_refused(tmp_path: Path) -> None:
         source.read(ref)
 
 
-def test_nothing_to_read_is_told(tmp_path: Path) -> None:
+def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no .*tfrecord"):
         open_source("rlds", tmp_path)
     write_bridge(tmp_path, [bridge_episode()])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import read_first
 from tests.ingest.formats.toy_demos import SIDE, demo, write_demos
 
 ENVIRONMENT = {"env_name": "Lift", "env_kwargs": {"control_freq": 10}}
@@ -45,12 +46,11 @@ def test_a_filter_chooses_demos(tmp_path: Path) -> None:
     assert [ref.location["demo"] for ref in chosen] == ["demo_0", "demo_2"]
     with pytest.raises(SourceError, match="no mask/trian; did you mean 'train'"):
         list(open_source("robomimic", path, filter="trian").episodes())
-    source = open_source("robomimic", path, filter="valid")
     with pytest.raises(EpisodeError, match="has no data/demo_7/obs"):
-        source.read(next(source.episodes()))
+        read_first("robomimic", path, filter="valid")
 
 
-def test_files_without_pictures_are_told_at_once(tmp_path: Path) -> None:
+def test_files_without_pictures_are_reported_at_once(tmp_path: Path) -> None:
     arrays = {key: array for key, array in demo().items() if not key.endswith("_image")}
     path = write_demos(tmp_path / "low_dim_v15.hdf5", {"demo_0": arrays})
     with pytest.raises(SourceError, match=r"low_dim_v15.hdf5: data/demo_0/obs has no \*_image; render them with"):
@@ -60,22 +60,20 @@ def test_files_without_pictures_are_told_at_once(tmp_path: Path) -> None:
 def test_depth_is_taken_when_asked(tmp_path: Path) -> None:
     depth = np.arange(4.0)[:, None, None, None] * np.ones((4, SIDE, SIDE, 1)) + 0.5
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo() | {"obs/agentview_depth": depth}})
-    source = open_source("robomimic", path, depth=True)
-    maps = source.read(next(source.episodes())).depth["agentview"].read([2, 0])
+    maps = read_first("robomimic", path, depth=True).depth["agentview"].read([2, 0])
     assert maps.shape == (2, SIDE, SIDE) and maps.dtype == np.float32 and maps[:, 1, 1].tolist() == [2.5, 0.5]
 
 
 def test_quaternions_of_the_state_keep_their_sign(tmp_path: Path) -> None:
     turns = np.tile([0.0, 0.6, 0.0, 0.8], (4, 1)) * np.array([[1], [-1], [-1], [1]])
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo() | {"obs/robot0_eef_quat": turns}})
-    source = open_source("robomimic", path)
-    episode = source.read(next(source.episodes()))
+    episode = read_first("robomimic", path)
     np.testing.assert_allclose(np.asarray(episode.states)[:, 3:7], [[0, 0.6, 0, 0.8]] * 4, atol=1e-6)
     assert episode.meta["notes"] == {"flipped": {"robot0_eef_quat": 2}}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"actions": np.zeros((3, 7))}, "states has 4 rows"),
         ({"actions": np.array([["a"]] * 4, dtype="S1")}, "data/demo_0/actions is .*should be numbers"),
@@ -86,12 +84,12 @@ def test_quaternions_of_the_state_keep_their_sign(tmp_path: Path) -> None:
         ({"obs/robot0_eef_pos": np.zeros((2, 3))}, "states has 2 rows"),
     ],
 )
-def test_one_broken_demo_leaves_the_others(tmp_path: Path, change: dict, said: str) -> None:
+def test_one_broken_demo_leaves_the_others(tmp_path: Path, change: dict, message: str) -> None:
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo() | change, "demo_1": demo()})
     source = open_source("robomimic", path)
     bad, good = source.episodes()
     assert len(source.read(good).timestamps) == 4
-    with pytest.raises(EpisodeError, match=f"a.hdf5: .*({said})"):
+    with pytest.raises(EpisodeError, match=f"a.hdf5: .*({message})"):
         source.read(bad)
 
 
@@ -99,26 +97,23 @@ def test_pictures_of_gigantic_dimensions_are_refused(tmp_path: Path) -> None:
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": {key: a for key, a in demo().items() if "image" not in key}})
     with h5py.File(path, "a") as file:
         file.create_dataset("data/demo_0/obs/a_image", (4, 10**6, 10**6, 3), np.uint8, chunks=(1, 16, 16, 3))
-    source = open_source("robomimic", path)
     with pytest.raises(EpisodeError, match="a_image is uint8 .*1000000"):
-        source.read(next(source.episodes()))
+        read_first("robomimic", path)
 
 
-def test_a_wrong_num_samples_is_told(tmp_path: Path) -> None:
+def test_a_wrong_num_samples_is_reported(tmp_path: Path) -> None:
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()})
     with h5py.File(path, "a") as file:
         file["data/demo_0"].attrs["num_samples"] = 9
-    source = open_source("robomimic", path)
     with pytest.raises(EpisodeError, match="actions has 4 rows, num_samples says 9"):
-        source.read(next(source.episodes()))
+        read_first("robomimic", path)
 
 
 @pytest.mark.parametrize("fps", ["20", -5, [20]])
-def test_an_impossible_rate_is_told(tmp_path: Path, fps: object) -> None:
+def test_an_impossible_rate_is_reported(tmp_path: Path, fps: object) -> None:
     path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()}, env_args={"env_kwargs": {"control_freq": fps}})
-    source = open_source("robomimic", path)
     with pytest.raises(EpisodeError, match="a.hdf5: control_freq in data.env_args is"):
-        source.read(next(source.episodes()))
+        read_first("robomimic", path)
 
 
 def test_an_unreadable_file_among_others_is_one_entry(tmp_path: Path) -> None:
@@ -148,14 +143,13 @@ def test_a_file_cut_anywhere_gives_episodes_or_clear_errors(
             source.read(ref)
 
 
-def test_nothing_to_read_is_told(tmp_path: Path) -> None:
+def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no .*hdf5 files"):
         open_source("robomimic", tmp_path)
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["x"] = 1
-    source = open_source("robomimic", tmp_path)
     with pytest.raises(EpisodeError, match="has no group data"):
-        source.read(next(source.episodes()))
+        read_first("robomimic", tmp_path)
 
 
 def test_a_file_without_demos_is_one_entry(tmp_path: Path) -> None:

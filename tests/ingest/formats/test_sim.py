@@ -6,6 +6,7 @@ import pytest
 from rsjax.data.store import Record, write_store
 from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
+from tests.ingest.formats.reading import read_first
 
 FRAMES = 4
 
@@ -43,19 +44,17 @@ def test_a_clip_is_an_episode_as_it_is(tmp_path: Path) -> None:
 
 def test_a_clip_cut_from_a_recording_keeps_its_times(tmp_path: Path) -> None:
     cut = {"camera": "front", "fps": 30.0, "frames": [30, 45, 60, 75], "depth_unit": "relative"}
-    source = open_source("sim", write(tmp_path / "store", clip(provenance=cut)))
-    episode = source.read(next(source.episodes()))
+    episode = read_first("sim", write(tmp_path / "store", clip(provenance=cut)))
     assert episode.fps == pytest.approx(2.0) and episode.depth == {}
     np.testing.assert_allclose(episode.timestamps, [0, 0.5, 1, 1.5])
 
 
 def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
-    source = open_source("sim", write(tmp_path / "store", clip(depth=None)))
-    assert source.read(next(source.episodes())).depth == {}
+    assert read_first("sim", write(tmp_path / "store", clip(depth=None))).depth == {}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"rgb": np.zeros((4, 5, 5, 3), np.float32)}, "rgb is float32"),
         ({"actions": np.zeros((3, 14), np.float32)}, "camera agentview|actions has 3 rows, timestamps 4"),
@@ -67,13 +66,12 @@ def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
         ({"provenance": [1]}, "provenance or settings are wrong"),
     ],
 )
-def test_a_clip_with_other_arrays_is_refused(tmp_path: Path, change: dict, said: str) -> None:
-    source = open_source("sim", write(tmp_path / "store", clip(**change)))
-    with pytest.raises(EpisodeError, match=f"train-00000.array_record: train record 0.*({said})"):
-        source.read(next(source.episodes()))
+def test_a_clip_with_other_arrays_is_refused(tmp_path: Path, change: dict, message: str) -> None:
+    with pytest.raises(EpisodeError, match=f"train-00000.array_record: train record 0.*({message})"):
+        read_first("sim", write(tmp_path / "store", clip(**change)))
 
 
-def test_what_is_no_store_of_clips_is_told(tmp_path: Path) -> None:
+def test_what_is_no_store_of_clips_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no store"):
         open_source("sim", tmp_path)
     write_store(tmp_path / "tokens", "tokens", {"train": [{"x": 1}]}, {})

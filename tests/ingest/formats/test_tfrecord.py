@@ -69,11 +69,11 @@ def test_an_example_has_its_features() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "rows", "said"), [("y", 3, "has no y"), ("x", 4, "6 values for 4"), ("text", 1, "bytes")]
+    ("name", "rows", "message"), [("y", 3, "has no y"), ("x", 4, "6 values for 4"), ("text", 1, "bytes")]
 )
-def test_a_feature_that_does_not_fit_is_named(name: str, rows: int, said: str) -> None:
+def test_a_feature_that_does_not_fit_is_named(name: str, rows: int, message: str) -> None:
     parsed = Example(example({"x": np.arange(6.0), "text": [b"a"]}), "here")
-    with pytest.raises(EpisodeError, match=f"^here: .*{said}"):
+    with pytest.raises(EpisodeError, match=f"^here: .*{message}"):
         parsed.numbers(name, rows)
 
 
