@@ -13,23 +13,17 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class Commands:
-    """Runs the project's commands as a user does, each in a process of its own. What they compile is kept for the next.
+    """Runs the project's commands as a user does, each in a process of its own.
 
     Attributes:
         data: the ``--data-dir`` of them all.
-        cache: where compiled programs are kept.
     """
 
     data: Path
-    cache: Path
 
     def __call__(self, module: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         line = [sys.executable, "-m", module, *map(str, arguments), "--data-dir", str(self.data)]
-        environment = os.environ | {
-            "JAX_COMPILATION_CACHE_DIR": str(self.cache),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "JAX_PLATFORMS": "cpu",
-        }
+        environment = os.environ | {"JAX_PLATFORMS": "cpu"}
         return subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
 
     def train(self, run: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -53,7 +47,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def command(shared: Path) -> Commands:
-    return Commands(shared / "data", shared / "compiled")
+    return Commands(shared / "data")
 
 
 @pytest.fixture(scope="session")

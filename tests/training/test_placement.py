@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def virtual(devices: int) -> dict[str, str]:
-    """The environment of a process with so many devices; unoptimised, as it mostly compiles."""
-    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
+    """The environment of a process with so many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
