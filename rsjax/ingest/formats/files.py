@@ -142,7 +142,7 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
 def _check_size(metadata: pq.FileMetaData, most: int, path: Path) -> None:
     """Raises :class:`EpisodeError` if a table is too large: one number a thousand million times takes few bytes.
 
-    Not asked is what the file says of each column chunk: if that is damaged, pyarrow ends the process.
+    Does not read the metadata of column chunks: if those are damaged, pyarrow ends the process.
     """
     size = sum(metadata.row_group(number).total_byte_size for number in range(metadata.num_row_groups))
     if metadata.num_rows > most or size > _MOST_BYTES:

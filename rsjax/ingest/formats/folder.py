@@ -113,7 +113,7 @@ class Folder:
                 flat += 1
                 yield self._ref(name, flat=True, files=sorted(files))
         if not folders and not flat:
-            raise SourceError(f"{self._root}: holds no episode: no folder, video or table; give the one that does")
+            raise SourceError(f"{self._root}: has no episode: no folder, video or table; give the one that does")
 
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one episode."""

@@ -210,7 +210,7 @@ def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> Non
 
 def test_a_folder_of_nothing_is_reported(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(SourceError, match=f"^{tmp_path}: holds no episode"):
+    with pytest.raises(SourceError, match=f"^{tmp_path}: has no episode"):
         list(open_source("folder", tmp_path).episodes())
 
 
