@@ -1,6 +1,5 @@
-import multiprocessing
-import os
-import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -60,22 +59,22 @@ def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(
         pass
 
 
-def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ready, path = multiprocessing.get_context("fork").Event(), tmp_path / "lock"
-    process = multiprocessing.get_context("fork").Process(target=_keep, args=(path, ready))
-    process.start()
-    assert ready.wait(10) and process.pid
-    with lock(path) as free:
-        assert not free
-    os.kill(process.pid, signal.SIGKILL)
-    with lock(path, wait="waiting for another process") as free:
-        assert free
-    process.join()
+KEEP = """
+import sys, time
+from pathlib import Path
+from rsjax.files import lock
+with lock(Path(sys.argv[1])):
+    print("ready", flush=True)
+    time.sleep(60)
+"""
 
 
-def _keep(path: Path, ready: Any) -> None:
-    with lock(path):
-        ready.set()
-        signal.pause()
+def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    with subprocess.Popen([sys.executable, "-c", KEEP, path], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout and process.stdout.readline() == "ready\n"
+        with lock(path) as free:
+            assert not free
+        process.kill()
+        with lock(path, wait="waiting for another process") as free:
+            assert free

@@ -43,7 +43,7 @@ class Prefetch:
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any], ahead: int = 2) -> None:
         self._loader, self._state = loader, loader.state()
-        self._batches = ThreadPrefetchDatasetIterator(_Batches(loader, put), ahead)
+        self._batches: Any = ThreadPrefetchDatasetIterator(_Batches(loader, put), ahead)
         self._batches.start_prefetch()
         self.waited = 0.0
 
@@ -52,10 +52,10 @@ class Prefetch:
 
     def __next__(self) -> DeviceBatch:
         began = time.monotonic()
-        try:
-            item = next(self._batches)
-        finally:
-            self.waited += time.monotonic() - began
+        item = next(self._batches)
+        self.waited += time.monotonic() - began
+        if isinstance(item, BaseException):
+            raise item
         self._state = item.after
         return item
 
@@ -85,24 +85,37 @@ class Prefetch:
 
     def close(self) -> None:
         """Stops the thread and closes the loader."""
-        self._batches.close()
+        if self._batches is not None:
+            self._batches.close()
+            self._batches = None  # Grain's iterator prints an error where it lives until the interpreter exits
         self._loader.close()
 
 
 class _Batches:
-    """A loader's batches on the device, in the form that Grain prefetches from."""
+    """A loader's batches on the device, in the form that Grain prefetches from.
+
+    After an error, each further item is that error. Grain's thread forwards an :class:`Exception` alone; of any other,
+    such as :class:`rsjax.errors.Preempted`, it dies silently, and the training loop would wait for ever.
+    """
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any]) -> None:
         self._loader, self._put = loader, put
+        self._failure: BaseException | None = None
 
-    def __iter__(self) -> Iterator[DeviceBatch]:
+    def __iter__(self) -> Iterator[DeviceBatch | BaseException]:
         return self
 
-    def __next__(self) -> DeviceBatch:
-        before = self._loader.state()
-        arrays = next(self._loader)
-        clips = {name: arrays[name] for name in ("part", "record")}
-        return DeviceBatch(self._put(arrays), clips, before, self._loader.state())
+    def __next__(self) -> DeviceBatch | BaseException:
+        if self._failure is not None:
+            return self._failure
+        try:
+            before = self._loader.state()
+            arrays = next(self._loader)
+            clips = {name: arrays[name] for name in ("part", "record")}
+            return DeviceBatch(self._put(arrays), clips, before, self._loader.state())
+        except BaseException as error:
+            self._failure = error
+            return error
 
     def get_state(self) -> dict[str, Any]:
         return self._loader.state()

@@ -71,7 +71,7 @@ def loader(stages: list[CurriculumStage], size: int, place: int = 0, shard: tupl
     return Loader(stages, size, 3, UNLISTED, shard=options, state=state)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(curricula(), st.data())
 def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
     curriculum: tuple[list[CurriculumStage], int], data: st.DataObject
@@ -92,7 +92,7 @@ def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
     assert (rest["index"] == np.arange(size)).all()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(curricula())
 def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(
     curriculum: tuple[list[CurriculumStage], int],
@@ -150,7 +150,7 @@ def test_clips_are_named_by_store_and_record_with_where_they_come_from(source: S
         assert Path(row["store"]).name == "set"
 
 
-def test_processes_change_nothing_whether_told_to_stop_or_killed(tmp_path: Path) -> None:
+def test_processes_change_nothing_whether_stopped_or_killed(tmp_path: Path) -> None:
     """Two worker processes over a stage's border, a mixture and a damaged record."""
     one, other = toy.store(tmp_path / "one", 5), toy.store(tmp_path / "other", 6, first=100)
     toy.damage(tmp_path / "one", 3)

@@ -63,20 +63,20 @@ def _opened(path: Path) -> bool:
     return True
 
 
-def test_a_loop_of_links_is_told(path: Path) -> None:
+def test_a_loop_of_links_is_reported(path: Path) -> None:
     (path / MANIFEST).rename(path / "real")
     (path / MANIFEST).symlink_to(MANIFEST)
     with pytest.raises(StoreError, match=r"manifest.json: cannot be read \(Too many levels of symbolic links\)"):
         open_store(path)
 
 
-def test_bytes_that_are_no_text_are_told(path: Path) -> None:
+def test_bytes_that_are_no_text_are_reported(path: Path) -> None:
     (path / MANIFEST).write_bytes(b"\xff\xfe\x00")
     with pytest.raises(StoreError, match=r"not JSON"):
         open_store(path)
 
 
-def test_a_missing_permission_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_permission_is_reported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
@@ -96,7 +96,7 @@ def test_a_split_that_leads_elsewhere_is_refused(path: Path, split: str) -> None
         open_store(path)
 
 
-def test_a_shard_that_is_a_loop_of_links_is_told(path: Path) -> None:
+def test_a_shard_that_is_a_loop_of_links_is_reported(path: Path) -> None:
     shard = path / "train-00000.array_record"
     shard.unlink()
     shard.symlink_to(shard)
@@ -104,7 +104,7 @@ def test_a_shard_that_is_a_loop_of_links_is_told(path: Path) -> None:
         open_store(path)
 
 
-def test_a_manifest_of_nothing_but_brackets_is_told(path: Path) -> None:
+def test_a_manifest_of_nothing_but_brackets_is_reported(path: Path) -> None:
     (path / MANIFEST).write_text("[" * 100_000)
     with pytest.raises(StoreError, match=r"manifest.json: not JSON"):
         open_store(path)

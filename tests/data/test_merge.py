@@ -116,19 +116,19 @@ def test_clips_with_and_without_depth_go_together_but_not_metres_and_relative_de
     for name, unit in units.items():
         place = tmp_path / name / "manifest.json"
         place.write_text(json.dumps(json.loads(place.read_text()) | {"depth_unit": unit}))
-    assert merge([blind.path, deep.path], tmp_path / "told").manifest["depth_unit"] == "metres"
+    assert merge([blind.path, deep.path], tmp_path / "both").manifest["depth_unit"] == "metres"
     with pytest.raises(StoreError, match=r"depth_unit: metres in .*deep; relative in .*far"):
         merge([deep.path, tmp_path / "far"], tmp_path / "out")
 
 
-def test_what_was_left_out_of_each_is_told_of_all(tmp_path: Path) -> None:
+def test_what_was_left_out_of_each_is_listed_in_the_merged_store(tmp_path: Path) -> None:
     for number, name in enumerate("ab"):
         place = clip_store(tmp_path / name, 10 * number).path / "manifest.json"
         more = {"quarantine": {"episode": f"bad in {name}"}, "filtered": {f"still {name}": "still"}}
         place.write_text(json.dumps(json.loads(place.read_text()) | more))
-    told = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c").manifest
-    assert told["quarantine"] == {"episode": "bad in a", f"episode ({tmp_path / 'b'})": "bad in b"}
-    assert told["filtered"] == {"still a": "still", "still b": "still"}
+    manifest = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c").manifest
+    assert manifest["quarantine"] == {"episode": "bad in a", f"episode ({tmp_path / 'b'})": "bad in b"}
+    assert manifest["filtered"] == {"still a": "still", "still b": "still"}
 
 
 def test_tokens_of_another_depth_range_are_refused(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 from rsjax.data.loader import Loader, batches
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import StoreError
+from rsjax.errors import Preempted
 from tests.data.toy import Numbers, assert_same, jitter
 
 
@@ -48,7 +49,7 @@ def test_batches_are_put_before_they_are_asked_for_but_no_more_than_wait() -> No
         made.release()
 
     with Prefetch(loader(), put, ahead=2) as ahead:
-        for _ in range(3):  # two wait, and a third is held ready
+        for _ in range(3):  # two wait, and a third is ready
             assert made.acquire(timeout=10)
         assert not made.acquire(timeout=0.1)
         waited = ahead.waited
@@ -71,6 +72,15 @@ def test_an_error_arrives_where_the_batch_is_asked_for_and_stays() -> None:
             with pytest.raises(StoreError, match="cannot be read"):
                 next(ahead)
         assert ahead.state() == {"global_next_index": 0}
+
+
+@pytest.mark.parametrize("error", [Preempted("stop"), KeyboardInterrupt(), StoreError("disk")])
+def test_an_error_of_putting_arrives_whatever_its_kind(error: BaseException) -> None:
+    def fail(arrays: object) -> None:
+        raise error
+
+    with Prefetch(loader(), fail) as ahead, pytest.raises(type(error)):
+        next(ahead)
 
 
 def test_closing_ends_the_thread_while_it_waits_for_room() -> None:

@@ -38,7 +38,7 @@ def test_a_damaged_record_is_replaced_by_the_next_of_its_part_that_can_be_read(
         assert number == int(record["i"]) == next(n for n in following if n not in bad)
 
 
-def test_each_is_told_and_listed_once_and_counted_over_restarts(
+def test_each_is_logged_and_listed_once_and_counted_over_restarts(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "stage" / "quarantine.jsonl"

@@ -182,8 +182,8 @@ def test_labels_are_those_of_the_records_in_their_order(tmp_path_factory: pytest
         return
     labels = store.labels("train")
     for column, name in enumerate(("one", "two")):
-        found = [labels.words[name][code] for code in labels.codes[name]]
-        assert found == [row[column] for row in rows]
+        words = [labels.words[name][code] for code in labels.codes[name]]
+        assert words == [row[column] for row in rows]
         assert sum(labels.counts()[name].values()) == len(rows)
 
 
@@ -221,14 +221,14 @@ def test_only_what_holds_shards_is_to_be_deleted(path: Path, tmp_path: Path, man
             (place / MANIFEST).write_text(manifest)
     with pytest.raises(StoreError, match=f"delete {path} and make it again"):
         open_store(path)
-    with pytest.raises(StoreError, match=r"; give a store, or make one with experiments.ingest") as told:
+    with pytest.raises(StoreError, match=r"; give a store, or make one with experiments.ingest") as caught:
         open_store(theirs)
-    assert "delete" not in str(told.value)
+    assert "delete" not in str(caught.value)
     if manifest is None:
-        assert f"{theirs}: no store (it has no manifest.json)" in str(told.value)
+        assert f"{theirs}: no store (it has no manifest.json)" in str(caught.value)
 
 
-def test_a_place_that_is_none_is_told(tmp_path: Path) -> None:
+def test_a_place_that_is_none_is_reported(tmp_path: Path) -> None:
     (tmp_path / "video.mp4").touch()
     with pytest.raises(StoreError, match=f"{tmp_path}/nowhere: not there"):
         open_store(tmp_path / "nowhere")

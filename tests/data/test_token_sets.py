@@ -65,5 +65,5 @@ def test_tokens_stay_behind_where_a_merged_store_would_not_make_them_so(
     if depth_range is None:
         merged = merge([stores[0].path, clip_store(tmp_path / "c", 20, 3).path], tmp_path / "out")  # c has no tokens
     else:
-        merged = merge([store.path for store in stores], tmp_path / "out")  # depth is told in other units
+        merged = merge([store.path for store in stores], tmp_path / "out")  # depth ranges differ
     assert token_sets(merged) == {}

@@ -44,7 +44,7 @@ def test_motion_counts_only_what_is_seen_twice() -> None:
     assert motion_of(record) == 0
 
 
-def test_a_damaged_record_is_told_and_the_others_are_shown(tmp_path: Path) -> None:
+def test_a_damaged_record_is_reported_and_the_others_are_shown(tmp_path: Path) -> None:
     store = clip_store(tmp_path / "a", size=32)
     shard = tmp_path / "a" / "test-00000.array_record"
     payload = bytearray(shard.read_bytes())
@@ -55,7 +55,7 @@ def test_a_damaged_record_is_told_and_the_others_are_shown(tmp_path: Path) -> No
     assert len(contact_sheet(store)) > 0
 
 
-def test_what_the_manifest_and_the_clips_say_of_their_origin_is_told(tmp_path: Path) -> None:
+def test_what_the_manifest_and_the_clips_say_of_their_origin_is_reported(tmp_path: Path) -> None:
     store = clip_store(tmp_path / "a", count=3)
     records = [store.source("train")[number] for number in range(3)]
     for record, motion in zip(records, (1.0, 3.0, 5.0), strict=True):
@@ -67,7 +67,7 @@ def test_what_the_manifest_and_the_clips_say_of_their_origin_is_told(tmp_path: P
     clip_store(tmp_path / "b" / FOLDER / "abc", count=3, kind="tokens")
     tokens = tmp_path / "b" / FOLDER / "set"
     write_store(tokens, "tokens", {"train": records}, {"key": tokens_key("b", "set")})
-    told, _ = describe(open_store(tmp_path / "b"))
+    lines, _ = describe(open_store(tmp_path / "b"))
     for line in (
         "tokens    set: train 3",
         "episodes  train 2, test 0",
@@ -76,13 +76,13 @@ def test_what_the_manifest_and_the_clips_say_of_their_origin_is_told(tmp_path: P
         "rate      30 fps, every 15 frames (2 Hz) 3×",
         "mean±std  0.5±1, -1±2",
     ):
-        assert line in told
-    assert not any("abc" in line for line in told)  # tokens of other clips
-    (speed,) = [line for line in told if "px/s of a 256-pixel-wide picture" in line]
+        assert line in lines
+    assert not any("abc" in line for line in lines)  # tokens of other clips
+    (speed,) = [line for line in lines if "px/s of a 256-pixel-wide picture" in line]
     assert speed.startswith("motion    1 ") and " 5 px/s" in speed and speed.endswith("median 3")
 
 
-def test_a_merged_store_tells_what_was_left_out_of_its_parts(tmp_path: Path) -> None:
+def test_a_merged_store_shows_what_was_left_out_of_its_parts(tmp_path: Path) -> None:
     store = clip_store(tmp_path / "a", count=2)
     records = [store.source("train")[0]]
     write_store(
@@ -101,7 +101,7 @@ def test_the_sheet_shows_the_clips_frames(tmp_path: Path, depth_range: list[floa
     assert sheet[-14 if depth_range is None else -28, 0].tolist() == [91, 91, 91]
 
 
-def test_each_row_of_the_sheet_is_called_by_its_own_number_and_task(tmp_path: Path) -> None:
+def test_each_row_of_the_sheet_is_captioned_with_its_own_number_and_task(tmp_path: Path) -> None:
     store = clip_store(tmp_path / "a", count=4, depth_range=[1.0, 2.0])
     sheet = contact_sheet(store, clips=6, frames=3)
     height = len(sheet) // 6
@@ -115,9 +115,9 @@ def test_each_row_of_the_sheet_is_called_by_its_own_number_and_task(tmp_path: Pa
 
 @given(st.lists(st.floats(0, 100)))
 def test_a_histogram_is_one_line(values: list[float]) -> None:
-    told = histogram(values, "px")
-    assert "\n" not in told
-    assert (f"px, median {np.median(values):.3g}" if values else "not measured") in told
+    text = histogram(values, "px")
+    assert "\n" not in text
+    assert (f"px, median {np.median(values):.3g}" if values else "not measured") in text
 
 
 def test_a_store_without_a_readable_clip_has_no_sheet(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_what_a_file_holds_are_the_clips_arrays(tmp_path: Path, unit: str | None
     assert rows["/clip_000/task"][0]["TextDocument:text"] == ["task 0"]
 
 
-def test_clips_are_spread_over_the_store_and_damaged_ones_told(tmp_path: Path) -> None:
+def test_clips_are_spread_over_the_store_and_damaged_ones_reported(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     store = clip_store(tmp_path / "a", size=32)
     shard = tmp_path / "a" / "test-00000.array_record"

@@ -75,6 +75,6 @@ def test_turns_towards_the_cube(sim: LiftSim) -> None:
 
 
 def test_only_plain_success_is_simple() -> None:
-    found = {mode: difficulty({"expert": {"mode": mode}}) for mode in MODES}
-    assert found == {"lift": "simple", "drop": "difficult", "near_miss": "difficult", "explore": "difficult"}
+    difficulties = {mode: difficulty({"expert": {"mode": mode}}) for mode in MODES}
+    assert difficulties == {"lift": "simple", "drop": "difficult", "near_miss": "difficult", "explore": "difficult"}
     assert difficulty({}) == "unknown"
