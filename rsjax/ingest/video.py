@@ -182,7 +182,21 @@ def _unreadable(path: Path, error: Exception) -> EpisodeError:
 
 _decoders: "OrderedDict[str, _Decoder]" = OrderedDict()
 _lock = threading.RLock()
-os.register_at_fork(after_in_child=_decoders.clear)  # a forked process would move the parent's place in the files
+_inherited: list[object] = []
+
+
+def _set_aside() -> None:
+    """Lets a forked process open files of its own: reading the parent's would move the parent's place in them.
+
+    This also runs between the fork and the exec of a command that is started with a ``preexec_fn``, as Ray's are. So it
+    frees nothing: FFmpeg waits for its threads when it is freed, and a fork does not copy them.
+    """
+    global _decoders, _lock
+    _inherited.append(_decoders)
+    _decoders, _lock = OrderedDict(), threading.RLock()  # another thread of the parent may have had the lock
+
+
+os.register_at_fork(after_in_child=_set_aside)
 
 
 def close_all() -> None:
@@ -238,7 +252,7 @@ class _Decoder:
     def picture(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
         """Decodes one frame of the file."""
         frame = self._decode(number)
-        picture = frame.to_ndarray(format="rgb24")
+        picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
         return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
 
     def _decode(self, number: int) -> Any:

@@ -1,5 +1,8 @@
+import os
 import pickle
 import re
+import subprocess
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -81,6 +84,28 @@ def test_files_kept_open_are_bounded(tmp_path: Path, clip: Path) -> None:
         VideoFrames(copy).read([0])
     assert len(video._decoders) == video.OPEN_FILES
     video.close_all()
+
+
+PROGRAM = """
+import os, subprocess, sys
+from pathlib import Path
+from rsjax.ingest.video import VideoFrames
+from tests.ingest.formats.videos import numbers_of
+frames = VideoFrames(Path(sys.argv[1]))
+assert numbers_of(frames.read([3])) == [3]
+subprocess.run(["true"], preexec_fn=lambda: None)
+child = os.fork()
+assert numbers_of(frames.read([4])) == [4]
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+    assert numbers_of(frames.read([5])) == [5]
+"""
+
+
+def test_a_forked_process_reads_files_of_its_own_and_ends(clip: Path) -> None:
+    """The threads of FFmpeg's that its parent may have are not copied; Ray forks thus before it starts a command."""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    subprocess.run([sys.executable, "-c", PROGRAM, str(clip)], env=environment, check=True, timeout=120)
 
 
 def test_a_file_that_changes_is_scanned_again(tmp_path: Path) -> None:
