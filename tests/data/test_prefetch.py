@@ -83,6 +83,17 @@ def test_an_error_of_putting_arrives_whatever_its_kind(error: BaseException) -> 
         next(ahead)
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_what_would_end_the_thread_arrives_too(error: type[BaseException]) -> None:
+    def put(arrays: object) -> None:
+        raise error
+
+    with Prefetch(loader(), put) as ahead:
+        for _ in range(2):
+            with pytest.raises(error):
+                next(ahead)
+
+
 def test_closing_ends_the_thread_while_it_waits_for_room() -> None:
     with Prefetch(loader(), lambda arrays: arrays, ahead=1):
         time.sleep(0.1)
