@@ -6,6 +6,7 @@ import tempfile
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # The tests compile thousands of small programs and run each a few times: compiling is most of their time. Without
 # LLVM's optimisations it takes half, without the fusion emitters (which write more code) a quarter less again. How fast
@@ -28,6 +29,10 @@ def pytest_unconfigure() -> None:
     if made:
         shutil.rmtree(made, ignore_errors=True)
 
+
+# A machine that is busy with something else fails no test.
+settings.register_profile("any-speed", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any-speed")
 
 # Directories whose tests take longest. They come first, so that no worker is left with one of them at the end.
 LONGEST = ("reliability", "pipeline", "ablation", "models", "training")

@@ -65,7 +65,7 @@ from pathlib import Path
 from rsjax.files import lock
 with lock(Path(sys.argv[1])):
     print("ready", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 

@@ -125,11 +125,11 @@ from rsjax.processes import run_items
 
 def work(item):
     Path(sys.argv[1], "working").touch()
-    time.sleep(100)
+    time.sleep(600)
 
 def load():
     Path(sys.argv[1], "loading").touch()
-    time.sleep(100)
+    time.sleep(600)
 
 class Slow:
     def __call__(self):

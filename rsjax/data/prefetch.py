@@ -91,10 +91,6 @@ class Prefetch:
         self._loader.close()
 
 
-class _ThreadEnded(Exception):
-    """Carries what ends Grain's thread but is no :class:`Exception`, and would leave the reader waiting for ever."""
-
-
 class _Batches:
     """A loader's batches on the device, in the form that Grain prefetches from.
 

@@ -106,7 +106,7 @@ def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
         assert_same(take(left, 10), take(right, 10))
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.integers(0, 20))
 def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store, number: int) -> None:
     _, feed = plan(loop("simple+difficult=2:1", "all:1"), own, transform, own.path)

@@ -2,7 +2,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.data.depth_color import Scale, color_to_depth, depth_to_color
@@ -21,7 +21,6 @@ def depth_at(share: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", SCALES)
-@settings(deadline=None)  # the first example compiles
 @given(share=UNIT)
 def test_a_round_trip_errs_by_half_a_level_at_most(scale: Scale, share: float) -> None:
     depth = depth_at(share)
@@ -33,7 +32,6 @@ def test_a_round_trip_errs_by_half_a_level_at_most(scale: Scale, share: float) -
 
 
 @pytest.mark.parametrize("scale", SCALES)
-@settings(deadline=None)  # the first example compiles
 @given(one=UNIT, other=UNIT, share=UNIT)
 def test_a_blend_of_two_colours_is_a_depth_between(scale: Scale, one: float, other: float, share: float) -> None:
     colors = [np.asarray(depth_to_color(depth_at(x), NEAR, FAR, scale)) for x in (one, other)]
@@ -43,7 +41,6 @@ def test_a_blend_of_two_colours_is_a_depth_between(scale: Scale, one: float, oth
 
 
 @pytest.mark.parametrize("scale", SCALES)
-@settings(deadline=None)  # the first example compiles
 @given(color=st.tuples(*[st.integers(0, 255)] * 3))
 def test_every_colour_is_a_depth_within_the_range(scale: Scale, color: tuple[int, int, int]) -> None:
     depth = float(color_to_depth(np.array(color, np.uint8), NEAR, FAR, scale))

@@ -71,7 +71,7 @@ def loader(stages: list[CurriculumStage], size: int, place: int = 0, shard: tupl
     return Loader(stages, size, 3, UNLISTED, shard=options, state=state)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(curricula(), st.data())
 def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
     curriculum: tuple[list[CurriculumStage], int], data: st.DataObject
@@ -92,7 +92,7 @@ def test_a_curriculum_resumes_at_any_batch_and_is_the_same_dealt_out_to_two(
     assert (rest["index"] == np.arange(size)).all()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(curricula())
 def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(
     curriculum: tuple[list[CurriculumStage], int],
@@ -186,7 +186,7 @@ if __name__ == "__main__":
     loader = batches(Numbers(5), jitter, 2, seed=0, workers=1)
     next(loader)
     print(multiprocessing.active_children()[0].pid, flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
@@ -199,7 +199,7 @@ def test_worker_processes_die_with_the_one_that_started_them(tmp_path: Path) -> 
         worker = int(parent.stdout.readline())
         assert running(worker)
         parent.kill()
-    until = time.monotonic() + 20
+    until = time.monotonic() + 120
     while running(worker) and time.monotonic() < until:
         time.sleep(0.05)
     assert not running(worker)

@@ -43,7 +43,7 @@ def test_impossible_sizes_are_refused(path: Path, value: Any) -> None:
             open_store(path)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.recursive(st.none() | st.integers() | st.text(), lambda x: st.lists(x) | st.dictionaries(st.text(), x)))
 def test_any_manifest_is_one_clear_line(tmp_path_factory: pytest.TempPathFactory, manifest: Any) -> None:
     path = tmp_path_factory.mktemp("store")

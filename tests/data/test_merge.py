@@ -56,7 +56,7 @@ def test_a_split_by_label_holds_each_record_once_and_merges_back(tmp_path: Path)
     }
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.integers(1, 6), st.integers(6, 9))
 def test_parts_are_of_one_size_and_together_the_whole(
     tmp_path_factory: pytest.TempPathFactory, count: int, clips: int

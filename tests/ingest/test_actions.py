@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -80,7 +80,6 @@ def test_an_offset_moves_commands_to_where_they_act() -> None:
     assert steps[:, 0].tolist() == [0, 3, 4, 0, 0]
 
 
-@settings(deadline=None)  # scipy is imported in it
 @given(st.lists(st.tuples(st.integers(0, 2), st.floats(-0.3, 0.3)), min_size=6, max_size=6))
 def test_turns_join_to_the_turn_from_end_to_end(turns: list[tuple[int, float]]) -> None:
     scipy = pytest.importorskip("scipy.spatial.transform")

@@ -57,7 +57,7 @@ def test_actions_between_frames_are_joined() -> None:
     assert kept[0]["actions"][:, 0].tolist() == [0, 1 + 2 + 3 + 4 + 5, 6 + 7 + 8 + 9 + 10, 11 + 12 + 13 + 14 + 15]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.sampled_from([5.0, 7.5, 10, 24, 29.97, 30]),
     st.sampled_from([0.0, 1, 2, 3, 5]),
@@ -75,7 +75,7 @@ def test_joined_actions_are_the_sums_over_the_frames_between(fps: float, rate: f
         np.testing.assert_allclose(record["actions"], [np.zeros(3), *between], rtol=1e-4, atol=1e-4)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.integers(1, 119), max_size=5), st.sampled_from([0.0, 2.0, 3.0]), st.booleans())
 def test_no_clip_reaches_across_a_cut(cuts: list[int], rate: float, within: bool) -> None:
     edges = [0, *sorted(set(cuts)), 120]
@@ -175,7 +175,7 @@ def test_overlapping_windows_read_each_frame_once() -> None:
 
 
 @given(st.sampled_from([5.0, 10.0, 29.97]), st.floats(0.5, 5), st.integers(2, 12), st.integers(1, 200))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_an_episode_as_long_as_a_window_is_said_to_take_gives_one(
     fps: float, rate: float, frames: int, count: int
 ) -> None:

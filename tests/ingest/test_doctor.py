@@ -157,7 +157,7 @@ def test_a_data_set_without_episodes_is_refused() -> None:
         diagnose(ToySource(()), Thresholds())
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 3), st.integers(0, 3))
 def test_quaternions_are_recognised_among_other_numbers(seed: int, before: int, after: int) -> None:
     rng = np.random.default_rng(seed)

@@ -81,7 +81,7 @@ def test_other_kinds_of_pictures_are_reported() -> None:
             decoded(payload, "p")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data(), st.sampled_from([".jpg", ".png"]))
 def test_a_damaged_picture_is_reported_or_keeps_its_shape(data: st.DataObject, ending: str) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (24, 16, 3), np.uint8)

@@ -114,12 +114,13 @@ def test_a_step_without_a_place_is_waited_for_and_then_named(tmp_path: Path, clu
 
 PROGRAM = """
 import sys
+import time
 from pathlib import Path
 from rsjax.ingest.ray_runner import run_on_ray
 from tests.ingest.toy import Source, noting_plan
 if __name__ == "__main__":
     plan = noting_plan(Path(sys.argv[1]), Source(6), seconds=0.3)
-    run_on_ray(plan, list(plan.source.episodes()), lambda *ran: None, cpus=3)
+    run_on_ray(plan, list(plan.source.episodes()), lambda *ran: time.sleep(600), cpus=3)
 """
 
 

@@ -23,7 +23,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", range(30))
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.lists(st.integers(0, 29), min_size=1, max_size=6), max_size=3))
 def test_any_order_of_any_frames(clip: Path, requests: list[list[int]]) -> None:
     frames = VideoFrames(clip)
@@ -115,7 +115,7 @@ def test_a_file_that_changes_is_scanned_again(tmp_path: Path) -> None:
     assert numbers_of(frames.read([8])) == [8]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0, 0.999))
 def test_a_truncated_file_is_reported_or_read_right(tmp_path: Path, clip: Path, share: float) -> None:
     payload = clip.read_bytes()

@@ -112,13 +112,16 @@ def test_an_episode_that_kills_its_worker_is_tried_again_and_then_quarantined(tm
 PROGRAM = """
 import multiprocessing
 import sys
+import time
 from pathlib import Path
 from rsjax.ingest.ingest import run_on_this_machine
 from tests.ingest.toy import Source, noting_plan
 if __name__ == "__main__":
     plan = noting_plan(Path(sys.argv[1]), Source(6), seconds=0.2)
-    tell = lambda *episode: print(*(child.pid for child in multiprocessing.active_children()), flush=True)
-    run_on_this_machine(plan, list(plan.source.episodes()), tell, workers=2)
+    def stop(*episode):
+        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+        time.sleep(600)
+    run_on_this_machine(plan, list(plan.source.episodes()), stop, workers=2)
 """
 
 

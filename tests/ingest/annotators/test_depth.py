@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -54,7 +54,6 @@ def test_filling_changes_holes_only_and_invents_no_depth(depth, holes):
     assert np.isin(filled, depth[~holes]).all()
 
 
-@settings(deadline=None)
 @given(hnp.arrays(np.float32, (2, 3, 4), elements=st.floats(0, 1000, width=32)))
 def test_relative_depth_can_be_undone(inverse):
     stretched = relative_depth(inverse)

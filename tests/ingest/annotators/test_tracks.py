@@ -52,7 +52,7 @@ def test_new_points_begin_where_none_is_left_and_the_others_go_on():
     np.testing.assert_allclose(moved, np.tile([32.0, 0.0], (through.sum(), 1)), atol=0.5)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(1, 40), st.integers(1, 9), st.integers(1, 5), st.integers(0, 2**16))
 def test_spans_cover_every_frame_once_whatever_their_length(count, span, grid, seed):
     rng = np.random.default_rng(seed)

@@ -64,7 +64,7 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return request.param, root
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_damage_to_one_file(whole: tuple[str, Path], data: st.DataObject) -> None:
     name, root = whole

@@ -185,7 +185,7 @@ def test_a_shard_that_cannot_be_opened_leaves_the_others(tmp_path: Path) -> None
         source.read(bad)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.data())
 def test_damage_that_no_checksum_shows_is_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -127,7 +127,7 @@ def test_an_unreadable_file_among_others_is_one_entry(tmp_path: Path) -> None:
         source.read(bad)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(share=st.floats(0, 0.99))
 def test_a_file_cut_anywhere_gives_episodes_or_clear_errors(
     tmp_path_factory: pytest.TempPathFactory, share: float

@@ -25,7 +25,7 @@ def test_records_come_back_by_their_spans(tmp_path: Path) -> None:
     assert [read_payload(path, span.offset, span.length) for span in found] == PAYLOADS
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.data())
 def test_a_truncated_file_keeps_what_is_before_the_cut(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -42,7 +42,7 @@ def test_a_truncated_file_keeps_what_is_before_the_cut(
     assert at_an_end or "truncated" in found[-1].damage
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.data())
 def test_no_changed_byte_goes_unnoticed(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     path = write_records(tmp_path_factory.mktemp("flip") / "a.tfrecord", PAYLOADS)
