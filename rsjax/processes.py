@@ -22,6 +22,7 @@ from rsjax.errors import UserError
 
 MOST_PER_CORE = 4  # workers; more only take memory from each other
 MAX_DEATHS = 2  # of workers over one item; the second time it is the item and not the machine
+_LOOK_SECONDS = 1.0  # between looks at who is alive: a dead worker's children may keep its pipe open
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 Item = TypeVar("Item")
@@ -97,11 +98,13 @@ def run_items(
                 _send(worker, entry[0])
             if not busy:
                 return
-            ready = wait(list(busy))
-            for pipe in [pipe for pipe in busy if pipe in ready]:
+            ready = wait(list(busy), _LOOK_SECONDS)
+            for pipe in [pipe for pipe in busy if pipe in ready or not busy[pipe][0].process.is_alive()]:
                 worker, item, deaths = busy.pop(pipe)
                 try:
-                    succeeded, answer = worker.pipe.recv()
+                    if not pipe.poll():
+                        raise EOFError
+                    succeeded, answer = pipe.recv()
                 except (EOFError, OSError):
                     started.remove(worker)
                     _stop([worker])

@@ -39,6 +39,20 @@ class Square:
         return number * number
 
 
+class Forking:
+    """Leaves a child behind, which has all that the worker had open, and is killed."""
+
+    def __init__(self, pids: Path) -> None:
+        self.pids = pids
+
+    def __call__(self, number: int) -> WorkerDied:
+        if child := os.fork():
+            (self.pids / str(child)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(600)
+        os._exit(1)
+
+
 def make_square(log: Path, options: dict[str, Any]) -> Square:
     return Square(log, **options)
 
@@ -83,6 +97,16 @@ def test_a_worker_that_is_killed_while_idle_is_replaced(tmp_path: Path) -> None:
             process.kill()
 
     assert squares(tmp_path / "log", 2, 1, kill) == {0: 0, 1: 1}
+
+
+def test_a_worker_whose_child_outlives_it_is_not_waited_for(tmp_path: Path) -> None:
+    results: list[WorkerDied] = []
+    run_items(partial(Forking, tmp_path), [0], 1, lambda number, result: results.append(result))
+    assert [type(result) for result in results] == [WorkerDied]
+    children = [int(path.name) for path in tmp_path.iterdir()]
+    assert len(children) == 2
+    for child in children:
+        os.kill(child, signal.SIGKILL)
 
 
 def test_a_worker_is_started_when_there_is_an_item_for_it(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.ingest.formats.videos import write_video
 
 EPISODES, FIRST, STEPS, SIDE = 50, 10, 12, 128
-MOST = 8 * 2**20  # bytes; fifty episodes that are held take 29 MB and more
+MOST = 16 * 2**20  # bytes; fifty episodes that are held take 29 MB and more
 NOISE = np.random.default_rng(0).integers(0, 255, (STEPS, SIDE, SIDE, 3), np.uint8)
 
 
