@@ -1,4 +1,7 @@
+import contextlib
 import fcntl
+import importlib
+import io
 import os
 import shutil
 import subprocess
@@ -7,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from rsjax.runtime import HUGE_PAGES
 
 ROOT = Path(__file__).parents[2]
 
@@ -30,12 +35,20 @@ class Commands:
         return self("experiments.train", "debug", "--run-dir", run, *arguments)
 
     def refused(self, module: str, *arguments: object) -> str:
-        """The one line on standard error of a command that cannot be carried out."""
-        done = self(module, *arguments)
-        assert done.returncode == 2, done.stderr
-        assert done.stderr.startswith("error: ")
-        assert done.stderr.count("\n") == 1, done.stderr
-        return done.stderr
+        """Returns the one line on standard error of a command that cannot be carried out.
+
+        It runs in this process: starting one takes seconds, and a refusal needs none of them.
+        """
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as errors:
+            patch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # else the process would start over
+            patch.setattr(sys, "argv", [module, *map(str, arguments), "--data-dir", str(self.data)])
+            with pytest.raises(SystemExit) as stop:
+                importlib.import_module(module if module.startswith("experiments") else f"{module}.__main__").main()
+        line = errors.getvalue()
+        assert stop.value.code == 2, line
+        assert line.startswith("error: ")
+        assert line.count("\n") == 1, line
+        return line
 
 
 @pytest.fixture(scope="session")
