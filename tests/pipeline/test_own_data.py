@@ -210,12 +210,12 @@ def commanded(folder: Path, module: str, *arguments: object) -> str:
 
 @needs_bridge
 def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
-    """The README's commands, shortened: ingest, train ``tiny``, generate."""
+    """The README's commands, shortened: ingest, train ``debug`` instead of ``tiny``, generate."""
     store, run = tmp_path / "bridge", tmp_path / "run"
     commanded(tmp_path, "ingest", "rlds", BRIDGE, "--out", store, "--windows.rate", 0, "--windows.frames", 8)
     few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--sample.steps", 2]
     few += ["--eval.clips", 2, "--eval.batch-size", 2, "--eval.action-draws", 1]
-    told = commanded(tmp_path, "train", "tiny", "--store", store, "--run-dir", run, *few)
+    told = commanded(tmp_path, "train", "debug", "--store", store, "--run-dir", run, *few)
     assert "no clip has depth, so the depth branch trains with its loss masked" in told
     log = [json.loads(line) for line in (run / "world_model" / "log.jsonl").read_text().splitlines()]
     trained = [row for row in log if "loss" in row]
