@@ -1,4 +1,4 @@
-"""How fast a preset runs here. ``python -m experiments.bench roboscape_s --batch 1 --json bench.json``"""
+"""Measures a preset's speed. ``python -m experiments.bench roboscape_s --batch 1 --json bench.json``"""
 
 import json
 import sys
@@ -18,22 +18,20 @@ class Options:
     """Options of this command."""
 
     batch: int = 1
-    """Clips in a training step, a rollout and a loader's batch; feed trains with the preset's own."""
+    """Clips per training step, rollout and loader batch; the part feed uses the preset's batch size."""
     only: str = ""
-    """Parts to measure, with commas between them: matmul,train,sample,tokenizer,loader,feed; all if not
-    given."""
+    """Parts to measure, separated by commas: matmul,train,sample,tokenizer,loader,feed; default: all."""
     horizons: tuple[int, ...] = ()
-    """Frames of the rollouts, their one prompt frame included; the model's own number and three times that if not
-    given."""
+    """Lengths of rollouts in frames, one prompt frame included; default: the clips' length and three times that."""
     torch: bool = False
-    """Time a plain PyTorch program of the RGB branch too, in the same run (needs rsjax[torch])."""
+    """Measure the RGB branch in plain PyTorch too (needs rsjax[torch])."""
     json: Path | None = None
-    """Write the numbers to this file too, after each part all so far."""
+    """Write the numbers to this file, after each part all so far."""
 
 
 @main_errors()
 def main() -> None:
-    """Measures, writes the file after each part, and prints a table."""
+    """Runs the benchmark, writes the file after each part, and prints a table."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Times training, sampling, tokenizer and loader.", Options())
     import jax
@@ -41,7 +39,7 @@ def main() -> None:
 
     from rsjax.bench.run import PARTS, bench, table
 
-    jax.config.update("jax_enable_compilation_cache", False)  # compile times are those from nothing
+    jax.config.update("jax_enable_compilation_cache", False)  # to measure compilation
     console = Console()
     only = tuple(options.only.split(",")) if options.only else PARTS
     keep = partial(write, options.json) if options.json else lambda numbers: None
@@ -50,7 +48,7 @@ def main() -> None:
 
 
 def write(path: Path, numbers: dict[str, Any]) -> None:
-    """Puts the numbers into the file, in place of what it held."""
+    """Writes the numbers to the file, replacing it."""
     from rsjax.files import disk_guard, write_atomically
 
     with disk_guard(path):

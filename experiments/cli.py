@@ -11,8 +11,8 @@ import tyro
 from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
 from rsjax.command import main_errors as main_errors  # every command imports both from here
-from rsjax.config import Config, ConfigError, StageConfig, presets
-from rsjax.config.stages import format_stage, parse_stage
+from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets
+from rsjax.config.curriculum import format_stage, parse_stage
 from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
@@ -27,20 +27,21 @@ FIRST_FIELDS = {
     "tokenizer-train.optimizer.learning-rate": "Peak learning rate of the tokenizer.",
     "model.width": "Channels of the world model.",
     "model.blocks": "Transformer blocks of the world model.",
-    "model.depth": "Whether the model has a depth branch.",
+    "model.use-depth": "Whether the model has a depth branch.",
+    "model.action-encoder": "How the model reads actions.",
     "train.steps": "Training steps of the world model.",
-    "train.stages": "A curriculum, one word per stage: simple:2 difficult:3:restart (see docs/training.md).",
+    "train.curriculum": "A curriculum, one word per stage: simple:2 difficult:3:restart (see docs/training.md).",
     "train.batch-size": "Clips of a batch, over all devices.",
     "train.optimizer.learning-rate": "Peak learning rate of the world model.",
     "train.seed": "Seed of the world model's training.",
     "train.checkpoint-every": "Steps between checkpoints.",
     "train.eval-every": "Steps between evaluations on validation clips; 0: none.",
     "train.start-from": "A run directory or converted checkpoint to start from.",
-    "loss.depth": "λ₁, the weight of the depth loss.",
-    "loss.keypoint": "λ₂, the weight of the keypoint loss.",
-    "loss.attention": "λ₃, the weight of the attention loss.",
-    "loss.keypoints": "Whether the keypoint and attention losses are used.",
-    "sample.steps": "Decoding steps per generated frame.",
+    "model.loss.depth-weight": "λ₁, the weight of the depth loss.",
+    "model.loss.keypoint-weight": "λ₂, the weight of the keypoint loss.",
+    "model.loss.attention-weight": "λ₃, the weight of the attention loss.",
+    "model.loss.use-keypoints": "Whether the keypoint and attention losses are used.",
+    "model.sample.steps": "Decoding steps per generated frame.",
     "eval.clips": "Test clips to evaluate on.",
 }
 
@@ -50,13 +51,13 @@ REGISTRY = tyro.constructors.ConstructorRegistry()
 @REGISTRY.primitive_rule
 def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
     """Reads a stage of a curriculum from one word, such as ``difficult:3:restart``."""
-    if info.type is not StageConfig:
+    if info.type is not CurriculumStageConfig:
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar="STAGE",
         instance_from_str=lambda words: parse_stage(words[0]),
-        is_instance=lambda value: isinstance(value, StageConfig),
+        is_instance=lambda value: isinstance(value, CurriculumStageConfig),
         str_from_instance=lambda stage: [format_stage(stage)],
     )
 
@@ -65,11 +66,15 @@ def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.Primi
 class PresetOptions:
     """Options of every command with a preset. They change the preset before its fields are set."""
 
+    model: str | None = None
+    """The family of the model (roboscape, genie): the preset's settings as far as both families have them."""
     store: Path | None = None
     """A store of clips made by experiments.ingest, to train on instead of simulated clips."""
 
     def apply(self, preset: Config) -> Config:
         """Returns the preset as these options change it."""
+        if self.model is not None:
+            preset = preset.with_family(self.model)
         if self.store is not None:
             from rsjax.pipeline.own_data import on_store
 
@@ -120,7 +125,7 @@ def parse_options(argv: Sequence[str], prog: str, description: str, options: Opt
 def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: str, rest: bool = False) -> Any:
     """Parses arguments into dataclasses like those of ``parts``; with ``rest``, skips arguments that none has.
 
-    Flags are named after fields, without their part. A boolean of the part "fields" takes a value: --model.depth False.
+    Flags are named after fields, without their part. A boolean of the part "fields" takes a value, False or True.
     """
     markers = {name: [tyro.conf.arg(name="")] for name in parts}
     markers.get("fields", []).append(tyro.conf.FlagConversionOff)

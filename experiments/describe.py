@@ -1,4 +1,4 @@
-"""What a preset comes to: modules, parameters, operations, memory. ``python -m experiments.describe roboscape_s``"""
+"""Describes a preset: modules, parameters, operations, memory. ``python -m experiments.describe roboscape_s``"""
 
 import json
 import sys

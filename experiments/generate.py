@@ -1,4 +1,4 @@
-"""Videos from a trained run. ``python -m experiments.generate runs/tiny --clips 0 3 --format gif``"""
+"""Generates videos from a trained run. ``python -m experiments.generate runs/tiny --clips 0 3 --format gif``"""
 
 import sys
 from dataclasses import dataclass, fields
@@ -14,48 +14,48 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options:
-    """Generates the frames that follow a clip's first one, and writes truth and prediction side by side."""
+    """Generates the frames that follow a clip's prompt, and writes truth and prediction side by side."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
     data_dir: Path = Path("data")
-    """Where the run's data set is kept, if it was simulated."""
+    """Directory of simulated data sets."""
     store: Path | None = None
-    """Where the run's store of clips lies now, if it was ingested and has moved since."""
+    """The new path of the run's store of ingested clips, if it was moved."""
     split: Literal["test", "train"] = "test"
-    """Which clips the first frames come from."""
+    """The split that the clips are from."""
     clips: tuple[int, ...] = ()
-    """Their numbers within the split; the first four if none is named."""
+    """Numbers of the clips within the split; default: the first four."""
     actions_from: int | None = None
-    """Generate under this clip's actions instead of each clip's own."""
+    """Use this clip's actions instead of each clip's own."""
     actions: Path | None = None
-    """Generate under the actions in this .npy file, float (T, A), in the data's units; row t leads into frame t."""
+    """Use the actions in this .npy file, float (T, A), in the data's units; row t leads into frame t."""
     frames: int | None = None
-    """How many frames to show, also more than the model was trained on; actions that end before begin again."""
+    """Frames per video, perhaps more than in training; shorter actions are repeated."""
     out: Path | None = None
-    """Where to write; RUN/generated if not given."""
+    """Directory of the videos; default RUN/generated."""
     format: Literal["mp4", "gif"] = "mp4"
-    """What to write."""
+    """File format."""
     fps: float = 4.0
-    """Frames a second."""
+    """Frames per second."""
     scale: int = 4
-    """Pixels per pixel, where prediction alone is shown."""
+    """Enlargement of videos that show only the prediction."""
     steps: int | None = None
-    """Decoding steps a frame; the run's own if not given, as with all that follow."""
+    """Decoding steps per frame. This and the following options default to the run's settings."""
     temperature: float | None = None
     """Logits are divided by it; 0 takes the most probable code."""
     unmask: Literal["random", "greedy"] | None = None
-    """Which cells are decided first: at random, or those most sure."""
+    """Unmask random cells first, or those of highest confidence."""
     top_k: int | None = None
-    """Draw among each vocabulary's this many most probable codes; 0: among all."""
+    """Draw from the k most probable codes of each vocabulary; 0: from all."""
     guidance: float | None = None
-    """How strongly actions guide; 1: as trained, others need a model trained with model.action_dropout."""
+    """Strength of guidance by actions; 1: none; other values need a model trained with model.action_dropout."""
     window_stride: int | None = None
-    """Frames that leave a full window at once (learned positions); 0: half of it."""
+    """Frames by which a full window moves (learned positions); 0: half of the window."""
     cache_dtype: Literal["float32", "bfloat16"] | None = None
-    """Of what is remembered from frame to frame."""
+    """Data type of the cache of keys and values."""
     seed: int | None = None
-    """Of the draws."""
+    """Seed of the random draws."""
 
 
 @main_errors()

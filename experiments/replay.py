@@ -1,4 +1,4 @@
-"""Looks into a training step that was left out. ``python -m experiments.replay runs/tiny --step 812``"""
+"""Replays a skipped training step. ``python -m experiments.replay runs/tiny --step 812``"""
 
 import sys
 from dataclasses import dataclass
@@ -13,40 +13,40 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options:
-    """Lists the steps whose loss or gradient was not finite, or goes through the clips of one of them."""
+    """Lists the skipped steps, whose loss or gradient was not finite, or the clips of one of them."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
     step: int | None = None
-    """The step to go through; all are listed if not given."""
+    """The step whose clips are listed; default: list all skipped steps."""
     stage: Literal["world_model", "tokenizer"] = "world_model"
-    """What was trained."""
+    """The training stage."""
     data_dir: Path = Path("data")
-    """Where the run's data set is kept, if it was simulated."""
+    """Directory of simulated data sets."""
     store: Path | None = None
-    """Where the run's store of clips lies now, if it was ingested and has moved since."""
+    """The new path of the run's store of ingested clips, if it was moved."""
 
 
 @main_errors()
 def main() -> None:
-    """Prints a line per step, or a line per clip of one step."""
+    """Prints a line per skipped step, or a line per clip of one step."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.replay", Options.__doc__ or "", Options())
-    from rsjax.pipeline.generator import load_config
     from rsjax.pipeline.own_data import relocated
     from rsjax.pipeline.replay import replay, skipped_steps
     from rsjax.pipeline.run import Run
+    from rsjax.pipeline.trained import load_config
 
     config = load_config(options.run)
     run = Run(relocated(config, options.store) if options.store else config, options.run, options.data_dir)
     if options.step is None:
-        print("\n".join(skipped_steps(run, options.stage)) or f"{options.run}: no step of {options.stage} was left out")
+        print("\n".join(skipped_steps(run, options.stage)) or f"{options.run}: no step of {options.stage} was skipped")
         return
     for clip in replay(run, options.stage, options.step):
-        told = ", ".join(f"{name} {value:.4g}" for name, value in clip.scalars.items())
-        where = clip.source.get("file", "")
+        scalars = ", ".join(f"{name} {value:.4g}" for name, value in clip.scalars.items())
+        file = clip.source.get("file", "")
         mark = "" if clip.finite else "   <-- not finite"
-        print(f"record {clip.source['record']} {where}: {told}{mark}")
+        print(f"record {clip.source['record']} {file}: {scalars}{mark}")
 
 
 if __name__ == "__main__":

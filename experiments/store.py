@@ -90,12 +90,15 @@ def tokenize(options: Tokenize) -> list[Any]:
     """Returns the store of tokens, which lies beside the clips."""
     tune_process()
     from rsjax.data.store import open_store
-    from rsjax.pipeline.generator import load_config, load_tokenizer
-    from rsjax.pipeline.tokens import tokenize_store
+    from rsjax.models import create_model
+    from rsjax.pipeline.trained import load_assets, load_config
 
-    clips, config = open_store(options.store), load_config(options.run)
-    tokenizer = load_tokenizer(config, options.run)
-    return [open_store(tokenize_store(clips, config, tokenizer, options.store / "tokens"))]
+    config = load_config(options.run)
+    place = (open_store(options.store), load_assets(config, options.run), options.store / "tokens")
+    prepared = create_model(config).prepare(*place, config.train.max_damaged)
+    if prepared is None:
+        raise ConfigError(f"{options.run}: a model of family {config.model.family!r} has no tokens")
+    return [prepared]
 
 
 ACTIONS: dict[str, tuple[Any, str, Callable[[Any], list[Any]]]] = {

@@ -1,4 +1,4 @@
-"""The main job: episodes in, a trained world model and a report out. ``python -m experiments.train tiny``"""
+"""Trains a world model from data to report. ``python -m experiments.train tiny``"""
 
 import shlex
 import sys
@@ -16,32 +16,32 @@ class Options:
     """Options of this command."""
 
     run_dir: Path | None = None
-    """Where the run is kept; runs/PRESET if not given."""
+    """Directory of the run; default runs/PRESET."""
     data_dir: Path = Path("data")
-    """Where simulated data sets are kept, to be shared by runs."""
+    """Directory of simulated data sets, which runs share."""
     resume: bool = True
-    """Go on from the checkpoints of an interrupted stage; --no-resume starts that stage over."""
+    """Resume an interrupted stage from its checkpoints; --no-resume starts the stage over."""
     overwrite: bool = False
-    """Train again the stages that the run directory holds under another configuration."""
+    """Train stages of the run directory again if they were trained with another configuration."""
     wandb: str = ""
     """Log to this Weights & Biases project as well; WANDB_MODE=offline keeps it on disk."""
     profile: int = 0
-    """Trace so many steps of each training stage, into its directory."""
+    """Number of steps of each training stage to trace, into the stage's directory."""
     coordinator: str = ""
-    """HOST:PORT of process 0 where several hosts train together; Slurm, Open MPI and TPU pods are asked instead."""
+    """HOST:PORT of process 0 to train on several hosts; not needed with Slurm, Open MPI or TPU pods."""
     processes: int | None = None
-    """How many processes there are, with --coordinator."""
+    """Number of processes, with --coordinator."""
     process_id: int | None = None
-    """Which of them this is, 0 and up, with --coordinator."""
+    """Number of this process, from 0, with --coordinator."""
 
 
 @main_errors()
 def main() -> None:
-    """Runs all stages that are not finished."""
+    """Runs all unfinished stages."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
     config = config.with_loops(**{n: value for n in ("wandb", "profile") if (value := getattr(options, n))})
-    # JAX is loaded only now, after arguments are known to be good.
+    # JAX is imported only after the arguments are checked.
     from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)

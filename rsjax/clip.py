@@ -1,16 +1,15 @@
-"""Clips and batches of tokens: each array's shape, dtype, unit and range.
+"""Clips and videos: each array's shape, dtype, unit and range.
 
-Axes: T frames, H×W pixels, H'×W' token cells, A action dimensions, N₀ tracks, B clips.
+Axes: T frames, H×W pixels, A action dimensions, N₀ tracks, B clips.
 """
 
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from flax import struct
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
-Array = Any  # JAX or numpy: on a device, or still on the host
+Array = Any  # JAX or numpy
 
 
 @dataclass(frozen=True)
@@ -19,15 +18,15 @@ class Clip:
 
     Attributes:
         rgb: frames, 0–255, RGB order, upright (row 0 is the top).
-        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0; None where none was
+        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0; None if none was
             recorded or estimated.
         actions: row t led from frame t-1 into frame t; row 0 is zeros (nothing led into the first frame).
         tracks: x (right) and y (down) of each keypoint in each frame; 0 and 1 are the image's outer edges, so the
             centre of pixel column i is (i + 0.5) / W. May leave [0, 1] when the point leaves the image.
-        visible: whether the point is inside the image and nothing stands before it. True in frame 0.
-        success: the simulator's own success predicate at each frame.
-        task: what the robot is asked to do, in words.
-        provenance: where the clip comes from (source, seed, episode, camera, expert's settings …), JSON-ready.
+        visible: whether the point is inside the image and not occluded. True in frame 0.
+        success: the simulator's success predicate at each frame.
+        task: the robot's task, in words.
+        provenance: the clip's origin (source, seed, episode, camera, expert's settings …), JSON-ready.
     """
 
     rgb: UInt8[np.ndarray, "T H W 3"]
@@ -40,28 +39,33 @@ class Clip:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
-@struct.dataclass
-class Batch:
-    """Tokenized clips, ready for a training step.
+@dataclass(frozen=True)
+class Video:
+    """Frames of B clips as numpy arrays: the input and output of world models.
 
     Attributes:
-        rgb: token of each cell, little-endian, 0 … 2^D - 1.
-        depth: token of each cell of the colourised depth map, likewise.
-        actions: inputs of the action encoder (:meth:`rsjax.data.normalization.Normalization.action_inputs`); row t led
-            into frame t.
-        tracks: as in :class:`Clip`.
-        visible: as in :class:`Clip`.
-        weight: 1 for a clip that counts, 0 for padding.
-        index: the clip's place in the global batch, so that its random masks don't depend on the device it is on.
-        has_depth: 1 for a clip with depth, 0 for one without, whose depth tokens are zeros and never read; None: all
-            clips have it.
+        rgb: frames, 0–255, RGB order, upright.
+        depth: z-depth in metres; all NaN for a clip without depth. None: no clip has depth.
     """
 
-    rgb: Int32[Array, "B T H W"]
-    depth: Int32[Array, "B T H W"]
-    actions: Float[Array, "B T A"]
-    tracks: Float[Array, "B N0 T 2"]
-    visible: Bool[Array, "B N0 T"]
-    weight: Float[Array, " B"]
-    index: Int32[Array, " B"]
-    has_depth: Float[Array, " B"] | None = None
+    rgb: UInt8[np.ndarray, "B T H W 3"]
+    depth: Float32[np.ndarray, "B T H W"] | None = None
+
+    @property
+    def has_depth(self) -> Bool[np.ndarray, " B"]:
+        """Which clips have depth."""
+        if self.depth is None:
+            return np.zeros(len(self.rgb), bool)
+        return ~np.isnan(self.depth[:, :1]).any(axis=(1, 2, 3))
+
+    def __len__(self) -> int:
+        """Returns the number of clips."""
+        return len(self.rgb)
+
+    def __getitem__(self, rows: Any) -> "Video":
+        """Returns some of the clips: ``rows`` is an array of numbers, a mask or a slice."""
+        return Video(self.rgb[rows], None if self.depth is None else self.depth[rows])
+
+    def frames(self, first: int, last: int | None = None) -> "Video":
+        """Returns frames ``first`` to ``last`` - 1 of every clip."""
+        return Video(self.rgb[:, first:last], None if self.depth is None else self.depth[:, first:last])

@@ -1,6 +1,6 @@
-"""What a configuration comes to, from shapes alone: parameters by part, operations, and memory. Allocates nothing."""
+"""Counts a configuration's parameters, operations and memory from shapes, without allocating arrays."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,31 +11,32 @@ from rich.console import Group
 from rich.table import Table
 from rich.tree import Tree
 
-from rsjax.clip import Batch
-from rsjax.config import Config, ModelConfig
-from rsjax.models.roboscape import losses
-from rsjax.models.roboscape.flops import forward_flops, train_flops
-from rsjax.models.roboscape.terms import world_model_terms
-from rsjax.models.roboscape.world_model import empty_cache
+from rsjax.bench import inputs
+from rsjax.config import Config, TransformerConfig
+from rsjax.models.base import create_model
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.transformer import empty_cache
 from rsjax.tokenizers.flops import tokenizer_flops
-from rsjax.training.objectives import TokenizerObjective, WorldModelObjective
+from rsjax.tokenizers.training import TokenizerTraining
+from rsjax.trainable import Params, StepContext, combine
 from rsjax.training.state import make_optimizer
 
 Shapes = dict[str, Any]  # nested, with ShapeDtypeStructs at the leaves
 
-# Of clips, in shapes: a prime that divides no dimension of a model, so that an array's size tells whether it grows with
-# the batch.
+# The batch size in shapes: a large prime, so that only arrays that grow with the batch have a size divisible by it.
 _CLIPS = 10_007
+CACHE_BYTES = {"float32": 4, "bfloat16": 2}
 
 
 @dataclass(frozen=True)
 class Description:
-    """A configuration's networks and their figures.
+    """Networks of a configuration, and figures about them.
 
     Attributes:
-        modules: shapes of the parameters by network, then part: "rgb", "depth", "projections" (depth → RGB) and
-            "shared" (positions, actions) of the world model; "encoder", "decoder" and perhaps "discriminator" of the
-            tokenizer. Blocks of the world model are stacked along a leading axis.
+        modules: shapes of parameters by network and part: "rgb", "depth", "projections" (depth → RGB) and "shared"
+            (positions, actions) of the world model; "encoder", "decoder" and perhaps "discriminator" of the tokenizer.
+            Blocks of the world model are stacked along a leading axis.
         figures: see :func:`figures`.
     """
 
@@ -45,14 +46,15 @@ class Description:
 
 
 def describe(config: Config) -> Description:
-    """Shapes and figures of the configuration's world model and tokenizer."""
-    world_model = jax.eval_shape(WorldModelObjective.create(config).init, jax.random.key(0))
-    modules = {"world_model": by_part(world_model), "tokenizer": _tokenizer(config)}
+    """Returns shapes and figures of the configuration's world model and tokenizer."""
+    modules = {"world_model": by_part(jax.eval_shape(create_model(config).init, jax.random.key(0)))}
+    if config.model.uses_tokenizer:
+        modules["tokenizer"] = _tokenizer(config)
     return Description(config.name, modules, figures(config, modules))
 
 
 def by_part(world_model: Shapes) -> Shapes:
-    """The world model's parameters by what they belong to: rgb, depth, projections, shared."""
+    """Groups the world model's parameters by part: rgb, depth, projections, shared."""
     parts: dict[str, dict[tuple[str, ...], Any]] = {}
     for path, x in flatten_dict(world_model).items():
         parts.setdefault(_part(path), {})[path] = x
@@ -67,56 +69,58 @@ def _part(path: tuple[str, ...]) -> str:
 
 
 def _tokenizer(config: Config) -> Shapes:
-    shapes = jax.eval_shape(TokenizerObjective(config.tokenizer, config.tokenizer_train).init, jax.random.key(0))
-    if config.tokenizer_train.adversarial:
+    shapes = jax.eval_shape(TokenizerTraining.create(config).init, jax.random.key(0))
+    if config.tokenizer_train.adversarial_weight:
         return shapes["generator"] | {"discriminator": shapes["discriminator"]}
     return shapes
 
 
 def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
-    """Counts of parameters, operations and bytes, by flat names.
+    """Counts parameters, operations and bytes, by flat names.
 
-    - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch with what it shares, which is the
-      model without depth.
-    - ``flops_…``: matrix products and convolutions at 2 a multiply-add (``flops.py`` of model and tokenizer). Per
-      frame: a forward pass over a clip by its frames, and about a pass of one frame through the cache. Training: three
-      forwards, without what remat repeats.
-    - ``bytes_train_state``: of the world model's parameters, optimizer, averages and gradients. Once a device.
-    - ``bytes_activations_per_clip``: what the backward pass keeps of the forward pass, that and the loss as autodiff
-      sees them; the compiler may keep less. ``…_remat``: each block's input, and all of the one block that is being
-      recomputed. ``model.remat`` says what applies: none or blocks; products lies between.
-    - ``bytes_cache_…``: temporal keys and values of one rollout of ``model.frames`` frames.
+    - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch and the shared part, the model
+      without depth.
+    - ``flops_…``: matrix products and convolutions, 2 per multiply-add (``flops.py`` of model and tokenizer). Per
+      frame: a forward pass over a clip divided by its frames, about that of one frame with the cache. Training: three
+      forward passes, without what remat repeats.
+    - ``bytes_train_state``: of the world model's parameters, optimizer state, averages and gradients, per device.
+    - ``bytes_activations_per_clip``: what automatic differentiation keeps of forward pass and loss; the compiler may
+      keep less. ``…_remat``: each block's input, and all of the block that is being recomputed. The first is for
+      ``model.remat`` none, the second for blocks; products is between them.
+    - ``bytes_cache_…``: temporal keys and values of one rollout of a clip's length.
     """
-    model, world, tokenizer = config.model, modules["world_model"], modules["tokenizer"]
+    model, world = create_model(config), modules["world_model"]
     counts = {part: count(shapes) for part, shapes in world.items()}
-    pass_over_clip = forward_flops(model, model.frames)
-    pixels = tokenizer_flops(config.tokenizer)
-    activations = activation_bytes(config)
-    return {
+    frames, flops, activations = config.clips.frames, model.flops(config.clips.frames), activation_bytes(config)
+    numbers = {
         **{f"params_{part}": n for part, n in counts.items()},
         "params_world_model": sum(counts.values()),
-        "params_one_branch": counts["rgb"] + counts["shared"],
-        **{f"params_{part}": count(shapes) for part, shapes in tokenizer.items()},
-        "flops_per_frame": pass_over_clip // model.frames,
-        "flops_train_per_clip": train_flops(model, model.frames, 1),
-        "flops_encode_per_image": pixels["encoder"],
-        "flops_decode_per_image": pixels["decoder"],
+        "params_one_branch": counts.get("rgb", 0) + counts.get("shared", 0),
+        **{f"params_{part}": count(shapes) for part, shapes in modules.get("tokenizer", {}).items()},
+    }
+    if flops:
+        numbers |= {"flops_per_frame": flops["forward"] // frames, "flops_train_per_clip": flops["train"]}
+    if config.model.uses_tokenizer:
+        pixels = tokenizer_flops(config.tokenizer, config.clips.image_size)
+        numbers |= {"flops_encode_per_image": pixels["encoder"], "flops_decode_per_image": pixels["decoder"]}
+    numbers |= {
         "bytes_train_state": _train_state_bytes(config, world),
         "bytes_activations_per_clip": activations[False],
         "bytes_activations_per_clip_remat": activations[True],
-        "bytes_cache_float32": cache_bytes(model, 4),
-        "bytes_cache_bfloat16": cache_bytes(model, 2),
     }
+    if isinstance(model, RoboScape):
+        numbers |= {f"bytes_cache_{name}": cache_bytes(model.architecture, n) for name, n in CACHE_BYTES.items()}
+    return numbers
 
 
 def count(shapes: Shapes) -> int:
-    """Numbers in a tree of arrays or shapes."""
+    """Returns the number of elements in a tree of arrays or shapes."""
     return sum(x.size for x in jax.tree.leaves(shapes))
 
 
-def cache_bytes(model: ModelConfig, bytes_per_number: int) -> int:
-    """Bytes of one rollout's temporal keys and values, all blocks and branches."""
-    cache = jax.eval_shape(lambda: empty_cache(model, 1, model.frames))
+def cache_bytes(arch: Architecture, bytes_per_number: int) -> int:
+    """Returns the bytes of one rollout's temporal keys and values, all blocks and branches."""
+    cache = jax.eval_shape(lambda: empty_cache(arch, 1, arch.frames))
     return count(cache) * bytes_per_number
 
 
@@ -127,41 +131,40 @@ def _train_state_bytes(config: Config, params: Shapes) -> int:
 
 
 def activation_bytes(config: Config) -> dict[bool, int]:
-    """Bytes per clip that training keeps for the backward pass, without remat (False) and with it (True)."""
-    plain, remat = (_kept(config, replace(config.model, remat=on)) for on in ("none", "blocks"))
+    """Returns bytes per clip that training keeps for the backward pass, without remat (False) and with it (True).
+
+    Both are equal for a family without this setting.
+    """
+    if not isinstance(config.model, TransformerConfig):
+        kept = sum(map(_bytes, _kept(config))) // _CLIPS
+        return {False: kept, True: kept}
+    with_remat = (replace(config, model=replace(config.model, remat=on)) for on in ("none", "blocks"))  # type: ignore[call-arg]
+    plain, remat = map(_kept, with_remat)
     blocks = config.model.blocks
     one_block = sum(_bytes(x) for x in plain if x.shape[0] == blocks) // blocks
     return {False: sum(map(_bytes, plain)) // _CLIPS, True: (sum(map(_bytes, remat)) + one_block) // _CLIPS}
 
 
-def _kept(config: Config, model: ModelConfig) -> list[jax.ShapeDtypeStruct]:
-    """What grows with the batch of all that the loss's forward pass keeps, on a batch of ``_CLIPS`` clips."""
-    params = jax.eval_shape(WorldModelObjective(model, config.mask, config.loss).init, jax.random.key(0))
-    weights = config.loss.terms(model.depth)
+def _kept(config: Config) -> list[jax.ShapeDtypeStruct]:
+    """Returns the arrays of ``_CLIPS`` clips that the loss keeps for its backward pass and that grow with the batch."""
+    model = create_model(config)
+    params = jax.eval_shape(model.init, jax.random.key(0))
 
-    def backward(params: Any, batch: Batch, key: jax.Array) -> Any:
-        def loss(params: Any) -> Any:
-            return losses.combine(world_model_terms(model, config.mask, config.loss, params, batch, key), weights)[0]
+    def backward(params: Params, batch: Any, key: jax.Array) -> Any:
+        def loss(params: Params) -> Any:
+            context = StepContext(jnp.int32(0), None, None)
+            return combine(model.loss_terms(params, batch, key, context), model.loss_weights)[0]
 
-        return jax.vjp(loss, params)[1]  # a tree whose leaves are what it keeps
+        return jax.vjp(loss, params)[1]  # a tree of the arrays that are kept
 
     kept = jax.eval_shape(backward, params, _batch(config, _CLIPS), jax.random.key(0))
     return [x for x in jax.tree.leaves(kept) if x.size % _CLIPS == 0]
 
 
 def _batch(config: Config, clips: int) -> Any:
-    model, tracks = config.model, config.clips.tracks
-    shape: Callable[..., Any] = lambda dtype, *axes: jax.ShapeDtypeStruct((clips, *axes), dtype)  # noqa: E731
-    tokens = shape(jnp.int32, model.frames, model.grid, model.grid)
-    return Batch(
-        rgb=tokens,
-        depth=tokens,
-        actions=shape(jnp.float32, model.frames, model.action_dim),
-        tracks=shape(jnp.float32, tracks, model.frames, 2),
-        visible=shape(jnp.bool_, tracks, model.frames),
-        weight=shape(jnp.float32),
-        index=shape(jnp.int32),
-    )
+    """Returns the shapes of a batch."""
+    one = inputs.batch_shapes(create_model(config), config)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((clips, *x.shape[1:]), x.dtype), one)
 
 
 def _bytes(tree: Any) -> int:
@@ -169,7 +172,7 @@ def _bytes(tree: Any) -> int:
 
 
 def render(description: Description) -> Group:
-    """Trees of modules with shapes and counts, and a table of the figures, for a rich console."""
+    """Returns trees of modules with shapes and counts, and a table of the figures, for a rich console."""
     trees = []
     for network, parts in description.modules.items():
         tree = Tree(f"[bold]{description.name}: {_title(network)}[/]  {count(parts):,}")
@@ -185,7 +188,7 @@ def render(description: Description) -> Group:
 
 
 def _grow(tree: Tree, shapes: Shapes) -> None:
-    """A line for each module that has parameters of its own, within those that hold it."""
+    """Adds a line for each module with its own parameters, nested as the modules are."""
     for name, x in shapes.items():
         inner = {key: y for key, y in x.items() if isinstance(y, dict)} if isinstance(x, dict) else {}
         own = [f"{key} {y.shape}" for key, y in _leaves(x) if key not in inner]

@@ -94,19 +94,34 @@ def debug(place: Path) -> dict[str, Any]:
 
 def tokens(place: Path) -> dict[str, str]:
     """Digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
-    import dataclasses
-
-    from rsjax.pipeline.clips import Clips
-    from rsjax.pipeline.generator import Generator
+    from rsjax.data.clips import Clips
     from rsjax.pipeline.run import Run
+    from rsjax.pipeline.trained import load
+    from rsjax.pipeline.videos import resampled
 
-    generator = Generator.load(place / "tiny")
-    source = Run(generator.config, place / "tiny", place / "data").open_clips().source("test")
+    trained = resampled(load(place / "tiny"), {"temperature": 0.0, "unmask": "greedy", "steps": 3})
+    source = Run(trained.config, place / "tiny", place / "data").open_clips().source("test")
     clips = Clips.stacked([source[number] for number in range(4)], range(4))
-    sample = dataclasses.replace(generator.config.sample, temperature=0.0, unmask="greedy", steps=3)
-    made = generator.generate(clips.tokens(generator.codec, 1), clips.actions, sample)
+    made = rollout_tokens(trained, clips)
     digest = lambda grid: hashlib.sha256(np.asarray(grid).astype("<i4").tobytes()).hexdigest()  # noqa: E731
-    return {branch: digest(grid) for branch, grid in made.tokens.items()}
+    return {branch: digest(grid) for branch, grid in made.items()}
+
+
+def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
+    """The tokens of the videos under the clips' own actions."""
+    import jax
+
+    from rsjax.models.roboscape.rollout import rollout
+    from rsjax.tokenizers.codec import Codec
+
+    model, codec = (
+        trained.model,
+        Codec(trained.config.tokenizer, trained.assets.tokenizer, trained.assets.normalization),
+    )
+    prompt = codec.encode(clips.video.frames(0, 1))
+    actions = codec.normalization.action_inputs(clips.actions, model.config.integrate_actions)
+    sample = model.config.sample
+    return rollout(model.architecture, sample, trained.params, prompt, actions, jax.random.key(sample.seed))
 
 
 def bridge(place: Path) -> dict[str, str] | None:

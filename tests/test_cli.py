@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.cli import FIRST_FIELDS, main_errors, parse, parse_options
-from rsjax.config import Config, ConfigError, presets
+from rsjax.config import Config, ConfigError, LossConfig, presets
+from rsjax.config.leaves import with_values
 from rsjax.errors import UserError, did_you_mean
 
 
@@ -42,14 +43,14 @@ def message(*argv: str) -> str:
 
 def numbers(part: Any, prefix: str = "--") -> list[tuple[str, str]]:
     """(flag, value) of each number and truth value within ``part``."""
-    found: list[tuple[str, str]] = []
+    flags: list[tuple[str, str]] = []
     for field in dataclasses.fields(part):
         value, flag = getattr(part, field.name), prefix + field.name
         if dataclasses.is_dataclass(value):
-            found += numbers(value, f"{flag}.")
+            flags += numbers(value, f"{flag}.")
         elif isinstance(value, (int, float)):
-            found.append((flag, str(value)))
-    return found
+            flags.append((flag, str(value)))
+    return flags
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
@@ -67,18 +68,25 @@ def test_flags_that_repeat_the_preset_change_nothing(flags: list[tuple[str, str]
 def test_overrides_reach_their_field_and_no_other() -> None:
     config, options = read(
         "debug",
-        *("--train.steps", "7", "--loss.keypoints", "False", "--sim.test-episodes=3", "--run-dir", "there"),
+        *("--train.steps", "7", "--model.loss.use-keypoints", "False", "--sim.test-episodes=3", "--run-dir", "there"),
         *("--tokenizer.channel_multipliers", "2", "4", "--no-resume"),
     )
     base = presets.get("debug")
     assert config == dataclasses.replace(
         base,
         train=dataclasses.replace(base.train, steps=7),
-        loss=dataclasses.replace(base.loss, keypoints=False),
+        model=dataclasses.replace(base.model, loss=LossConfig(num_keypoints=8, use_keypoints=False)),  # type: ignore[call-arg]
         sim=dataclasses.replace(base.sim, test_episodes=3),
         tokenizer=dataclasses.replace(base.tokenizer, channel_multipliers=(2, 4)),
     )
     assert options == Options(run_dir=Path("there"), resume=False)
+
+
+def test_a_family_is_chosen_before_its_fields_are_set() -> None:
+    for flag in (["--model", "genie"], ["--model=genie"]):
+        config, _ = read("debug", "--model.action-encoder", "none", *flag, "--model.sample.steps=3")
+        genie = presets.get("debug").with_family("genie")
+        assert config == with_values(genie, {"model.action_encoder": "none", "model.sample.steps": 3})
 
 
 @pytest.mark.parametrize(
@@ -94,9 +102,11 @@ def test_overrides_reach_their_field_and_no_other() -> None:
         (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),
         (["tiny", "--train.steps"], "--train.steps: its value is missing"),
         (["tiny", "--store"], "--store: its value is missing"),
-        (["tiny", "--sample.unmask", "worst"], "--sample.unmask: 'worst' is none of random, greedy"),
-        (["tiny", "--sim.frames", "99"], f"model.frames holds positions for {presets.get('tiny').model.frames}"),
-        (["debug", "--sim.control-steps", "2"], "is 14 but model.action_dim is 28"),
+        (["tiny", "--model.sample.unmask", "worst"], "--model.sample.unmask: 'worst' is none of random, greedy"),
+        (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
+        (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
+        (["debug", "--model", "genie", "--model.loss.gamma", "2"], "unknown argument '--model.loss.gamma'"),
+        (["debug", "--model", "geni"], "unknown model 'geni'; did you mean 'genie'? (models: roboscape, genie"),
     ],
 )
 def test_each_mistake_gets_one_line_that_names_it(argv: list[str], expected: str) -> None:
@@ -127,7 +137,7 @@ def test_help_lists_presets_then_first_fields_then_all_fields(capsys: pytest.Cap
         assert ", ".join(presets.PRESETS) in shown(capsys, *argv)
     first, everything = shown(capsys, "debug", "--help"), shown(capsys, "debug", "--help-all")
     assert [text.count("--run-dir") for text in (first, everything)] == [1, 1]
-    assert [text.count("--loss.gamma") for text in (first, everything)] == [0, 1]
+    assert [text.count("--model.loss.gamma") for text in (first, everything)] == [0, 1]
     assert "--store" in first
     assert "--help-all" in first
     for name in FIRST_FIELDS:

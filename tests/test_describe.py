@@ -12,16 +12,18 @@ import pytest
 from rich.console import Console
 
 from experiments import describe as command
-from rsjax.clip import Batch
 from rsjax.config import Config, presets
+from rsjax.config.leaves import with_values
 from rsjax.describe import activation_bytes, cache_bytes, count, describe, render
-from rsjax.models.roboscape import losses
-from rsjax.models.roboscape.terms import world_model_terms
-from rsjax.models.roboscape.world_model import empty_cache
-from rsjax.training.objectives import WorldModelObjective
+from rsjax.models import create_model
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.transformer import empty_cache
+from rsjax.trainable import StepContext, combine
 from rsjax.training.state import create_state
 
 DEBUG = presets.get("debug")
+NETWORK = Architecture.create(DEBUG)
 described = cache(describe)
 
 
@@ -30,12 +32,12 @@ def bytes_of(tree: Any) -> int:
 
 
 def with_blocks(blocks: int) -> Config:
-    return replace(DEBUG, model=replace(DEBUG.model, blocks=blocks))
+    return with_values(DEBUG, {"model.blocks": blocks})
 
 
 def test_every_parameter_belongs_to_one_part() -> None:
     description = described(DEBUG)
-    whole = jax.eval_shape(WorldModelObjective.create(DEBUG).init, jax.random.key(0))
+    whole = jax.eval_shape(create_model(DEBUG).init, jax.random.key(0))
     parts = description.modules["world_model"]
     assert count(parts) == count(whole) == description.figures["params_world_model"]
     assert list(parts) == ["rgb", "depth", "projections", "shared"]
@@ -48,30 +50,37 @@ def test_every_parameter_belongs_to_one_part() -> None:
 
 
 def test_one_branch_is_the_model_without_depth() -> None:
-    alone = replace(DEBUG, model=replace(DEBUG.model, depth=False))
+    alone = with_values(DEBUG, {"model.use_depth": False})
     assert described(DEBUG).figures["params_one_branch"] == described(alone).figures["params_world_model"]
+
+
+def test_a_genie_is_one_branch_with_its_action_encoder() -> None:
+    genie = describe(DEBUG.with_family("genie"))
+    assert list(genie.modules["world_model"]) == ["rgb", "shared"]
+    assert genie.modules["world_model"]["shared"].keys() == {"pos_embed", "action_encoder_fc1", "action_encoder_fc2"}
+    assert genie.figures["params_one_branch"] == genie.figures["params_world_model"]
 
 
 def test_the_state_in_training_has_the_bytes_of_a_whole_one_and_of_its_gradients() -> None:
     config = replace(DEBUG, train=replace(DEBUG.train, ema=0.9))
-    state = jax.eval_shape(lambda: create_state(WorldModelObjective.create(config), config.train))
+    state = jax.eval_shape(lambda: create_state(create_model(config), config.train))
     whole = bytes_of((state.params, state.opt_state, state.ema)) + bytes_of(state.params)
     assert describe(config).figures["bytes_train_state"] == whole
 
 
 def test_the_cache_has_the_bytes_of_a_real_one() -> None:
-    assert cache_bytes(DEBUG.model, 4) == bytes_of(empty_cache(DEBUG.model, 1, DEBUG.model.frames))
+    assert cache_bytes(NETWORK, 4) == bytes_of(empty_cache(NETWORK, 1, NETWORK.frames))
 
 
 def kept_for(clips: int) -> int:
     """Bytes of all that the loss's backward pass holds on a batch of so many clips."""
-    model, objective = DEBUG.model, WorldModelObjective.create(DEBUG)
-    tokens = jnp.zeros((clips, model.frames, model.grid, model.grid), jnp.int32)
-    tracks = (clips, DEBUG.sim.tracks, model.frames)
+    model, frames = create_model(DEBUG), DEBUG.clips.frames
+    tokens = jnp.zeros((clips, frames, DEBUG.grid, DEBUG.grid), jnp.int32)
+    tracks = (clips, DEBUG.clips.tracks, frames)
     batch = Batch(
         rgb=tokens,
         depth=tokens,
-        actions=jnp.zeros((clips, model.frames, model.action_dim)),
+        actions=jnp.zeros((clips, frames, DEBUG.clips.action_dim)),
         tracks=jnp.zeros((*tracks, 2)),
         visible=jnp.ones(tracks, bool),
         weight=jnp.ones(clips),
@@ -79,11 +88,11 @@ def kept_for(clips: int) -> int:
     )
 
     def loss(params: Any, key: jax.Array) -> Any:
-        terms = world_model_terms(DEBUG.model, DEBUG.mask, DEBUG.loss, params, batch, key)
-        return losses.combine(terms, objective.weights)[0]
+        terms = model.loss_terms(params, batch, key, StepContext(jnp.int32(0), None, None))
+        return combine(terms, model.loss_weights)[0]
 
     def backward(key: jax.Array) -> Any:
-        return jax.vjp(lambda params: loss(params, key), objective.init(key))[1]
+        return jax.vjp(lambda params: loss(params, key), model.init(key))[1]
 
     return bytes_of(jax.eval_shape(backward, jax.random.key(0)))
 
@@ -94,8 +103,7 @@ def test_activations_are_what_another_clip_adds_to_what_the_backward_pass_holds(
 
 def test_with_remat_another_block_adds_its_input_alone() -> None:
     one, two, three = (activation_bytes(with_blocks(n)) for n in (1, 2, 3))
-    model = DEBUG.model
-    of_features = 2 * model.frames * model.grid**2 * model.width * 4
+    of_features = 2 * NETWORK.frames * NETWORK.grid**2 * NETWORK.width * 4
     assert three[True] - two[True] == two[True] - one[True] == of_features
     assert three[False] - two[False] == two[False] - one[False] > 10 * of_features
 
@@ -115,7 +123,7 @@ def test_the_terminal_shows_every_module_and_figure() -> None:
 def test_the_command_prints_figures_as_json_with_overrides_applied(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["describe", "debug", "--json", "--model.depth", "False"])
+    monkeypatch.setattr("sys.argv", ["describe", "debug", "--json", "--model.use-depth", "False"])
     command.main()
     printed = json.loads(capsys.readouterr().out)
-    assert printed == {"preset": "debug"} | described(replace(DEBUG, model=replace(DEBUG.model, depth=False))).figures
+    assert printed == {"preset": "debug"} | described(with_values(DEBUG, {"model.use_depth": False})).figures

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rsjax.ablation.table import ABSENT, Column, Row, best, shown_columns
+from rsjax.ablation.table import ABSENT, Row, best, shown_columns
+from rsjax.evaluation.registry import Metric
 
 PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
 PANEL, LINE = 2.3, 0.42  # inches: width of a panel, height of a line
@@ -36,7 +37,7 @@ def draw(rows: Sequence[Row], title: str) -> bytes:
     return buffer.getvalue()
 
 
-def _panel(axes: Axes, column: Column, rows: Sequence[Row], top: set[int]) -> None:
+def _panel(axes: Axes, column: Metric, rows: Sequence[Row], top: set[int]) -> None:
     for y, row in enumerate(rows):
         if column.name not in row.spreads:
             axes.text(0.5, y, ABSENT, transform=axes.get_yaxis_transform(), ha="center", va="center", color=FAINT)

@@ -22,13 +22,13 @@ from rsjax.progress import note
 
 Value = bool | int | float | str
 
-DEFAULT_AXES = ("model.depth=True,False", "loss.keypoints=True,False")
+DEFAULT_AXES = ("model.use_depth=True,False", "model.loss.use_keypoints=True,False")
 SWITCHES = {  # a field → the switch without which the field has no effect
-    "loss.depth": "model.depth",
-    "loss.keypoint": "loss.keypoints",
-    "loss.attention": "loss.keypoints",
-    "loss.gamma": "loss.keypoints",
-    "loss.num_keypoints": "loss.keypoints",
+    "model.loss.depth_weight": "model.use_depth",
+    "model.loss.keypoint_weight": "model.loss.use_keypoints",
+    "model.loss.attention_weight": "model.loss.use_keypoints",
+    "model.loss.gamma": "model.loss.use_keypoints",
+    "model.loss.num_keypoints": "model.loss.use_keypoints",
 }
 SEED = "train.seed"
 FILE = "grid.json"
@@ -58,7 +58,7 @@ class Choice:
 
     Attributes:
         number: the position of a single cell, counted from 0; None for all.
-        only: names or shell patterns (``model.depth=True,*``); cells that match none are left out. Empty for all.
+        only: names or shell patterns (``model.use_depth=True,*``); cells that match none are left out. Empty for all.
         skip: names or patterns of cells to leave out.
     """
 
@@ -164,7 +164,7 @@ def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
 
 
 def cell_name(values: Mapping[str, Value], seed: int) -> str:
-    """Returns a directory's name that shows the values: ``model.depth=True,loss.gamma=5.0,seed=0``.
+    """Returns a directory's name that shows the values: ``model.use_depth=True,loss.gamma=5.0,seed=0``.
 
     A name that is too long or has unsafe characters is shortened and cleaned, and a hash keeps it unique.
     """

@@ -122,9 +122,9 @@ def share(run: Run, others: Sequence[Run], shared: Path) -> None:
         if not run.finished("collect"):
             with run.stage("collect"):
                 stages.collect_clips(run)
-    for name in SHARED:
+    for name in (name for name in SHARED if name in run.stages):
         key = run.keys()[name]
-        same = [other for other in others if other.keys()[name] == key]
+        same = [other for other in others if other.keys().get(name) == key]
         if run.finished(name) or (name == "world_model" and not same):
             continue
         maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
@@ -138,14 +138,14 @@ def share(run: Run, others: Sequence[Run], shared: Path) -> None:
 def _make(maker: Run, run: Run, name: str) -> None:
     """Makes a stage in a shared run directory, from the stages before it, which the cell's run has."""
     maker.prepare(overwrite=False)
-    for before in SHARED[: SHARED.index(name)]:
+    for before in (before for before in SHARED[: SHARED.index(name)] if before in run.stages):
         link_stage(run, maker, before)
     note(f"for all cells that share it, in {maker.directory}: {name.replace('_', ' ')}")
     with maker.stage(name):
         if name == "tokenizer":
             stages.train_tokenizer(maker, resume=True)
         elif name == "tokens":
-            stages.tokenize(maker)
+            stages.prepare(maker)
         else:
             stages.train_world_model(maker, resume=True)
 

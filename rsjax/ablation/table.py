@@ -12,8 +12,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rsjax.ablation.grid import Value, values_of
+from rsjax.evaluation.registry import Metric, metrics
 from rsjax.files import FileError, is_held, read_json
-from rsjax.pipeline.run import STAGES, Run
+from rsjax.models import create_model
+from rsjax.pipeline.run import Run
 from rsjax.training.log import read_log
 
 ERROR = "error.json"  # in the directory of a cell that failed
@@ -21,34 +23,9 @@ FINAL_SHARE = 0.1  # of the logged steps, over which a loss term is averaged
 ABSENT = "–"
 LEGEND = (
     "Mean ± sample standard deviation over the finished seeds (of all). **Bold**: the best mean of its column, "
-    "which may be chance. L_RGB: training loss, mean over the last tenth of the logged steps."
+    "which may be chance. L: training loss terms, mean over the last tenth of the logged steps."
 )
 State = Literal["finished", "running", "failed", "interrupted", "missing"]
-
-
-class Column(NamedTuple):
-    """A metric of the table."""
-
-    name: str  # in a cell's metrics
-    title: str
-    unit: str
-    better: Literal["higher", "lower"]
-    decimals: int
-
-    @property
-    def heading(self) -> str:
-        """``PSNR, dB ↑``."""
-        return f"{self.title}{', ' if self.unit else ''}{self.unit} {'↑' if self.better == 'higher' else '↓'}"
-
-
-COLUMNS = (
-    Column("psnr", "PSNR", "dB", "higher", 2),
-    Column("ssim", "SSIM", "", "higher", 4),
-    Column("depth_absrel", "depth AbsRel", "", "lower", 4),
-    Column("depth_delta1", "depth δ₁", "", "higher", 4),
-    Column("delta_psnr", "ΔPSNR", "dB", "higher", 2),
-    Column("loss_rgb", "L_RGB", "", "lower", 3),
-)
 
 
 @dataclass(frozen=True)
@@ -95,7 +72,7 @@ class Row:
 
     @property
     def label(self) -> str:
-        """``model.depth True, loss.keypoints False``."""
+        """``model.use_depth True, model.loss.use_keypoints False``."""
         return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as configured"
 
 
@@ -113,8 +90,8 @@ def read_result(run: Run) -> Result:
     with suppress(FileError):
         return Result(run, "failed", str(read_json(run.directory / ERROR).get("error")), {})
     if run.directory.exists():
-        done = sum(run.finished(stage) for stage in STAGES)
-        return Result(run, "interrupted", f"{done} of {len(STAGES)} stages are finished", {})
+        done = sum(run.finished(stage) for stage in run.stages)
+        return Result(run, "interrupted", f"{done} of {len(run.stages)} stages are finished", {})
     return Result(run, "missing", "not started", {})
 
 
@@ -127,8 +104,8 @@ def read_metrics(run: Run) -> dict[str, float] | None:
     except FileError:
         return None
     numbers = {name: float(value) for name, value in saved.items() if isinstance(value, int | float)}
-    terms = run.config.loss.terms(run.config.model.depth)
-    return numbers | final_terms(read_log(run.directory / "world_model"), tuple(terms))
+    terms = tuple(create_model(run.config).loss_weights)
+    return numbers | final_terms(read_log(run.directory / "world_model"), terms)
 
 
 def final_terms(log: Sequence[Mapping[str, Any]], terms: Sequence[str]) -> dict[str, float]:
@@ -158,7 +135,7 @@ def spread(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(values)), std, len(values))
 
 
-def best(rows: Sequence[Row], column: Column) -> set[int]:
+def best(rows: Sequence[Row], column: Metric) -> set[int]:
     """Returns the rows whose mean, rounded as shown, is the best; none where fewer than two rows have a mean."""
     spreads = {i: row.spreads[column.name] for i, row in enumerate(rows) if column.name in row.spreads}
     means = {i: round(s.mean, column.decimals) for i, s in spreads.items() if not math.isnan(s.mean)}
@@ -166,9 +143,12 @@ def best(rows: Sequence[Row], column: Column) -> set[int]:
     return {i for i, mean in means.items() if mean == top} if len(means) > 1 else set()
 
 
-def shown_columns(rows: Sequence[Row]) -> tuple[Column, ...]:
-    """Returns the columns that any row has a number for."""
-    return tuple(column for column in COLUMNS if any(column.name in row.spreads for row in rows))
+def shown_columns(rows: Sequence[Row]) -> tuple[Metric, ...]:
+    """Returns the registered metrics, and the loss terms of the last steps, that any row has a number for."""
+    names = dict.fromkeys(name for row in rows for name in row.spreads)
+    terms = [name for name in names if name.startswith("loss_")]
+    columns = [*metrics().values(), *(Metric(name, f"L_{name[5:]}", "", "lower", 3) for name in terms)]
+    return tuple(column for column in columns if column.name in names)
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
@@ -192,7 +172,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _number(row: Row, column: Column) -> str:
+def _number(row: Row, column: Metric) -> str:
     if column.name not in row.spreads:
         return ABSENT
     return " ± ".join(f"{x:.{column.decimals}f}" for x in row.spreads[column.name][:2] if x is not None)

@@ -1,1 +1,1 @@
-"""How fast a configuration runs on this machine: medians of timed runs after warm-up, on synthetic inputs."""
+"""Benchmarks of a configuration on this machine: medians of timed runs after warm-up, on synthetic inputs."""

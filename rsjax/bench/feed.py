@@ -1,9 +1,8 @@
-"""Whether the loader keeps ahead of the device: real training steps, fed as training feeds them."""
+"""Measures the time that training waits for data, in real training steps."""
 
 import tempfile
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,35 +14,36 @@ from rsjax.config import Config
 from rsjax.data.curriculum import plan
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
-from rsjax.pipeline.transforms import token_batch
-from rsjax.training.objectives import WorldModelObjective
-from rsjax.training.placement import Placement
+from rsjax.models.base import create_model
+from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
+from rsjax.training.step import train_step
 
 CLIPS = 256
 WARM_UP, LEAST, MOST = 3, 10, 200  # steps
 
 
 def feed(config: Config, budget: float) -> dict[str, Any]:
-    """The share of the time that training steps on one device wait for their batch.
+    """Measures the share of time that training steps on one device wait for their batch.
 
-    The preset's own batch size and workers; clips with random contents, from a store on disk. Every step is waited for
-    before the next batch is asked for, so the time that the batch takes then is the time that the device waits.
+    It uses the preset's batch size and workers, and random clips from a store on disk. Each step finishes before the
+    next batch is requested, so the time until the batch arrives is the time that the device waits.
 
     Args:
-        budget: seconds after which no further step begins, once there are ``LEAST``.
+        budget: seconds after which no further step begins, but at least ``LEAST`` steps are run.
     """
-    loop = replace(config.train, placement="jit", fsdp=1, stages=())
-    objective = WorldModelObjective.create(config)
+    loop = replace(config.train, sharding="jit", fsdp=1, curriculum=())
+    model = create_model(config)
+    transform = model.transform(inputs.normalization(config))
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
-        write_store(path, "tokens", {"train": (inputs.record(config, rng) for _ in range(CLIPS))}, {})
-        loop, make = plan(loop, open_store(path), lambda store: inputs.transform(config), Path(folder))
-        placement = Placement.create(loop)
-        step = placement.compile(objective, loop)
-        state = jax.jit(partial(create_state, objective, loop))()
-        with Prefetch(make(None), lambda arrays: placement.put_batch(token_batch(arrays))) as batches:
+        write_store(path, "tokens", {"train": (model.example(rng) for _ in range(CLIPS))}, {})
+        loop, make = plan(loop, open_store(path), lambda store: transform, Path(folder))
+        sharding = Sharding.create(loop)
+        step = sharding.compile(train_step, model, loop)
+        state = jax.jit(lambda: create_state(model, loop))()
+        with Prefetch(make(None), lambda arrays: sharding.put_batch(model.batch(arrays))) as batches:
             steps, began, waited = 0, 0.0, 0.0
             while steps < WARM_UP + MOST:
                 if steps == WARM_UP:

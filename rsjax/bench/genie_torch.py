@@ -1,8 +1,8 @@
-"""The RGB branch as a plain eager PyTorch program, to be timed beside this one (architecture: 1xgpt's STMaskGIT).
+"""The RGB branch in plain eager PyTorch, as a baseline of speed (architecture: 1xgpt's STMaskGIT).
 
-Written as the public code is: ``scaled_dot_product_attention``, ``nn.LayerNorm``, exact GELU, AdamW, no compilation, no
-cache in sampling. Parameter names are the public checkpoints'. Needs torch, an extra: import this module only where it
-is used.
+Like the public code it uses ``scaled_dot_product_attention``, ``nn.LayerNorm``, exact GELU and AdamW, without
+compilation and without a cache in sampling. Parameter names are those of the public checkpoints. It needs torch, an
+optional dependency, so import this module only where it is used.
 
 Axes: B clips, T frames, S cells, C width, n vocabularies of V codes.
 """
@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rsjax.bench.plain import check_plain
-from rsjax.config import ModelConfig, OptimizerConfig
+from rsjax.config import OptimizerConfig
+from rsjax.models.roboscape.architecture import Architecture
 
 
 class Attention(nn.Module):
@@ -47,9 +48,9 @@ class Mlp(nn.Module):
 
 
 class STBlock(nn.Module):
-    """x += Spatial(norm1 x); x += Temporal(x), which has no norm before it; x += MLP(norm2 x)."""
+    """x += Spatial(norm1 x); x += Temporal(x), without a norm; x += MLP(norm2 x)."""
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: Architecture) -> None:
         super().__init__()
         self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
         self.spatial_attn = Attention(config.width, config.heads)
@@ -65,13 +66,13 @@ class STBlock(nn.Module):
 
 
 class GenieTorch(nn.Module):
-    """Logits (B, T, S, n, V) of tokens (B, T, S); no actions, as in the public Genie.
+    """Maps tokens (B, T, S) to logits (B, T, S, n, V); without actions, as in the public Genie.
 
     Raises:
-        ConfigError: the model has something that the public code has not (other norms, rotary positions, …).
+        ConfigError: the model has options that the public code lacks (other norms, rotary positions, …).
     """
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: Architecture) -> None:
         super().__init__()
         check_plain(config)
         self.config = config
@@ -92,14 +93,14 @@ class GenieTorch(nn.Module):
         return self.out_x_proj(x).reshape(*tokens.shape, self.config.vocabularies, self.config.vocabulary_size)
 
 
-def sub_tokens(tokens: Tensor, config: ModelConfig) -> list[Tensor]:
-    """Tokens to their sub-tokens, little-endian, one per vocabulary."""
+def sub_tokens(tokens: Tensor, config: Architecture) -> list[Tensor]:
+    """Splits tokens into sub-tokens, little-endian, one per vocabulary."""
     bits = config.code_bits // config.vocabularies
     return [(tokens >> (k * bits)) & (2**bits - 1) for k in range(config.vocabularies)]
 
 
 def masked_loss(model: GenieTorch, tokens: Tensor, mask: Tensor) -> Tensor:
-    """Mean over the masked cells of the sum of both vocabularies' cross-entropies, in nats."""
+    """Returns the mean over masked cells of the sum of the vocabularies' cross-entropies, in nats."""
     logits = model(tokens, mask).float()
     targets = torch.stack(sub_tokens(tokens, model.config), dim=-1)
     cross_entropy = F.cross_entropy(logits.flatten(0, -2), targets.flatten(), reduction="none")
@@ -107,7 +108,7 @@ def masked_loss(model: GenieTorch, tokens: Tensor, mask: Tensor) -> Tensor:
 
 
 def make_adamw(model: GenieTorch, optimizer: OptimizerConfig) -> Any:
-    """AdamW with this project's settings."""
+    """Returns AdamW with this project's settings."""
     return torch.optim.AdamW(
         model.parameters(),
         lr=optimizer.learning_rate,
@@ -119,7 +120,7 @@ def make_adamw(model: GenieTorch, optimizer: OptimizerConfig) -> Any:
 def train_step(
     model: GenieTorch, adamw: Any, tokens: Tensor, mask: Tensor, bf16: bool, grad_clip: float = 1.0
 ) -> Tensor:
-    """One step; ``bf16`` runs it under autocast; ``grad_clip`` 0 clips nothing. Returns the loss before it."""
+    """Does one step, with ``bf16`` under autocast, and returns the loss before it. ``grad_clip`` 0 does not clip."""
     with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
         loss = masked_loss(model, tokens, mask)
     adamw.zero_grad()
@@ -132,7 +133,7 @@ def train_step(
 
 @torch.no_grad()
 def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, bf16: bool) -> Tensor:
-    """Tokens with frame ``t`` filled in by MaskGIT decoding, random unmasking, each step a pass over all frames."""
+    """Returns tokens with frame ``t`` decoded by MaskGIT with random unmasking; each step passes over all frames."""
     hidden = torch.ones_like(tokens[:, t], dtype=torch.bool)
     bits = model.config.code_bits // model.config.vocabularies
     tokens = tokens.clone()

@@ -1,67 +1,53 @@
-"""Inputs made from shapes alone: speed does not depend on what clips show, so no data is needed.
+"""Makes random inputs from shapes, since speed does not depend on the contents of clips.
 
-Axes: B clips, T frames, H×W token cells, A action dimensions, N₀ tracks.
+Axes: B clips, T frames, H×W token cells, A action dimensions.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
-from rsjax.clip import Batch
-from rsjax.config import Config, ModelConfig
+from rsjax.config import Config
 from rsjax.data.normalization import Normalization
-from rsjax.data.order import Transform
-from rsjax.data.store import Record
-from rsjax.models.roboscape.world_model import WorldModel, branches
-from rsjax.pipeline.transforms import token_batch, token_clip
+from rsjax.data.order import Arrays
+from rsjax.models.base import WorldModel
+from rsjax.models.roboscape.architecture import Architecture
 
 
-def record(config: Config, rng: np.random.Generator) -> Record:
-    """A token record as stage 3 writes it, with random contents."""
-    frames, grid = config.clips.frames, config.model.grid
-    tokens = rng.integers(0, 2**config.model.code_bits, (2, frames, grid, grid), np.int32)
-    return {
-        "rgb": tokens[0],
-        "depth": tokens[1],
-        "actions": rng.normal(size=(frames, config.clips.action_dim)).astype(np.float32),
-        "tracks": rng.random((config.clips.tracks, frames, 2), np.float32),
-        "visible": rng.random((config.clips.tracks, frames)) < 0.9,
-        "task": "",
-        "provenance": {},
-    }
-
-
-def batch(config: Config, size: int) -> Batch:
-    """A batch of ``size`` clips, on the device."""
-    rng = np.random.default_rng(0)
-    rows = [transform(config)(record(config, rng), rng) for _ in range(size)]
-    return jax.device_put(token_batch({name: np.stack([row[name] for row in rows]) for name in rows[0]}))
-
-
-def transform(config: Config) -> Transform:
-    """From token records to arrays, as training has it, with units that change nothing."""
+def normalization(config: Config) -> Normalization:
+    """Returns the identity normalization."""
     width = config.clips.action_dim
-    return partial(
-        token_clip, Normalization((0.0,) * width, (1.0,) * width, (0.1, 1.0)), config.model.integrate_actions
-    )
+    return Normalization((0.0,) * width, (1.0,) * width, (0.1, 1.0))
 
 
-def prompt(model: ModelConfig, size: int, frames: int) -> dict[str, Any]:
-    """Tokens of ``frames`` given frames by branch, (B, T, H, W)."""
-    keys = jax.random.split(jax.random.key(0), len(branches(model)))
-    shape = (size, frames, model.grid, model.grid)
-    drawn = (jax.random.randint(key, shape, 0, 2**model.code_bits, jnp.int32) for key in keys)
-    return dict(zip(branches(model), drawn, strict=True))
+def arrays(model: WorldModel[Any], config: Config, size: int) -> Arrays:
+    """Returns the stacked arrays of ``size`` random records."""
+    rng, transform = np.random.default_rng(0), model.transform(normalization(config))
+    rows = [transform(model.example(rng), rng) for _ in range(size)]
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-def actions(model: ModelConfig, size: int, frames: int) -> Any:
-    """Normalised actions, (B, T, A)."""
-    return jax.random.normal(jax.random.key(1), (size, frames, model.action_dim))
+def batch(model: WorldModel[Any], config: Config, size: int) -> Any:
+    """Returns a training batch of ``size`` clips, on the device."""
+    return jax.device_put(model.batch(arrays(model, config, size)))
 
 
-def world_model_params(model: ModelConfig) -> Any:
-    """Fresh parameters of the world model, made in one compiled call."""
-    return jax.jit(WorldModel(model).init_params)(jax.random.key(0))
+def batch_shapes(model: WorldModel[Any], config: Config) -> Any:
+    """Returns the shapes of a training batch of one clip."""
+    one = model.batch(arrays(model, config, 1))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), one)
+
+
+def prompt(arch: Architecture, size: int, frames: int) -> dict[str, Int[Array, "B T H W"]]:
+    """Returns random tokens of ``frames`` prompt frames by branch."""
+    keys = jax.random.split(jax.random.key(0), len(arch.branches))
+    shape = (size, frames, arch.grid, arch.grid)
+    drawn = (jax.random.randint(key, shape, 0, 2**arch.code_bits, "int32") for key in keys)
+    return dict(zip(arch.branches, drawn, strict=True))
+
+
+def actions(arch: Architecture, size: int, frames: int) -> Float[Array, "B T A"]:
+    """Returns random normalised actions."""
+    return jax.random.normal(jax.random.key(1), (size, frames, arch.action_inputs))

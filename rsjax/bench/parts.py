@@ -1,6 +1,7 @@
-"""What is measured, part by part. Each part takes a configuration, a batch size and a time budget for each of its
-quantities, and gives flat keys: seconds (``_s``), rates (``_per_s``) and floating-point operations (``_flops``, per
-second for the ceiling and for what is achieved).
+"""The parts of a benchmark.
+
+Each part takes a configuration, a batch size and a time budget per quantity, and returns numbers by name: seconds
+(``_s``), rates (``_per_s``) and floating-point operations (``_flops``, per second for ceiling and achieved rate).
 """
 
 import dataclasses
@@ -18,31 +19,29 @@ from rsjax.bench import inputs
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config
 from rsjax.data import loader
-from rsjax.data.normalization import Normalization
 from rsjax.data.store import open_store, write_store
-from rsjax.models.roboscape.flops import train_flops
+from rsjax.models.base import create_model
+from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.rollout import rollout
-from rsjax.models.roboscape.world_model import branches
-from rsjax.pipeline.generator import Codec
-from rsjax.pipeline.transforms import token_batch
+from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.training.objectives import WorldModelObjective
-from rsjax.training.placement import Placement
+from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
+from rsjax.training.step import train_step
 
 Numbers = dict[str, Any]
 
-# (N, K, M) of the products that stand for the machine's ceiling: the layers of the 32×256 model, and larger ones.
+# (N, K, M) of the products whose fastest is the ceiling: the layers of the 32×256 model, and larger ones.
 CPU_PRODUCTS = ((4096, 256, 1024), (4096, 1024, 256), (2048, 2048, 2048))
 ACCELERATOR_PRODUCTS = ((4096, 256, 1024), (8192, 8192, 8192), (16384, 4096, 16384))
-PRODUCTS_PER_RUN = 10  # more than one, so that a launch does not count
-PROMPT_FRAMES = 1  # of the rollouts, as the paper gives: then their cost does not depend on the preset's training
-UNCACHED_FRAMES = 2  # that are decoded by recomputing all frames; each costs the same, so few are enough
+PRODUCTS_PER_RUN = 10  # to hide the cost of a launch
+PROMPT_FRAMES = 1  # of rollouts, as in the paper, for every preset
+UNCACHED_FRAMES = 2  # frames decoded without the cache; all cost the same, so few are enough
 LOADER_CLIPS, LOADER_BATCHES = 64, 16
 
 
 def matmul(dtype: str, budget: float, shapes: tuple[tuple[int, int, int], ...] | None = None) -> Numbers:
-    """The rate of the fastest of some matrix products, float32 accumulation, in operations a second."""
+    """Measures matrix products with float32 accumulation; the ceiling is the fastest rate in operations a second."""
     if shapes is None:
         shapes = CPU_PRODUCTS if jax.default_backend() == "cpu" else ACCELERATOR_PRODUCTS
     product = jax.jit(lambda x, w: jnp.matmul(x, w, preferred_element_type=jnp.float32))
@@ -58,13 +57,14 @@ def matmul(dtype: str, budget: float, shapes: tuple[tuple[int, int, int], ...] |
 
 
 def train(config: Config, batch: int, budget: float) -> Numbers:
-    """The world model's training step on one device: compilation from nothing, and the step itself."""
-    objective = WorldModelObjective.create(config)
-    loop = dataclasses.replace(config.train, batch_size=batch, placement="jit")
-    state = jax.jit(partial(create_state, objective, loop))()
-    clips = inputs.batch(config, batch)
+    """Measures the world model's training step on one device, and its compilation without caches."""
+    model = create_model(config)
+    loop = dataclasses.replace(config.train, batch_size=batch, sharding="jit")
+    state = jax.jit(lambda: create_state(model, loop))()
+    clips = inputs.batch(model, config, batch)
     began = time.perf_counter()
-    step = Placement.create(loop).compile(objective, loop).lower(state, clips).compile()
+    compiled: Any = Sharding.create(loop).compile(train_step, model, loop)
+    step = compiled.lower(state, clips).compile()
     compile_s = time.perf_counter() - began
 
     def run() -> Any:
@@ -73,32 +73,38 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
         return state, metrics
 
     seconds = median_seconds(run, budget)
-    frames, cells = config.clips.frames, config.model.grid**2
-    flops = train_flops(config.model, frames, batch)
-    return {
+    numbers: Numbers = {
         "train_step_s": seconds,
-        "train_tokens_per_s": batch * frames * cells * len(branches(config.model)) / seconds,
-        "train_step_flops": flops,
-        "train_flops": flops / seconds,
+        "train_frames_per_s": batch * config.clips.frames / seconds,
         "compile_s": compile_s,
         "parameters": sum(x.size for x in jax.tree.leaves(state.params)),
     }
+    if isinstance(model, RoboScape):
+        tokens = batch * config.clips.frames * config.grid**2 * len(model.architecture.branches)
+        numbers["train_tokens_per_s"] = tokens / seconds
+    if flops := batch * model.flops(config.clips.frames).get("train", 0):
+        numbers |= {"train_step_flops": flops, "train_flops": flops / seconds}
+    return numbers
 
 
 def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
-    """Seconds for each generated frame of a batch, by rollouts' length, with the temporal cache and without.
+    """Measures seconds per generated frame of a batch for each rollout length, with and without the temporal cache.
 
-    Without it, the last frames of a rollout are measured: each frame costs a pass over all of them, whichever it is.
+    Without it, only the last frames of a rollout are decoded, since each costs a pass over all frames. Only RoboScape
+    and Genie are measured.
     """
-    model, key = config.model, jax.random.key(0)
-    params = inputs.world_model_params(model)
-    numbers: Numbers = {"sample_steps": config.sample.steps, "sample_prompt_frames": PROMPT_FRAMES}
+    model, key = create_model(config), jax.random.key(0)
+    if not isinstance(model, RoboScape):
+        return {}
+    arch, settings = model.architecture, model.config.sample
+    params = jax.jit(model.init)(jax.random.key(0))
+    numbers: Numbers = {"sample_steps": settings.steps, "sample_prompt_frames": PROMPT_FRAMES}
     for frames in horizons:
-        actions, late = inputs.actions(model, batch, frames), max(PROMPT_FRAMES, frames - UNCACHED_FRAMES)
-        for name, given, cached in (("cached", PROMPT_FRAMES, True), ("uncached", late, False)):
-            prompt = inputs.prompt(model, batch, given)
-            run = partial(rollout, model, config.sample, params, prompt, actions, key, cached=cached)
-            numbers[f"sample_s_per_frame_{name}_{frames}"] = median_seconds(run, budget) / (frames - given)
+        actions, late = inputs.actions(arch, batch, frames), max(PROMPT_FRAMES, frames - UNCACHED_FRAMES)
+        for name, start, cached in (("cached", PROMPT_FRAMES, True), ("uncached", late, False)):
+            prompt = inputs.prompt(arch, batch, start)
+            run = partial(rollout, arch, settings, params, prompt, actions, key, cached=cached)
+            numbers[f"sample_s_per_frame_{name}_{frames}"] = median_seconds(run, budget) / (frames - start)
         numbers[f"sample_uncached_frames_measured_{frames}"] = frames - late
     first, last = horizons[0], horizons[-1]
     for name in ("s_per_frame_cached", "s_per_frame_uncached", "uncached_frames_measured"):
@@ -110,11 +116,10 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
 
 
 def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
-    """Frames a second into tokens and back, images from and to the host, for as many frames as the clips have."""
+    """Measures encoded and decoded frames a second, with images on the host, for all frames of a batch of clips."""
     params = jax.jit(Tokenizer(config.tokenizer).init_params)(jax.random.key(0))
-    units = Normalization((0.0,), (1.0,), (0.1, 1.0))  # of depth and actions, which are not coded here
-    codec = Codec(config, params, units)
-    size, rng = config.tokenizer.image_size, np.random.default_rng(0)
+    codec = Codec(config.tokenizer, params, inputs.normalization(config))
+    size, rng = config.clips.image_size, np.random.default_rng(0)
     images = rng.integers(0, 256, (batch * config.clips.frames, size, size, 3), np.uint8)
     tokens = codec.encode_rgb(images)
     return {
@@ -125,13 +130,13 @@ def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
 
 
 def load(config: Config, batch: int, budget: float) -> Numbers:
-    """Clips a second from a store of tokens to batches on the host, through the loader that training uses."""
-    rng = np.random.default_rng(0)
-    records = [inputs.record(config, rng) for _ in range(LOADER_CLIPS)]
+    """Measures clips a second from a store to batches on the host, through the loader that training uses."""
+    model, rng = create_model(config), np.random.default_rng(0)
+    records = [model.example(rng) for _ in range(LOADER_CLIPS)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": records}, {})
-        source = open_store(path).source("train")
-        with loader.batches(source, inputs.transform(config), batch, config.train.seed) as clips:
-            seconds = median_seconds(lambda: [token_batch(next(clips)) for _ in range(LOADER_BATCHES)], budget)
+        source, transform = open_store(path).source("train"), model.transform(inputs.normalization(config))
+        with loader.batches(source, transform, batch, config.train.seed) as clips:
+            seconds = median_seconds(lambda: [model.batch(next(clips)) for _ in range(LOADER_BATCHES)], budget)
     return {"loader_clips_per_s": batch * LOADER_BATCHES / seconds}

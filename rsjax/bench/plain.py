@@ -1,12 +1,13 @@
-"""Which models the baselines can be: those of the public Genie as it was published. Needs no torch."""
+"""Checks that the PyTorch baseline can be compared with a model, without importing torch."""
 
-from rsjax.config import ConfigError, ModelConfig
+from rsjax.config import ConfigError
+from rsjax.models.roboscape.architecture import Architecture
 
-ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup")  # options that are off there
+ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup")  # options that the baseline lacks
 
 
-def check_plain(model: ModelConfig) -> None:
-    """Raises :class:`ConfigError` where the model has something that the baseline's code has not."""
+def check_plain(model: Architecture) -> None:
+    """Raises :class:`ConfigError` if the model has an option that the baseline lacks."""
     for name in ADDED:
         if getattr(model, name):
             raise ConfigError(

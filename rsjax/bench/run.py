@@ -1,4 +1,4 @@
-"""A whole benchmark: the parts in order, facts about the machine, the table."""
+"""Runs a benchmark's parts in order, with facts about the machine, and formats the table."""
 
 import datetime
 import os
@@ -18,7 +18,8 @@ from rsjax.config import Config, ConfigError
 from rsjax.errors import did_you_mean
 
 PARTS = ("matmul", "train", "sample", "tokenizer", "loader", "feed")
-BUDGET_SECONDS = 20.0  # for each quantity, if three runs take no longer
+MODEL_FACTS = ("blocks", "width", "use_depth", "compute_dtype", "remat")  # reported if the family has them
+BUDGET_SECONDS = 20.0  # per quantity, unless three runs take longer
 
 
 def bench(
@@ -31,29 +32,30 @@ def bench(
     say: Callable[[str], None] = lambda line: None,
     keep: Callable[[dict[str, Any]], None] = lambda numbers: None,
 ) -> dict[str, Any]:
-    """Measures the parts named in ``only``, one after the other, in this process.
+    """Measures the parts named in ``only`` one after another in this process.
 
     Args:
-        batch: clips in a training step, a rollout and a loader's batch; the tokenizer gets their frames. The part
-            ``feed`` trains with the preset's own.
-        horizons: frames of the rollouts, their one prompt frame included; the model's own number and three times that
-            if empty. PyTorch decodes in a window of the first.
-        torch: time the PyTorch baseline too.
-        budget: seconds after which a quantity's repetitions end, once there are three.
-        say: told what is measured, before it is.
-        keep: given after each part all numbers so far, as they would be returned: the next part may run out of memory.
+        batch: clips per training step, rollout and loader batch; the tokenizer processes their frames. The part
+            ``feed`` uses the preset's batch size.
+        horizons: lengths of rollouts in frames, one prompt frame included; if empty, the clips' length and three times
+            that. PyTorch decodes in a window of the first length.
+        torch: whether to measure the PyTorch baseline too.
+        budget: seconds after which repetitions of a quantity end, but at least three are run.
+        say: takes a message before each part.
+        keep: takes all numbers so far after each part, since the next part may run out of memory.
 
     Returns:
-        Flat and JSON-ready: what was measured, and on what. Peak memory is the high-water mark up to each part's end.
+        Numbers and facts about model and machine, flat and JSON-ready. Peak memory is the maximum up to a part's end.
 
     Raises:
-        UserError: a part is unknown, the batch is not positive, a rollout has nothing to generate, or torch is asked
-            for and is not there or cannot be this model.
+        UserError: a part is unknown, the batch is not positive, a rollout has nothing to generate, torch is not
+            installed, or the PyTorch baseline cannot be compared with the model.
     """
     check_request(config, batch, only, horizons, torch)
-    horizons = horizons or (config.model.frames, 3 * config.model.frames)
+    horizons = horizons or (config.clips.frames, 3 * config.clips.frames)
+    dtype = getattr(config.model, "compute_dtype", "float32")
     works: dict[str, Callable[[], dict[str, Any]]] = {
-        "matmul": lambda: parts.matmul(config.model.compute_dtype, budget),
+        "matmul": lambda: parts.matmul(dtype, budget),
         "train": lambda: parts.train(config, batch, budget),
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
@@ -65,15 +67,15 @@ def bench(
     for name in [part for part in PARTS if part in only] + ["torch"] * torch:
         say(f"measuring {name}")
         numbers |= works[name]() | {"peak_memory_bytes": peak_memory_bytes()}
-        if name != "torch":  # whose memory on an accelerator jax does not see
+        if name != "torch":  # jax does not see torch's memory on an accelerator
             numbers[f"{name}_peak_memory_bytes"] = numbers["peak_memory_bytes"]
-        numbers |= ratios(numbers, config.model.depth)
+        numbers |= ratios(numbers, config.model.uses_depth)
         keep(dict(numbers))
     return numbers
 
 
 def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int], torch: bool) -> None:
-    """Raises :class:`UserError` for what cannot be measured, before anything is."""
+    """Raises :class:`UserError` if a part cannot be measured, before any is."""
     for name in only:
         if name not in PARTS:
             raise ConfigError(f"--only has no part {name!r}{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})")
@@ -82,20 +84,20 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
     for frames in horizons:
         if frames <= parts.PROMPT_FRAMES:
             raise ConfigError(
-                f"--horizons has {frames}; the prompt is {parts.PROMPT_FRAMES} frame, and one must follow"
+                f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
             )
     if torch:
-        check_torch(config.model)
+        check_torch(config)
 
 
 def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, float]:
-    """What follows from two measured quantities, where both are there."""
+    """Returns ratios of two measured quantities if both were measured."""
     over = {
         "train_share_of_ceiling": ("train_flops", "matmul_ceiling_flops"),
         "sample_cache_speedup": ("sample_s_per_frame_uncached", "sample_s_per_frame_cached"),
     }
     same_device = (numbers.get("torch_device") == "cpu") == (numbers.get("platform") == "cpu")
-    if same_device and not dual:  # the PyTorch baseline is one branch: only then do both do the same work
+    if same_device and not dual:  # the PyTorch baseline has only one branch
         for dtype in ("float32", "bfloat16"):
             over[f"train_speedup_over_torch_{dtype}"] = (f"torch_train_step_s_{dtype}", "train_step_s")
             over[f"sample_speedup_over_torch_{dtype}"] = (
@@ -106,17 +108,14 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, float]:
 
 
 def facts(config: Config, batch: int) -> dict[str, Any]:
-    """What was measured, on what, and when."""
+    """Returns facts about the model, the machine and the date."""
     device = jax.local_devices()[0]
     return {
         "preset": config.name,
         "batch": batch,
-        "blocks": config.model.blocks,
-        "width": config.model.width,
-        "branches": 2 if config.model.depth else 1,
+        "model": config.model.family,
         "frames": config.clips.frames,
-        "dtype": config.model.compute_dtype,
-        "remat": config.model.remat,
+        **{name: getattr(config.model, name) for name in MODEL_FACTS if hasattr(config.model, name)},
         "device": _cpu_model() if device.platform == "cpu" else device.device_kind,
         "platform": device.platform,
         "cores": len(os.sched_getaffinity(0)),
@@ -133,7 +132,7 @@ def _cpu_model() -> str:
 
 
 def table(numbers: dict[str, Any]) -> Table:
-    """The same for a terminal."""
+    """Formats numbers for a terminal."""
     out = Table(show_header=False, box=None)
     for name, value in numbers.items():
         out.add_row(name, _shown(name, value))

@@ -1,4 +1,4 @@
-"""Timed runs, and the memory that they took."""
+"""Measures time and memory."""
 
 import resource
 import statistics
@@ -10,13 +10,13 @@ import jax
 
 
 def median_seconds(call: Callable[[], Any], budget: float, most: int = 20, least: int = 3) -> float:
-    """Median wall time of ``call`` in seconds, after one run that is not counted (it compiles and warms caches).
+    """Returns the median wall time of ``call`` in seconds, after a warm-up run that compiles and fills caches.
 
     Args:
-        call: returns the arrays that it made; they are waited for.
-        budget: seconds after which no further run begins, once there are ``least``.
-        most: runs at the most.
-        least: runs at the least.
+        call: returns its arrays, so that the time until they are ready is measured.
+        budget: seconds after which no further run begins, but at least ``least`` runs are timed.
+        most: largest number of timed runs.
+        least: smallest number of timed runs.
     """
     jax.block_until_ready(call())
     seconds: list[float] = []
@@ -28,7 +28,7 @@ def median_seconds(call: Callable[[], Any], budget: float, most: int = 20, least
 
 
 def peak_memory_bytes() -> int:
-    """High-water mark since the process began: of the device's memory, or, on a CPU, of the resident set."""
+    """Returns the peak since the process began of the device's memory or, on a CPU, of the resident set."""
     stats = jax.local_devices()[0].memory_stats()
     if stats:
         return stats["peak_bytes_in_use"]

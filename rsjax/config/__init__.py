@@ -1,40 +1,68 @@
-"""Every setting of the project: frozen dataclasses, checked where they are made, hashable, serialisable.
+"""Every setting of the project: frozen, hashable, serialisable dataclasses that check themselves when made.
 
-A :class:`Config` names everything that one run depends on. Presets live in :mod:`rsjax.config.presets`.
-The loss weights λ₁, λ₂, λ₃ and γ of the paper live in :class:`LossConfig` and nowhere else.
+A :class:`Config` contains everything that one run depends on. Presets are in :mod:`rsjax.config.presets`.
+The paper's λ₁, λ₂, λ₃ and γ are in :class:`LossConfig` and nowhere else.
 
-A field made with :func:`runtime` changes how fast or how talkatively a run goes but not what it makes;
-it is left out of content keys, so changing it never invalidates finished work.
+A field made with :func:`runtime` changes the speed or the logging of a run, not its results. Content keys leave it
+out, so changing it never invalidates finished work.
 """
 
 from rsjax.config.data import ClipShape, DataConfig
-from rsjax.config.fields import ConfigError, content_key, from_dict, require, runtime, to_dict
-from rsjax.config.model import LossConfig, MaskConfig, ModelConfig
-from rsjax.config.run import Config, EvalConfig, SampleConfig
+from rsjax.config.fields import (
+    ConfigError,
+    content_key,
+    from_dict,
+    require,
+    runtime,
+    sampling,
+    sampling_settings,
+    to_dict,
+)
+from rsjax.config.model import (
+    FAMILIES,
+    GenieConfig,
+    LossConfig,
+    MaskConfig,
+    ModelConfig,
+    RoboScapeConfig,
+    SampleConfig,
+    TokenModelConfig,
+    TransformerConfig,
+    register_family,
+)
+from rsjax.config.run import Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from rsjax.config.train import LoopConfig, OptimizerConfig, PartConfig, StageConfig
+from rsjax.config.train import ComponentConfig, CurriculumStageConfig, LoopConfig, OptimizerConfig
 
 __all__ = [
+    "FAMILIES",
     "ClipShape",
+    "ComponentConfig",
     "Config",
     "ConfigError",
+    "CurriculumStageConfig",
     "DataConfig",
     "EvalConfig",
+    "GenieConfig",
     "LoopConfig",
     "LossConfig",
     "MaskConfig",
     "ModelConfig",
     "OptimizerConfig",
-    "PartConfig",
+    "RoboScapeConfig",
     "SampleConfig",
     "SimConfig",
-    "StageConfig",
+    "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",
+    "TransformerConfig",
     "content_key",
     "from_dict",
+    "register_family",
     "require",
     "runtime",
+    "sampling",
+    "sampling_settings",
     "to_dict",
 ]

@@ -1,4 +1,4 @@
-"""What the clips are like that everything else has to fit, and a store of clips that was not simulated."""
+"""The shape of a data set's clips, and settings of a store of ingested clips."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from rsjax.config.fields import require, runtime
 
 @dataclass(frozen=True)
 class ClipShape:
-    """A data set's clips: frames, pixels of a side, tracks N₀, width of a frame's action, clips of the test split."""
+    """Shape of a data set's clips: frames, pixels per side, tracks N₀, numbers in a frame's action; test clips."""
 
     frames: int
     image_size: int
@@ -18,13 +18,13 @@ class ClipShape:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """A store of clips, as ``experiments.ingest`` makes it, to train on in place of simulated episodes.
+    """A store of clips made by ``experiments.ingest``, to train on instead of simulated episodes.
 
-    ``experiments.train --store`` fills it in (:func:`rsjax.pipeline.own_data.on_store`).
+    ``--store`` fills it in (:func:`rsjax.pipeline.own_data.on_store`).
     """
 
-    store: str = runtime("")  # where it lies
-    key: str = ""  # its content key, by which a run knows it wherever it lies; empty: episodes are simulated
+    store: str = runtime("")  # its path
+    key: str = ""  # its content key, which identifies it wherever it is; empty: episodes are simulated
     frames: int = 0
     image_size: int = 0
     tracks: int = 0
@@ -39,5 +39,5 @@ class DataConfig:
 
     @property
     def clips(self) -> ClipShape:
-        """What its clips are like."""
+        """The shape of its clips."""
         return ClipShape(self.frames, self.image_size, self.tracks, self.action_dim, self.test_clips)

@@ -1,4 +1,4 @@
-"""Every field of a nested config by its dotted name: read them all, or replace some at once."""
+"""The fields of a nested config by dotted name: reads them all, or replaces several at once."""
 
 import dataclasses
 import typing
@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 class Leaf(NamedTuple):
-    """A field's value, its declared type, and whether it leaves results as they are (:func:`rsjax.config.runtime`)."""
+    """A field's value, its declared type, and whether it is a :func:`rsjax.config.runtime` field."""
 
     value: Any
     kind: Any
@@ -30,10 +30,10 @@ def leaves(config: Any, prefix: str = "") -> dict[str, Leaf]:
 
 
 def with_values(config: T, values: Mapping[str, Any]) -> T:
-    """Returns the config with new values of these dotted names. It is checked once, after all of them are set.
+    """Returns the config with new values for these dotted names. It is checked once, after all are set.
 
     Raises:
-        ConfigError: the combination cannot run.
+        ConfigError: the combination is impossible.
     """
     changes: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
     for head in {name.partition(".")[0] for name in values if "." in name}:

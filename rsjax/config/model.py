@@ -1,74 +1,221 @@
-"""Settings of the world model, its masked training and its objective."""
+"""Settings of the families of world models: one frozen dataclass each, with the common base :class:`ModelConfig`.
 
-from dataclasses import dataclass
-from typing import Literal
+Each family is registered under a name. ``Config.model`` is one of them, chosen by the preset or by ``--model NAME``.
+"""
 
-from rsjax.config.fields import require, runtime
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, TypeVar
+
+from rsjax.config.data import ClipShape
+from rsjax.config.fields import ConfigError, loss_weights, require, runtime, sampling
+from rsjax.errors import did_you_mean
+
+M = TypeVar("M", bound="type[ModelConfig]")
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The dual-branch spatial-temporal transformer (paper §2.3)."""
+    """Base of every family's settings.
 
-    frames: int = 16
-    grid: int = 16
-    code_bits: int = 18
-    vocabularies: int = 2
-    action_dim: int = 28  # of what the action encoder sees; 0: there is no encoder, actions are not read (Genie)
-    # The encoder also sees the sum of all actions so far (action_dim doubles). Where actions are pose deltas, that is
-    # the pose: a large model finds it by temporal attention, a small one on few steps need not. Not in the paper.
+    Attributes:
+        family: its registered name.
+        uses_tokenizer: whether the family models the tokens of ``Config.tokenizer``; if not, no tokenizer is trained.
+    """
+
+    family: ClassVar[str] = ""
+    uses_tokenizer: ClassVar[bool] = False
+
+    def check(self, clips: ClipShape) -> None:
+        """Raises :class:`rsjax.config.ConfigError` if the model does not fit clips of this shape."""
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        """The weight of each active loss term by name; by default the nonzero fields ``NAME_weight``."""
+        return loss_weights(self)
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether the model learns from depth."""
+        return False
+
+    @property
+    def marked_keypoints(self) -> int:
+        """How many keypoints the model selects in each clip, for the report's pictures; 0: none."""
+        return 0
+
+    @classmethod
+    def chosen(cls, values: dict[str, Any]) -> tuple[type["ModelConfig"], dict[str, Any]]:
+        """Returns the class and the fields of a dictionary made by :func:`rsjax.config.to_dict`."""
+        require("family" in values, "model has no family; the file is of another version")
+        return family(values["family"]), {name: value for name, value in values.items() if name != "family"}
+
+
+FAMILIES: dict[str, type[ModelConfig]] = {}
+
+
+def register_family(name: str) -> Callable[[M], M]:
+    """Registers a subclass of :class:`ModelConfig` under a name for ``--model`` and ``config.json``.
+
+    Raises:
+        ConfigError: another class already has that name.
+    """
+
+    def register(kind: M) -> M:
+        require(FAMILIES.get(name, kind) is kind, f"two families of models are named {name!r}; rename one of them")
+        kind.family = name
+        FAMILIES[name] = kind
+        return kind
+
+    return register
+
+
+def family(name: str) -> type[ModelConfig]:
+    """Returns the settings class of the family called ``name``.
+
+    Raises:
+        ConfigError: the name is unknown; the message suggests the closest and lists all.
+    """
+    if name not in FAMILIES:
+        raise ConfigError(f"unknown model {name!r}{did_you_mean(name, FAMILIES)} (models: {', '.join(FAMILIES)})")
+    return FAMILIES[name]
+
+
+def converted(model: ModelConfig, name: str) -> ModelConfig:
+    """Returns settings of the family called ``name`` that keep those fields of ``model`` that are not defaults.
+
+    Fields that the new family lacks are dropped.
+    """
+    kind, default = family(name), type(model)()
+    changed = {f.name for f in fields(default) if getattr(model, f.name) != getattr(default, f.name)}
+    shared: dict[str, Any] = {f.name: getattr(model, f.name) for f in fields(kind) if f.name in changed}
+    return model if type(model) is kind else kind(**shared)
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Masking and corruption of training tokens, as in the public Genie (reference: 1xgpt).
+
+    Rates are probabilities; see :mod:`rsjax.models.roboscape.masking` for the recipe's three steps.
+    """
+
+    random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
+    corruption_probability: float = 0.5  # step 2 applies to this share of the batches
+    corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
+    corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """Settings of MaskGIT decoding within a frame, and of the memory from frame to frame."""
+
+    steps: int = 2
+    temperature: float = 0.0  # logits are divided by it; 0 takes the most probable code
+    top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
+    unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
+    # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
+    # double the work.
+    guidance: float = 1.0
+    # Learned positions only: when the window is full, its first window_stride frames are dropped and the others encoded
+    # again from position 0. A smaller stride gives a longer memory and more work. 0: half of the positions.
+    window_stride: int = 0
+    cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 1, f"model.sample.steps is {self.steps}; a frame needs at least 1 decoding step")
+        for name in ("temperature", "top_k", "window_stride"):
+            value = getattr(self, name)
+            require(value >= 0, f"model.sample.{name} is {value}; it cannot be negative")
+
+
+def check_sampling(sample: SampleConfig, positions: int, action_dropout: float) -> None:
+    """Raises :class:`rsjax.config.ConfigError` if a model with so many positions does not support these settings."""
+    require(
+        sample.guidance == 1 or action_dropout > 0,
+        f"model.sample.guidance is {sample.guidance} but the model never saw clips without actions; "
+        f"set it to 1, or train with model.action_dropout above 0",
+    )
+    require(
+        sample.window_stride < positions,
+        f"model.sample.window_stride is {sample.window_stride} of {positions} positions; "
+        f"at least one frame must stay in the window",
+    )
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Eq. 8: L = L_RGB + λ₁·L_Depth + λ₂·L_Keypoint + λ₃·L_Attention.
+
+    A field ``NAME_weight`` weighs the term NAME; 0 switches it off.
+    """
+
+    rgb_weight: float = 1.0
+    depth_weight: float = 1.0  # λ₁
+    keypoint_weight: float = 0.01  # λ₂
+    attention_weight: float = 1.0  # λ₃
+    gamma: float = 5.0  # γ of Eq. 6
+    use_keypoints: bool = True  # False: without the keypoint and attention terms
+    num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
+
+    def __post_init__(self) -> None:
+        require(self.num_keypoints >= 1, f"model.loss.num_keypoints is {self.num_keypoints}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """A spatial-temporal transformer on token grids, with one branch or two."""
+
+    # linear: one linear layer (RoboScape). mlp: an MLP (the paper's Genie with actions), whose last layer starts at
+    # zero, so that public weights keep their logits. none: no actions (the public Genie).
+    action_encoder: Literal["linear", "mlp", "none"] = "linear"
+    # The encoder also reads the sum of all actions so far, which doubles its input. If actions are pose deltas, the sum
+    # is the pose: a large model finds it by temporal attention, a small one in few steps may not. Not in the paper.
     integrate_actions: bool = False
     width: int = 256
     blocks: int = 32
     heads: int = 8
     mlp_ratio: int = 4
-    # Training shows a learned null action in place of all of this share of the clips' own, so that sampling can guide
-    # (classifier-free). Not in the paper.
+    # The share of training clips whose actions are replaced by a learned null action, for classifier-free guidance in
+    # sampling. Not in the paper.
     action_dropout: float = 0.0
-    # rotary: time enters by turning temporal queries and keys, positions within a frame stay learned. Then a rollout
-    # rolls on beyond ``frames``, which is how far a frame looks back. The public code learns all positions.
+    # learned: as in the public code. rotary: temporal queries and keys are rotated, and a rollout can go on beyond the
+    # trained frames with a rolling cache; positions within a frame are learned in both cases.
     positions: Literal["learned", "rotary"] = "learned"
-    depth: bool = True  # False: the second branch and the projections do not exist at all
-    # The public Genie normalises before spatial attention and the MLP, not before temporal attention and
-    # not at the end; small models on few steps learn faster with both.
+    # Norms before temporal attention and before the heads. The public Genie has neither; small models trained for few
+    # steps learn faster with both.
     temporal_norm: bool = False
     final_norm: bool = False
-    # Options of the public code that its published weights may have been trained with. qk_norm: queries and keys are
-    # normalised per head, by one LayerNorm for both; the norms before spatial attention and the MLP then do not exist.
+    # Options of the public code that published weights may use. qk_norm: one LayerNorm normalises each head's queries
+    # and keys; the norms before spatial attention and the MLP are then absent.
     qk_norm: bool = False
-    mup: bool = False  # attention scale 8/head width instead of its root; the heads' input ÷ (width/256)
-    embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 is torch's default and so the public code's
-    position_std: float = 0.0  # position and mask embeddings likewise; the public code starts them at zero
-    # bfloat16: operands of the linear layers' products (accumulated in float32) and, in frames of many cells or on an
-    # accelerator, of the attention within frames. Parameters, norms and softmaxes stay float32.
+    mup: bool = False  # attention scale 8/head width instead of 1/√(head width); the heads' input ÷ (width/256)
+    embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 as in the public code (torch's default)
+    position_std: float = 0.0  # position and mask embeddings ~ N(0, std²); 0 as in the public code
+    # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
+    # more, of attention within frames. Parameters, norms and softmaxes stay float32.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    unroll: int = runtime(1)  # blocks per turn of the scan over them: more are faster on a CPU, and compile longer
-    # What the backward pass finds kept: none recomputes nothing, blocks keeps each block's input alone, products the
-    # linear layers' outputs as well (less to compute again, more memory).
+    unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
+    # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
+    # but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
 
     def __post_init__(self) -> None:
-        for name in ("frames", "grid", "width", "blocks", "heads", "mlp_ratio", "unroll"):
+        for name in ("width", "blocks", "heads", "mlp_ratio", "unroll"):
             require(getattr(self, name) >= 1, f"model.{name} is {getattr(self, name)}; it must be at least 1")
         require(
             self.width % self.heads == 0,
             f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
         )
         require(
-            self.code_bits % self.vocabularies == 0,
-            f"model.code_bits {self.code_bits} does not divide into {self.vocabularies} vocabularies; "
-            f"make it a multiple of model.vocabularies",
-        )
-        require(
             self.positions == "learned" or self.head_width % 2 == 0,
             f"model.positions is 'rotary', which turns pairs of channels, but a head has {self.head_width} "
             f"(model.width / model.heads); change one of them",
         )
-        require(self.action_dim >= 0, f"model.action_dim is {self.action_dim}; it cannot be negative")
         require(
-            self.action_dim > 0 or not (self.integrate_actions or self.action_dropout),
-            "model.action_dim is 0, so there are no actions for model.integrate_actions or model.action_dropout; "
-            "set them to False and 0",
+            self.action_encoder != "none" or not (self.integrate_actions or self.action_dropout),
+            "model.action_encoder is none, so there are no actions for model.integrate_actions or "
+            "model.action_dropout; set them to False and 0",
         )
         require(
             0 <= self.action_dropout < 1,
@@ -80,46 +227,66 @@ class ModelConfig:
         """Channels of one attention head."""
         return self.width // self.heads
 
-    @property
-    def vocabulary_size(self) -> int:
-        """Codes per factorised vocabulary: 2^(D/n)."""
-        return 2 ** (self.code_bits // self.vocabularies)
-
 
 @dataclass(frozen=True)
-class MaskConfig:
-    """Masked training with corruption, after the public Genie (reference: 1xgpt).
+class TokenModelConfig(TransformerConfig, ModelConfig):
+    """Settings that RoboScape and Genie share: a transformer trained on masked tokens and sampled with MaskGIT.
 
-    Rates are probabilities; see :mod:`rsjax.models.roboscape.masking` for the recipe's three steps.
+    Attributes:
+        max_frames: positions in time, and how many frames temporal attention covers; 0: the clips' frames.
     """
 
-    prompt_frames: int = 1  # frames given at generation; the paper gives one
-    random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
-    corruption_probability: float = 0.5  # step 2 happens to this share of the batches
-    corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
-    corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+    uses_tokenizer: ClassVar[bool] = True
+    max_frames: int = 0
+    mask: MaskConfig = MaskConfig()
+    sample: SampleConfig = sampling(SampleConfig())
 
-    def __post_init__(self) -> None:
-        require(self.prompt_frames >= 1, f"mask.prompt_frames is {self.prompt_frames}; at least 1 frame is given")
+    def frames(self, clips: ClipShape) -> int:
+        """Returns the number of positions in time for such clips."""
+        return self.max_frames or clips.frames
+
+    def check(self, clips: ClipShape) -> None:
+        require(
+            clips.frames <= self.frames(clips),
+            f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "
+            f"it to 0 (as many as the clips have)",
+        )
+        check_sampling(self.sample, self.frames(clips), self.action_dropout)
 
 
+@register_family("roboscape")
 @dataclass(frozen=True)
-class LossConfig:
-    """Eq. 8: L = rgb·L_RGB + λ₁·L_Depth + λ₂·L_Keypoint + λ₃·L_Attention. Field names are term names."""
+class RoboScapeConfig(TokenModelConfig):
+    """RoboScape: the dual-branch transformer with the physics-informed objective (paper §2.3)."""
 
-    rgb: float = 1.0
-    depth: float = 1.0  # λ₁
-    keypoint: float = 0.01  # λ₂
-    attention: float = 1.0  # λ₃
-    gamma: float = 5.0  # γ of Eq. 6
-    keypoints: bool = True  # False: neither the keypoint nor the attention term exists
-    num_keypoints: int = 32  # K of the top-K; the paper does not give its K
+    use_depth: bool = True  # False: without the depth branch, its projections and the depth term
+    loss: LossConfig = LossConfig()
 
-    def terms(self, depth_branch: bool) -> dict[str, float]:
-        """The weights of the terms that are on, by term name."""
-        weights = {"rgb": self.rgb}
-        if depth_branch:
-            weights["depth"] = self.depth
-        if self.keypoints:
-            weights |= {"keypoint": self.keypoint, "attention": self.attention}
-        return weights
+    @property
+    def uses_depth(self) -> bool:
+        return self.use_depth
+
+    @property
+    def marked_keypoints(self) -> int:
+        return self.loss.num_keypoints if self.loss.use_keypoints else 0
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        off = set() if self.use_depth else {"depth"}
+        off |= set() if self.loss.use_keypoints else {"keypoint", "attention"}
+        return {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
+
+
+@register_family("genie")
+@dataclass(frozen=True)
+class GenieConfig(TokenModelConfig):
+    """Genie (reference: 1xgpt's STMaskGIT): RGB only, trained with cross-entropy only.
+
+    With ``action_encoder`` "mlp" it is the paper's baseline, with "none" the public model.
+    """
+
+    action_encoder: Literal["linear", "mlp", "none"] = "mlp"
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return {"rgb": 1.0}

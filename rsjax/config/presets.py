@@ -1,4 +1,4 @@
-"""The named experiments: complete configurations, one function each."""
+"""The presets: complete named configurations, one function each."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,11 +7,12 @@ from rsjax.config import (
     Config,
     ConfigError,
     EvalConfig,
+    GenieConfig,
     LoopConfig,
     LossConfig,
     MaskConfig,
-    ModelConfig,
     OptimizerConfig,
+    RoboScapeConfig,
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
@@ -20,12 +21,11 @@ from rsjax.errors import did_you_mean
 
 
 def debug() -> Config:
-    """All six stages in about a minute on a CPU: the integration test. Its pictures are noise."""
+    """Runs all six stages in about a minute on a CPU, as the integration test. Its pictures are noise."""
     return Config(
         name="debug",
         sim=SimConfig(episodes=8, test_episodes=2, frames=6, tracks=64),
         tokenizer=TokenizerConfig(
-            image_size=64,
             patch_size=4,
             channels=16,
             channel_multipliers=(1, 2),
@@ -34,22 +34,20 @@ def debug() -> Config:
             code_bits=8,
         ),
         tokenizer_train=TokenizerTrainConfig(steps=6, batch_size=2, log_every=2, checkpoint_every=3),
-        model=ModelConfig(frames=6, grid=8, code_bits=8, width=32, blocks=2, heads=2),
-        loss=LossConfig(num_keypoints=8),
+        model=RoboScapeConfig(width=32, blocks=2, heads=2, loss=LossConfig(num_keypoints=8)),
         train=LoopConfig(steps=4, batch_size=2, log_every=2, checkpoint_every=2),
         eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2),
     )
 
 
 def tiny() -> Config:
-    """A robot arm that lifts a cube, in under 30 minutes on 2 CPU cores without a GPU."""
+    """Trains on a robot arm that lifts a cube, in under 30 minutes on 2 CPU cores."""
     return Config(
         name="tiny",
         sim=SimConfig(),
-        # Six vocabularies of 8 codes: of the codes that a held-out clip needs, many never occur in 180 training clips,
-        # but their parts do (20.4 dB on validation clips after 600 steps, against 20.0 with two of 512).
+        # Six vocabularies of 8 codes: many codes of a validation clip never occur in the 180 training clips, but their
+        # sub-tokens do (20.4 dB on validation clips after 600 steps, against 20.0 with two vocabularies of 512).
         tokenizer=TokenizerConfig(
-            image_size=64,
             patch_size=2,
             channels=32,
             channel_multipliers=(1, 2, 4),
@@ -57,8 +55,8 @@ def tiny() -> Config:
             norm_groups=8,
             vocabularies=6,
         ),
-        # Small batches: in so few minutes the number of steps counts. The weights are chosen for PSNR; at the
-        # reference's entropy weight (0.1) codes spread further, and reconstruction pays for it.
+        # Small batches, since in a few minutes the number of steps matters most. The weights are chosen for PSNR; the
+        # reference's entropy weight (0.1) spreads codes further at the cost of reconstruction.
         tokenizer_train=TokenizerTrainConfig(
             steps=3400,
             batch_size=8,
@@ -66,32 +64,29 @@ def tiny() -> Config:
             depth_share=0.2,
             optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
             ema=0.998,
-            l1=0.2,
-            l2=4.0,
-            entropy=0.01,
-            commitment=0.1,
-            placement="jit",
+            l1_weight=0.2,
+            l2_weight=4.0,
+            entropy_weight=0.01,
+            commitment_weight=0.1,
+            sharding="jit",
             checkpoint_every=500,
             eval_every=1700,
         ),
-        model=ModelConfig(
-            grid=8,
-            vocabularies=6,
+        model=RoboScapeConfig(
             width=128,
             blocks=4,
             unroll=4,
             heads=4,
-            action_dim=56,
             integrate_actions=True,
             temporal_norm=True,
             final_norm=True,
             embed_std=0.5,
             position_std=0.5,
             compute_dtype="bfloat16",
+            # In so few steps corruption costs more than it gains: 22.2 dB on validation clips without it (after 1950
+            # steps), 22.0 with its first step and half of its second (after 1800).
+            mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
         ),
-        # In so few steps the corruption recipe costs more than it gives: 22.2 dB on validation clips without it (after
-        # 1950 steps), 22.0 with its first step and half of its second (after 1800).
-        mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
         train=LoopConfig(
             steps=2000,
             batch_size=4,
@@ -104,43 +99,48 @@ def tiny() -> Config:
 
 
 def roboscape_s() -> Config:
-    """The paper's smallest model, which it calls 34M: one branch without actions, and there are two."""
-    return _full_size("roboscape_s", ModelConfig())
+    """Returns the paper's smallest model, "34M": the size of one of its two branches, without actions."""
+    return _full_size("roboscape_s", RoboScapeConfig())
 
 
 def roboscape_m() -> Config:
-    """The paper's middle model, which it calls 131M."""
-    return _full_size("roboscape_m", ModelConfig(width=512))
+    """Returns the paper's middle model, "131M"."""
+    return _full_size("roboscape_m", RoboScapeConfig(width=512))
 
 
 def roboscape_l() -> Config:
-    """The paper's largest model, which it calls 544M."""
-    return _full_size("roboscape_l", ModelConfig(width=1024, heads=16))
+    """Returns the paper's largest model, "544M"."""
+    return _full_size("roboscape_l", RoboScapeConfig(width=1024, heads=16))
 
 
 def genie_35m() -> Config:
-    """The public Genie (1xgpt's GENIE_35M): RGB alone, no actions. The paper's baseline of that name reads actions."""
-    return _genie("genie_35m", ModelConfig())
+    """Returns the public Genie (1xgpt's GENIE_35M): RGB only, no actions, half of the frames as prompt."""
+    return replace(_full_size("genie_35m", GenieConfig(action_encoder="none")), prompt_frames=8)
 
 
 def genie_138m() -> Config:
-    """The public Genie's larger model (1xgpt's GENIE_138M)."""
-    return _genie("genie_138m", ModelConfig(width=512))
+    """Returns the larger public Genie (1xgpt's GENIE_138M)."""
+    return replace(_full_size("genie_138m", GenieConfig(width=512, action_encoder="none")), prompt_frames=8)
 
 
-def _full_size(name: str, model: ModelConfig) -> Config:
-    """256² pixels, 16 frames of 16×16 tokens, 32 blocks. λ and γ are the paper's: the defaults.
+def genie_35m_actions() -> Config:
+    """Returns the paper's baseline: the public Genie's network with actions through an MLP and one prompt frame."""
+    return _full_size("genie_35m_actions", GenieConfig())
 
-    Heads are not in the paper: 8 as in the public code, 16 where that would make them wider than 64. Nor are optimizer
-    and batch: AdamW and a linear decay as in the public code, and 5 epochs of 6.5 million clips, the paper's, at a
-    batch of 256.
+
+def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
+    """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
+
+    The paper gives neither heads nor optimizer nor batch size. Heads: 8 as in the public code, 16 if a head would be
+    wider than 64. Optimizer: AdamW with linear decay, as in the public code. Steps: the paper's 5 epochs of 6.5 million
+    clips, at a batch of 256.
     """
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
         tokenizer=TokenizerConfig(),
-        # Open-MAGVIT2: Adam, 256 images a step, 270 epochs of ImageNet, a tenth of the rate after 200 and 250 of them.
-        # LPIPS joins with the path of its weights, --tokenizer-train.lpips-weights.
+        # Open-MAGVIT2: Adam, 256 images a step, 270 epochs of ImageNet, the rate divided by 10 after 200 and 250 of
+        # them. LPIPS needs the path of its weights, --tokenizer-train.lpips-weights.
         tokenizer_train=TokenizerTrainConfig(
             steps=1_350_000,
             batch_size=64,
@@ -150,8 +150,8 @@ def _full_size(name: str, model: ModelConfig) -> Config:
             ),
             ema=0.999,
             flip=True,
-            perceptual=1.0,
-            adversarial=0.1,
+            perceptual_weight=1.0,
+            adversarial_weight=0.1,
             log_every=100,
             checkpoint_every=5000,
             eval_every=5000,
@@ -168,20 +168,11 @@ def _full_size(name: str, model: ModelConfig) -> Config:
     )
 
 
-def _genie(name: str, model: ModelConfig) -> Config:
-    # The public code prompts with half of the frames; --mask.prompt-frames 1 for the paper's comparison.
-    return replace(
-        _full_size(name, replace(model, depth=False, action_dim=0)),
-        mask=MaskConfig(prompt_frames=8),
-        loss=LossConfig(keypoints=False),
-    )
-
-
 def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
-    """The configurations of ``makers`` by name.
+    """Returns the configurations of ``makers`` by name.
 
     Raises:
-        ConfigError: two share a name.
+        ConfigError: two have the same name.
     """
     presets: dict[str, Config] = {}
     for make in makers:
@@ -192,14 +183,14 @@ def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
     return presets
 
 
-PRESETS = collect(debug, tiny, roboscape_s, roboscape_m, roboscape_l, genie_35m, genie_138m)
+PRESETS = collect(debug, tiny, roboscape_s, roboscape_m, roboscape_l, genie_35m, genie_138m, genie_35m_actions)
 
 
 def get(name: str) -> Config:
-    """The preset called ``name``.
+    """Returns the preset called ``name``.
 
     Raises:
-        ConfigError: there is none; the message names the nearest and lists them all.
+        ConfigError: the name is unknown; the message suggests the closest and lists all.
     """
     if name not in PRESETS:
         raise ConfigError(f"unknown preset {name!r}{did_you_mean(name, PRESETS)} (presets: {', '.join(PRESETS)})")

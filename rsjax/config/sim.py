@@ -11,7 +11,7 @@ class SimConfig:
     """Lift episodes collected in the simulator (:mod:`rsjax.sim`)."""
 
     episodes: int = 200
-    test_episodes: int = 20  # the last ones of the collection, never seen in training
+    test_episodes: int = 20  # the last ones collected, never used in training
     frames: int = 16
     control_steps: int = 4  # 20 Hz control steps between frames; a frame's action is their concatenation
     image_size: int = 64
@@ -37,5 +37,5 @@ class SimConfig:
 
     @property
     def clips(self) -> ClipShape:
-        """What its clips are like; an episode is one."""
+        """The shape of its clips; each episode is one clip."""
         return ClipShape(self.frames, self.image_size, self.tracks, self.action_dim, self.test_episodes)

@@ -1,4 +1,4 @@
-"""Settings of the tokenizer and of its training."""
+"""Settings of the tokenizer and its training."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,33 +11,24 @@ from rsjax.config.train import LoopConfig
 class TokenizerConfig:
     """MAGVIT-2 encoder and decoder with lookup-free quantisation (reference: Open-MAGVIT2)."""
 
-    image_size: int = 256
-    patch_size: int = 1  # space-to-depth before the first convolution; 1 is MAGVIT-2, more is cheap on CPUs
+    patch_size: int = 1  # space-to-depth before the first convolution; 1 as in MAGVIT-2, larger is cheaper
     channels: int = 128
-    channel_multipliers: tuple[int, ...] = (1, 1, 2, 2, 4)  # one level each; every level but the last halves
+    channel_multipliers: tuple[int, ...] = (1, 1, 2, 2, 4)  # one per level; every level but the last halves the grid
     res_blocks: int = 2
     norm_groups: int = 32
-    # Both public generations: the older has 2 residual blocks a level and False, the newer 4 and True.
-    adaptive_norm: bool = False  # normalise each level of the decoder by the codes' statistics
+    # Normalises each level of the decoder by the codes' statistics. The older public generation has 2 residual blocks
+    # per level and False, the newer 4 and True.
+    adaptive_norm: bool = False
     code_bits: int = 18  # D: one token is D bits, a vocabulary of 2^D
-    vocabularies: int = 2  # the 2^D vocabulary is factorised into this many of 2^(D/n)
-    # Paper: depth is tokenized by the same MAGVIT-2; its colour map is unpublished (see tokenizer/depth_color).
+    vocabularies: int = 2  # n: the vocabulary of 2^D is factorised into n of 2^(D/n)
+    # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
     depth_scale: Literal["linear", "inverse"] = "inverse"
 
     def __post_init__(self) -> None:
         require(
-            self.image_size % self.downsampling == 0,
-            f"tokenizer.image_size {self.image_size} is not divisible by the downsampling {self.downsampling} "
-            f"(patch_size × 2^(levels - 1)); change image_size, patch_size or channel_multipliers",
-        )
-        require(
             self.code_bits % self.vocabularies == 0,
             f"tokenizer.code_bits {self.code_bits} does not divide into {self.vocabularies} vocabularies; "
             f"make code_bits a multiple of tokenizer.vocabularies",
-        )
-        require(
-            not self.adaptive_norm or self.grid > 1,
-            "tokenizer.adaptive_norm needs a grid of more than one cell, for a variance; enlarge tokenizer.image_size",
         )
         for multiplier in self.channel_multipliers:
             require(
@@ -48,56 +39,77 @@ class TokenizerConfig:
 
     @property
     def downsampling(self) -> int:
-        """α: pixels of the image per token cell, along each side."""
+        """α: pixels per token cell along each side."""
         return self.patch_size * 2 ** (len(self.channel_multipliers) - 1)
 
+    def grid(self, image_size: int) -> int:
+        """Returns H' = W', the token cells along each side of an image.
+
+        Raises:
+            ConfigError: the downsampling does not divide the image size.
+        """
+        require(
+            image_size % self.downsampling == 0,
+            f"images have {image_size} pixels a side, which the downsampling {self.downsampling} of the tokenizer "
+            f"(patch_size × 2^(levels - 1)) does not divide; change tokenizer.patch_size or "
+            f"tokenizer.channel_multipliers, or the clips' image size",
+        )
+        grid = image_size // self.downsampling
+        require(
+            not self.adaptive_norm or grid > 1,
+            "tokenizer.adaptive_norm needs a grid of more than one cell, for a variance; take larger images",
+        )
+        return grid
+
     @property
-    def grid(self) -> int:
-        """H' = W': token cells along each side."""
-        return self.image_size // self.downsampling
+    def vocabulary_size(self) -> int:
+        """Codes of each factorised vocabulary: 2^(D/n)."""
+        return 2 ** (self.code_bits // self.vocabularies)
 
 
 @dataclass(frozen=True)
 class TokenizerTrainConfig(LoopConfig):
-    """How the tokenizer is trained. The defaults are the reference's reconstruction, without its networks that judge.
+    """Settings of the tokenizer's training. The defaults are the reference's, without LPIPS and discriminator.
 
-    ``batch_size`` counts clips, of which ``frames_per_clip`` frames each are drawn. Weights are named as their terms.
+    ``batch_size`` counts clips, of which ``frames_per_clip`` frames each are drawn. A field ``NAME_weight`` weighs the
+    loss term NAME.
     """
 
-    # Not a runtime field here: the codes' entropy, the discriminator's normalisation and LeCAM go by each part.
+    # Not a runtime field here: the entropy, the discriminator's batch norm and LeCAM are computed for each part.
     accumulate: int = 1
     frames_per_clip: int = 4
-    depth_share: float = 0.25  # of the drawn frames: their colourised depth map is taken instead
+    depth_share: float = 0.25  # share of the drawn frames that are replaced by their colourised depth map
     flip: bool = False  # mirror half of the images
-    l1: float = 1.0
-    l2: float = 0.0  # not in the reference, which has LPIPS; small models reach a higher PSNR with it
-    perceptual: float = 0.0  # LPIPS, 1.0 in the reference; off where lpips_weights is empty
-    lpips_weights: str = ""  # a safetensors file as rsjax.tokenizers.lpips.load_lpips reads it
-    entropy: float = 0.1
+    l1_weight: float = 1.0
+    l2_weight: float = 0.0  # not in the reference; raises the PSNR of small models without LPIPS
+    perceptual_weight: float = 0.0  # LPIPS, 1.0 in the reference; needs lpips_weights
+    lpips_weights: str = ""  # a safetensors file for rsjax.tokenizers.lpips.load_lpips
+    entropy_weight: float = 0.1
     entropy_temperature: float = 0.01
-    commitment: float = 0.25
-    adversarial: float = 0.0  # the generator's term, 0.1 in the reference; 0: there is no discriminator at all
-    hinge: float = 0.5  # the discriminator's loss
-    lecam: float = 0.005  # its regulariser; 0.05 for the newer generation
-    lecam_decay: float = 0.999  # of the averages of its logits
-    disc_start: int = 0  # the step from which the adversarial terms count
+    commitment_weight: float = 0.25
+    adversarial_weight: float = 0.0  # the generator's term, 0.1 in the reference; 0: no discriminator
+    hinge_weight: float = 0.5  # the discriminator's loss
+    lecam_weight: float = 0.005  # the discriminator's regulariser; 0.05 in the newer generation
+    lecam_decay: float = 0.999  # decay of LeCAM's averages of the logits
+    disc_start: int = 0  # the first step with adversarial terms
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.adversarial >= 0, f"tokenizer_train.adversarial is {self.adversarial}; it cannot be negative")
+        value = self.adversarial_weight
+        require(value >= 0, f"tokenizer_train.adversarial_weight is {value}; it cannot be negative")
 
     @property
     def lpips_missing(self) -> bool:
-        """Whether the LPIPS term is asked for but has no weights, and so is off."""
-        return self.perceptual > 0 and not self.lpips_weights
+        """Whether the LPIPS term has a weight but no weights file, so that it is skipped."""
+        return self.perceptual_weight > 0 and not self.lpips_weights
 
     @property
-    def weights(self) -> dict[str, float]:
-        """The weights of the loss terms that are on, by term name. The logits are logged, not minimised."""
+    def loss_weights(self) -> dict[str, float]:
+        """The weight of each active loss term by name; 0 for the discriminator's mean logits, which are only logged."""
         names = ["l1", "l2", "entropy", "commitment"]
-        if self.perceptual > 0 and self.lpips_weights:
+        if self.perceptual_weight > 0 and self.lpips_weights:
             names.append("perceptual")
-        if not self.adversarial:
-            return {name: getattr(self, name) for name in names}
-        names += ["adversarial", "hinge", "lecam"]
-        return {name: getattr(self, name) for name in names} | {"real_logit": 0.0, "fake_logit": 0.0}
+        if self.adversarial_weight:
+            names += ["adversarial", "hinge", "lecam"]
+        logged = {"real_logit": 0.0, "fake_logit": 0.0} if self.adversarial_weight else {}
+        return {name: getattr(self, f"{name}_weight") for name in names} | logged

@@ -3,13 +3,12 @@
 import json
 from pathlib import Path
 
-from rsjax.config import ConfigError, ModelConfig, TokenizerConfig, from_dict, to_dict
-from rsjax.convert import genie, lpips, tokenizer
+from rsjax.config import ConfigError, TokenizerConfig, from_dict, to_dict
+from rsjax.convert import directory, genie, lpips, tokenizer
 from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_file, write_safetensors
 from rsjax.convert.table import to_tensors
-from rsjax.training.pretrained import load_part, save_part
 
-METADATA = "rsjax.tokenizers"  # key of the configuration in the metadata of an exported tokenizer
+METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported tokenizer
 
 
 def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> list[str]:
@@ -20,13 +19,13 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
     """
     if source.is_dir():
         _check_suffix(out)
-        config, params = load_part(source, TokenizerConfig)
+        config, params = directory.load_tokenizer(source)
         tensors = to_tensors(params, tokenizer.table(config))
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names"]
     tensors, metadata = read_tensors(source)
     config, params, ignored = tokenizer.from_public(source, tensors, weights, _exported_config(source, metadata))
-    save_part(out, config, params)
+    directory.save(out, config, params)
     used = len(tensors) - ignored.total()
     lines = [f"ignored: {count} tensors of {group}" for group, count in sorted(ignored.items())]
     return [f"{out}: a tokenizer of {used} {weights} tensors, {config}", *lines]
@@ -40,7 +39,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
     """
     if source.is_dir():
         _check_suffix(out)
-        config, params = load_part(source, ModelConfig)
+        config, params = directory.load_world_model(source)
         tensors = to_tensors(params, genie.table(config))
         beside, text = out.parent / genie.CONFIG, json.dumps(genie.settings_of(config), indent=1)
         if beside.exists() and beside.read_text() != text:
@@ -51,7 +50,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
     tensors, _ = read_tensors(source)
     settings = genie.read_settings(source)
     config, params = genie.from_public(source, tensors, settings, heads)
-    save_part(out, config, params)
+    directory.save(out, config, params)
     lines = [f"{out}: a world model of {len(tensors)} tensors, {config}"]
     if settings.get("use_mup") is None:
         lines.append(f"no use_mup in a {genie.CONFIG} beside {source.name}: converted as a model without muP")

@@ -10,10 +10,11 @@ from typing import Any
 
 import jax
 
-from rsjax.config import ModelConfig
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.trainable import Params
 
 CONFIG = "config.json"
 
@@ -21,7 +22,7 @@ CONFIG = "config.json"
 FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
 
 
-def table(config: ModelConfig) -> Table:
+def table(config: Architecture) -> Table:
     """Returns an entry for each public tensor of the network.
 
     Raises:
@@ -75,7 +76,7 @@ def read_settings(weights: Path) -> dict[str, Any]:
     return settings
 
 
-def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None) -> ModelConfig:
+def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None) -> Architecture:
     """Infers the network from the names and shapes of its tensors and from its settings.
 
     Args:
@@ -103,17 +104,18 @@ def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads
             f"{source}: the number of attention heads is {heads or 'unknown'} and cannot be inferred from the weights; "
             f"put the published {CONFIG} beside the file, or set --heads (8 in the public models)"
         )
-    config = ModelConfig(
+    config = Architecture(
         frames=frames,
         grid=math.isqrt(cells),
         code_bits=vocabularies * round(math.log2(len(first))),
         vocabularies=vocabularies,
-        action_dim=0,
+        action_encoder="none",
+        action_inputs=0,
         width=width,
         blocks=blocks,
         heads=heads,
         mlp_ratio=len(hidden) // width,
-        depth=False,
+        use_depth=False,
         qk_norm=shared is not None,
         mup=bool(settings.get("use_mup", False)),
     )
@@ -134,7 +136,7 @@ def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, An
         raise ConvertError(f"{path}: does not fit the weights beside it: {'; '.join(wrong)}")
 
 
-def settings_of(config: ModelConfig) -> dict[str, Any]:
+def settings_of(config: Architecture) -> dict[str, Any]:
     """Returns the GenieConfig of a model; the inverse of :func:`infer_config`."""
     return {
         "num_layers": config.blocks,
@@ -156,12 +158,12 @@ def settings_of(config: ModelConfig) -> dict[str, Any]:
 
 def from_public(
     source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None
-) -> tuple[ModelConfig, Any]:
+) -> tuple[Architecture, Params]:
     """Returns a model's configuration and parameters, converted from a public file's tensors.
 
     Arguments and errors as in :func:`infer_config`; also raises ConvertError if tensors are missing, unexpected or of
     another shape.
     """
     config = infer_config(source, tensors, settings, heads)
-    shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     return config, to_params(source, tensors, table(config), shapes)

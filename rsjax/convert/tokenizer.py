@@ -16,7 +16,6 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 
 Weights = Literal["raw", "ema"]
 
-CELLS = 16  # along each side of the public models' grids; the size of the images cannot be inferred from weights
 
 # Prefixes of the tensors to ignore.
 IGNORED: dict[Weights, tuple[str, ...]] = {
@@ -72,7 +71,7 @@ def _blocks(key: str, path: str, count: int, width_in: int, width_out: int) -> l
 
 
 def infer_config(source: object, tensors: Tensors, weights: Weights) -> TokenizerConfig:
-    """Infers the network from the names and shapes of its tensors, assuming images of 16×16 tokens.
+    """Infers the network from the names and shapes of its tensors.
 
     Raises:
         ConvertError: the tensors are not a tokenizer's, or include no moving average where ``weights`` is "ema".
@@ -99,7 +98,6 @@ def infer_config(source: object, tensors: Tensors, weights: Weights) -> Tokenize
     (channels, colors), bits = ends[0].shape[:2], ends[1].shape[0]
     patch = round((colors / 3) ** 0.5)
     return TokenizerConfig(
-        image_size=CELLS * patch * 2 ** (levels - 1),
         patch_size=patch,
         channels=channels,
         channel_multipliers=tuple(

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rsjax.config import LoopConfig, PartConfig, StageConfig
-from rsjax.config.stages import format_stage
+from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
+from rsjax.config.curriculum import format_stage
 from rsjax.data.labels import Labels
 from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
@@ -18,7 +18,7 @@ from rsjax.data.store import Store, StoreError, open_store
 
 LABELS = ("task", "difficulty")
 SPLIT = "train"
-EVERYTHING = StageConfig()
+EVERYTHING = CurriculumStageConfig()
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class LoaderFactory:
     def summary(self) -> list[str]:
         """Returns a line for each stage of the config: how many clips it reads, in which steps."""
         lines, first = [], 0
-        for config, stage in zip(self.loop.stages, self.stages, strict=False):
+        for config, stage in zip(self.loop.curriculum, self.stages, strict=False):
             last = first + stage.records // self.loop.batch_size
-            clips = " + ".join(str(len(part)) for part in stage.parts)
+            clips = " + ".join(str(len(part)) for part in stage.components)
             lines.append(f"stage {format_stage(config)}: {clips} clips, steps {first + 1} to {last}")
             first = last
         return lines
@@ -74,12 +74,12 @@ def plan(
     Raises:
         StoreError: a component's store cannot be read or does not go with ``own``, or nothing passes its patterns.
     """
-    resolved = [_resolve(stage, loop.batch_size, own, transform) for stage in loop.stages or (EVERYTHING,)]
-    if loop.stages:
+    resolved = [_resolve(stage, loop.batch_size, own, transform) for stage in loop.curriculum or (EVERYTHING,)]
+    if loop.curriculum:
         steps = [stage.records // loop.batch_size for stage in resolved]
         firsts = np.cumsum([0, *steps]).tolist()
         restarts = tuple(
-            first for first, stage in zip(firsts, loop.stages, strict=False) if stage.restart and first > 0
+            first for first, stage in zip(firsts, loop.curriculum, strict=False) if stage.restart and first > 0
         )
         loop = replace(loop, steps=firsts[-1], restarts=restarts)
     return loop, LoaderFactory(loop, tuple(resolved), directory / NAME)
@@ -91,13 +91,13 @@ def check_stages(loop: LoopConfig, own: Store) -> None:
     Raises:
         StoreError: as :func:`plan`.
     """
-    for part in (part for stage in loop.stages for part in stage.parts):
+    for part in (part for stage in loop.curriculum for part in stage.components):
         store = open_store(part.store) if part.store else own
         if store.labelled(SPLIT):
             choose(part, store)
 
 
-def choose(part: PartConfig, store: Store) -> np.ndarray | None:
+def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     """Returns the numbers of the records that pass a component's patterns; None if every record does.
 
     Raises:
@@ -117,10 +117,10 @@ def choose(part: PartConfig, store: Store) -> np.ndarray | None:
 
 
 def _resolve(
-    stage: StageConfig, batch_size: int, own: Store, transform: Callable[[Store], Transform]
+    stage: CurriculumStageConfig, batch_size: int, own: Store, transform: Callable[[Store], Transform]
 ) -> CurriculumStage:
     components = []
-    for config in stage.parts:
+    for config in stage.components:
         store = open_store(config.store) if config.store else own
         component = MixtureComponent(store.source(SPLIT), transform(store), choose(config, store), config.weight)
         if not len(component):
@@ -166,7 +166,7 @@ def _listed(labels: Labels) -> str:
 def _distinct(stages: tuple[CurriculumStage, ...]) -> int:
     """Returns the number of records of all stages, each counted once."""
     chosen: dict[str, list[np.ndarray]] = {}
-    for part in (part for stage in stages for part in stage.parts):
+    for part in (part for stage in stages for part in stage.components):
         numbers = np.arange(len(part.source)) if part.chosen is None else part.chosen
         chosen.setdefault(place_of(part.source, 0)["store"], []).append(numbers)
     return sum(len(np.unique(np.concatenate(numbers))) for numbers in chosen.values())

@@ -60,7 +60,7 @@ class Loader:
         state: dict[str, Any] | None = None,
         shard: grain.sharding.ShardOptions | None = None,
     ) -> None:
-        self._components = [component for stage in stages for component in stage.parts]
+        self._components = [component for stage in stages for component in stage.components]
         if not all(map(len, self._components)):
             raise StoreError("the split has no records; collect or tokenize again")
         self._shard = shard or grain.sharding.ShardByJaxProcess()

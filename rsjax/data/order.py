@@ -45,7 +45,7 @@ class MixtureComponent:
 class CurriculumStage:
     """Components that are mixed, for so many records. In the last stage the number does not matter: it is endless."""
 
-    parts: tuple[MixtureComponent, ...]
+    components: tuple[MixtureComponent, ...]
     records: int
 
 
@@ -87,11 +87,11 @@ def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine
     mixed, number = [], 0
     for place, stage in enumerate(stages):
         datasets = []
-        for component in stage.parts:
+        for component in stage.components:
             datasets.append(_dataset(component, number, _seed(seed, number), quarantine))
             number += 1
         # Grain rounds weights to percents of the smallest one.
-        weights = [component.weight for component in stage.parts]
+        weights = [component.weight for component in stage.components]
         dataset = grain.MapDataset.mix(datasets, weights) if len(datasets) > 1 else datasets[0]
         mixed.append(dataset if place == len(stages) - 1 else dataset[: stage.records])
     before = sum(stage.records for stage in stages[:-1])

@@ -1,18 +1,18 @@
 """The token sets beside a store's clips: one store of token grids for each tokenizer that made them."""
 
-from rsjax.config import Config, content_key
+from rsjax.config import TokenizerConfig, content_key
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
 
 
-def tokenizer_key(config: Config, weights: str) -> str:
+def tokenizer_key(config: TokenizerConfig, weights: str) -> str:
     """Returns the key of everything that decides an image's tokens: the tokenizer and how depth becomes an image.
 
     Args:
         weights: fingerprint of the tokenizer's weights.
     """
-    return content_key("tokenizer", weights, config.tokenizer.depth_scale)
+    return content_key("tokenizer", weights, config.depth_scale)
 
 
 def tokens_key(clips: str, tokenizer: str) -> str:

@@ -1,1 +1,1 @@
-"""Scores of generated clips: pixels, depth, controllability, and the intervals around their means."""
+"""Scores generated clips: pixels, depth, controllability, with confidence intervals."""

@@ -1,4 +1,4 @@
-"""Generation from held-out first frames, its scores, and the arrays that the report shows.
+"""Evaluates a world model: generates from first frames of the test split and scores all registered metrics.
 
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
@@ -8,172 +8,149 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Num, UInt8
+from jaxtyping import Float
 
-from rsjax.data.store import Store, StoreError, decode, encode
-from rsjax.evaluation import control, pixels
-from rsjax.evaluation.depth import depth_scores, result_key
-from rsjax.evaluation.statistics import bootstrap, over_predicted_frames
+from rsjax.clip import Video
+from rsjax.data.clips import Clips, readable, spread
+from rsjax.data.codec import decode, encode
+from rsjax.data.store import Store, StoreError
+from rsjax.evaluation.metrics import delta_psnr
+from rsjax.evaluation.registry import Metric, Scene, metrics
+from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
-from rsjax.pipeline.clips import Clips, readable, spread
-from rsjax.pipeline.generator import Generated, Generator, Tokens
+from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 
-RANGE_CLIPS = 1000  # of the train split, out of whose actions the range of uniform random ones is taken
+RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Flat scores, and arrays of the clips that the report shows (each with a leading axis over them)."""
+    """Scores by name, and arrays of the clips in the report (with a leading axis over clips)."""
 
     metrics: dict[str, float]
     shown: dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Held-out clips, their tokens, and what those keep of them."""
-
-    clips: Clips
-    tokens: Tokens
-    reconstruction: UInt8[np.ndarray, "B T H W 3"]
-    depth_reconstruction: Float32[np.ndarray, "D T H W"]  # of the clips that have depth
-
-    @classmethod
-    def load(cls, generator: Generator, store: Store) -> "HeldOut":
-        """``eval.clips`` of the test split.
-
-        Raises:
-            StoreError: one of them is damaged.
-        """
-        source, codec = store.source("test"), generator.codec
-        numbers = spread(source, generator.config.eval.clips)
-        clips = Clips.stacked([source[number] for number in numbers], numbers)
-        tokens = clips.tokens(codec)
-        depth = codec.decode_depth(tokens["depth"][clips.has_depth]) if "depth" in tokens else clips.depth[:0]
-        return cls(clips, tokens, codec.decode_rgb(tokens["rgb"]), depth)
-
-    def prompt(self, frames: int) -> Tokens:
-        """The first frames' tokens."""
-        return {name: grid[:, :frames] for name, grid in self.tokens.items()}
-
-
-def evaluate(generator: Generator, clips: Store) -> Evaluation:
-    """Scores the generator on the test split, beside repeat-the-first-frame and the tokenizer's reconstruction.
+def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
+    """Scores a model on the test split, and two baselines: repeating the last prompt frame, and reconstruction.
 
     Args:
-        clips: the store that the generator was trained on; its test split is scored, its train split gives the range of
+        store: the clips of the run; the test split is scored, the train split determines the range of
             uniform random actions.
+
+    Raises:
+        StoreError: a test clip is damaged.
     """
-    held = HeldOut.load(generator, clips)
-    given, truth = generator.config.mask.prompt_frames, held.clips.rgb
-    plans = _plans(generator, held.clips.actions, clips)
-    results: dict[str, list[Generated]] = {}
-    rollouts = sum(len(draws) for draws in plans.values())
-    with Progress("evaluation", rollouts * len(truth), "rollouts") as progress:
+    source, config = store.source("test"), trained.config
+    numbers = spread(source, config.eval.clips)
+    clips = Clips.stacked([source[number] for number in numbers], numbers)
+    reconstruction = trained.model.reconstruct(trained.assets, clips.video)
+    videos = _generate_all(trained, clips, store)
+    own = videos.pop("own")[0]
+
+    scores: dict[str, float] = {}
+    for metric in metrics().values():
+        scores |= _score(metric, clips, own, videos, reconstruction, config.prompt_frames)
+    scores["clips"] = float(len(clips.rgb))
+    if (share := store.manifest.get("success_share")) is not None:
+        scores["success_share"] = float(share)
+    return Evaluation(scores, _shown(clips, reconstruction, own, videos["other"][0], config.eval.report_clips))
+
+
+def _generate_all(trained: TrainedModel, clips: Clips, store: Store) -> dict[str, list[Video]]:
+    """Generates videos under the clips' own actions and under every draw of others, by kind."""
+    draws = _draws(trained, clips.actions, store)
+    total = sum(map(len, draws.values())) * len(clips.rgb)
+    videos: dict[str, list[Video]] = {}
+    with Progress("evaluation", total, "rollouts") as progress:
         done = 0
-        for kind, draws in plans.items():
-            for actions in draws:
-                results.setdefault(kind, []).append(_generate(generator, held, actions, depth=kind == "own"))
-                progress.update(done := done + len(truth))
-    own = results["own"][0]
-
-    metrics = _pixel_metrics(held, own.rgb, given)
-    for kind, suffix in (("other", ""), ("uniform", "_uniform")):
-        delta = np.stack([control.delta_psnr(truth, own.rgb, drawn.rgb) for drawn in results[kind]])
-        for name, per_clip in control.clip_means(delta, given).items():
-            metrics |= bootstrap(per_clip).flat(f"delta_psnr{suffix}" + ("" if name == "mean" else f"_{name}"))
-        metrics[f"delta_psnr{suffix}_repeat_first"] = 0.0  # it does not look at the actions
-    if own.depth is not None and held.clips.metric.any():
-        metrics |= _depth_metrics(held, own.depth, given)
-    metrics["clips"] = float(len(truth))
-    if (share := clips.manifest.get("success_share")) is not None:
-        metrics["success_share"] = float(share)
-    return Evaluation(metrics, _shown(generator, held, own, results["other"][0]))
+        for kind, sequences in draws.items():
+            for actions in sequences:
+                videos.setdefault(kind, []).append(_generate(trained, clips, actions, depth=kind == "own"))
+                progress.update(done := done + len(clips.rgb))
+    return videos
 
 
-def _plans(generator: Generator, actions: Float[np.ndarray, "B T A"], clips: Store) -> dict[str, np.ndarray]:
-    """The actions to generate under, by kind, each (R, B, T, A)."""
-    draws = generator.config.eval.action_draws
-    train = clips.source("train")
-    low, high = control.action_range(
+def _draws(trained: TrainedModel, actions: Float[np.ndarray, "B T A"], store: Store) -> dict[str, np.ndarray]:
+    """Returns the actions to generate under by kind, each (R, B, T, A)."""
+    draws, train = trained.config.eval.action_draws, store.source("train")
+    low, high = delta_psnr.action_range(
         np.stack([clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))])
     )
     return {
         "own": actions[None],
-        "other": actions[control.other_clips(len(actions), draws, seed=0)],
-        "uniform": control.uniform_actions(actions, low, high, draws, seed=0),
+        "other": actions[delta_psnr.other_clips(len(actions), draws, seed=0)],
+        "uniform": delta_psnr.uniform_actions(actions, low, high, draws, seed=0),
     }
 
 
-def _generate(generator: Generator, held: HeldOut, actions: np.ndarray, depth: bool) -> Generated:
-    """All clips, in batches of one shape (so that one program is compiled)."""
-    cfg, parts = generator.config, []
-    prompt = held.prompt(cfg.mask.prompt_frames)
-    for start in range(0, len(actions), cfg.eval.batch_size):
-        rows = np.minimum(np.arange(start, start + cfg.eval.batch_size), len(actions) - 1)
-        part = {name: grid[rows] for name, grid in prompt.items()}
-        index, has_depth = held.clips.index[rows], held.clips.has_depth[rows]
-        parts.append(generator.generate(part, actions[rows], cfg.sample, depth, index, has_depth))
-    join = lambda arrays: np.concatenate([np.asarray(a) for a in arrays])[: len(actions)]  # noqa: E731
-    return Generated(
-        {name: join(p.tokens[name] for p in parts) for name in parts[0].tokens},
-        join(p.rgb for p in parts),
-        join(_depth_of(p) for p in parts) if any(p.depth is not None for p in parts) else None,
+def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: bool) -> Video:
+    """Generates the videos of all clips in batches of one shape, so that one program is compiled."""
+    size, prompt = trained.config.eval.batch_size, clips.video.frames(0, trained.config.prompt_frames)
+    parts = []
+    for start in range(0, len(actions), size):
+        rows = np.minimum(np.arange(start, start + size), len(actions) - 1)
+        inputs = (trained.params, trained.assets, prompt[rows], actions[rows])
+        parts.append(trained.model.generate(*inputs, index=clips.index[rows], depth=depth))
+    rgb = np.concatenate([part.rgb for part in parts])[: len(actions)]
+    if all(part.depth is None for part in parts):
+        return Video(rgb)
+    unknown = [np.full(part.rgb.shape[:-1], np.nan, np.float32) if part.depth is None else part.depth for part in parts]
+    return Video(rgb, np.concatenate(unknown)[: len(actions)])
+
+
+def _score(
+    metric: Metric,
+    clips: Clips,
+    own: Video,
+    alternatives: dict[str, list[Video]],
+    reconstruction: Video | None,
+    prompt_frames: int,
+) -> dict[str, float]:
+    """Scores the prediction and both baselines with a metric; empty if the metric's data are missing."""
+    if "depth" in metric.needs and (own.depth is None or not clips.metric.any()):
+        return {}
+    rows = clips.metric if "depth" in metric.needs else np.ones(len(clips.rgb), bool)
+    others = {kind: [video[rows] for video in videos] for kind, videos in alternatives.items()}
+    scene = Scene(clips.video[rows], own[rows], prompt_frames, others)
+    scores = _flat(metric, scene, "")
+    if {"other", "uniform"} & set(metric.needs):
+        return scores | {f"{metric.name}_repeat_first": 0.0}  # this baseline ignores actions
+    scores |= _flat(
+        metric, Scene(scene.truth, _repeat_first(scene.truth, prompt_frames), prompt_frames), "_repeat_first"
     )
+    if reconstruction is not None:
+        scores |= _flat(metric, Scene(scene.truth, reconstruction[rows], prompt_frames), "_tokenizer")
+    return scores
 
 
-def _depth_of(made: Generated) -> np.ndarray:
-    """Generated depth; nothing known where none of these clips has any."""
-    return np.full(made.rgb.shape[:-1], np.nan, np.float32) if made.depth is None else made.depth
+def _flat(metric: Metric, scene: Scene, suffix: str) -> dict[str, float]:
+    assert metric.function is not None
+    scored = metric.function(scene)
+    flat: dict[str, float] = {}
+    for part, per_clip in (scored if isinstance(scored, dict) else {"": scored}).items():
+        name = f"{metric.name}{part}{suffix}"
+        flat |= bootstrap(per_clip).flat(name) if metric.interval else {name: float(np.mean(per_clip))}
+    return flat
 
 
-def _repeat_first(frames: Num[np.ndarray, "B T *rest"], given: int) -> Num[np.ndarray, "B T *rest"]:
-    """The last given frame in place of all that follow: the baseline that nothing moves."""
-    return np.repeat(frames[:, given - 1 : given], frames.shape[1], axis=1)
+def _repeat_first(video: Video, prompt_frames: int) -> Video:
+    """Returns the last prompt frame repeated for the whole video: the baseline without motion."""
+    last, frames = video.frames(prompt_frames - 1, prompt_frames), video.rgb.shape[1]
+    return Video(np.repeat(last.rgb, frames, 1), None if last.depth is None else np.repeat(last.depth, frames, 1))
 
 
-def _pixel_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
-    metrics: dict[str, float] = {}
-    truth = held.clips.rgb
-    candidates = {"": predicted, "_repeat_first": _repeat_first(truth, given), "_tokenizer": held.reconstruction}
-    for name, score in (("psnr", pixels.psnr), ("ssim", pixels.ssim)):
-        for suffix, frames in candidates.items():
-            per_clip = over_predicted_frames(np.asarray(score(truth, frames)), given)
-            metrics |= bootstrap(per_clip).flat(name + suffix)
-    return metrics
-
-
-def _depth_metrics(held: HeldOut, predicted: np.ndarray, given: int) -> dict[str, float]:
-    """Of the clips whose depth is in metres."""
-    metrics: dict[str, float] = {}
-    metric = held.clips.metric
-    truth = held.clips.depth[metric]
-    candidates = {
-        "": predicted[metric],
-        "_repeat_first": _repeat_first(truth, given),
-        "_tokenizer": held.depth_reconstruction[metric[held.clips.has_depth]],
-    }
-    for suffix, depth in candidates.items():
-        scores = depth_scores(truth[:, given:], depth[:, given:], alignment="none")
-        metrics |= bootstrap(scores.abs_rel).flat(result_key("absrel") + suffix)
-        mean = scores.mean()
-        metrics |= {result_key(name) + suffix: mean[name] for name in ("delta1", "delta2")}
-    return metrics
-
-
-def _shown(generator: Generator, held: HeldOut, own: Generated, other: Generated) -> dict[str, np.ndarray]:
-    """Arrays of the clips in the report: successes and failures by turns, in the split's order."""
-    clips = held.clips
+def _shown(clips: Clips, reconstruction: Video | None, own: Video, other: Video, count: int) -> dict[str, np.ndarray]:
+    """Returns arrays of the clips in the report: successes and failures alternate, in the split's order."""
     ends = clips.success[:, -1]
     good, bad = (list(np.flatnonzero(ends == outcome)) for outcome in (True, False))
     turns = [queue.pop(0) for _ in ends for queue in (good, bad) if queue]
-    rows = np.array(turns[: generator.config.eval.report_clips])
+    rows = np.array(turns[:count])
     arrays: dict[str, Any] = {
         "clip": clips.index[rows],
         "task": np.array(clips.task)[rows],
         "truth": clips.rgb[rows],
-        "reconstruction": held.reconstruction[rows],
         "prediction": own.rgb[rows],
         "other_actions": other.rgb[rows],
         "has_depth": clips.has_depth[rows],
@@ -182,16 +159,18 @@ def _shown(generator: Generator, held: HeldOut, own: Generated, other: Generated
         "visible": clips.visible[rows],
         "success": ends[rows],
     }
+    if reconstruction is not None:
+        arrays["reconstruction"] = reconstruction.rgb[rows]
     return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
 
 
 def save(path: Path, result: Evaluation) -> None:
-    """Writes a result; it appears whole or not at all."""
+    """Writes a result atomically."""
     write_atomically(path, encode({"metrics": result.metrics} | result.shown))
 
 
 def load(path: Path) -> Evaluation:
-    """Reads what :func:`save` wrote.
+    """Reads a result written by :func:`save`.
 
     Raises:
         StoreError: the file is damaged.

@@ -1,4 +1,4 @@
-"""Means over clips with their intervals."""
+"""Means over clips and their confidence intervals."""
 
 from dataclasses import dataclass
 
@@ -8,20 +8,20 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over clips and its bootstrap interval; ``low`` and ``high`` are None for a single clip."""
+    """A mean over clips with its bootstrap interval; ``low`` and ``high`` are None for a single clip."""
 
     mean: float
     low: float | None
     high: float | None
 
     def flat(self, name: str) -> dict[str, float]:
-        """``name``, and ``name_low`` and ``name_high`` where there is an interval."""
+        """Returns the mean as ``name``, and the interval, if any, as ``name_low`` and ``name_high``."""
         values = {name: self.mean, f"{name}_low": self.low, f"{name}_high": self.high}
         return {key: value for key, value in values.items() if value is not None}
 
 
 def over_predicted_frames(per_frame: Float[np.ndarray, "*B T"], prompt_frames: int = 1) -> Float[np.ndarray, "*B"]:
-    """Each clip's mean over its predicted frames: the first ``prompt_frames`` were given and don't count.
+    """Returns each clip's mean over its predicted frames, those after the first ``prompt_frames``.
 
     Raises:
         ValueError: no frame is left.
@@ -35,15 +35,15 @@ def over_predicted_frames(per_frame: Float[np.ndarray, "*B T"], prompt_frames: i
 def bootstrap(
     per_clip: Float[np.ndarray, " B"], seed: int = 0, level: float = 0.95, resamples: int = 10_000
 ) -> Estimate:
-    """The mean over clips and its percentile-bootstrap interval; clips are resampled, never frames.
+    """Returns the mean over clips and its percentile-bootstrap interval; clips are resampled, not frames.
 
-    For a paired comparison of two models pass the clips' differences.
+    For a paired comparison of two models, pass the clips' differences.
 
     Args:
         per_clip: one finite number per clip.
         seed: of the resampling.
         level: the interval's coverage, between 0 and 1.
-        resamples: how many times B clips are drawn with replacement.
+        resamples: the number of times that B clips are drawn with replacement.
 
     Raises:
         ValueError: no clips, or a value that is not finite.

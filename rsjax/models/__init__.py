@@ -1,1 +1,7 @@
-"""World models: the contract, and one package for each family."""
+"""World models: their interface (:mod:`rsjax.models.base`), and one package per family."""
+
+from rsjax.models.base import Assets, WorldModel, create_model, implements
+from rsjax.models.genie import Genie
+from rsjax.models.roboscape.model import RoboScape
+
+__all__ = ["Assets", "Genie", "RoboScape", "WorldModel", "create_model", "implements"]

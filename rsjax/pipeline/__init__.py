@@ -1,1 +1,1 @@
-"""The main job: six stages from an empty directory to a report."""
+"""The pipeline of a run: six stages from an empty directory to a report."""

@@ -1,44 +1,33 @@
-"""A store of clips that was not simulated, as what a run learns from."""
+"""Configures a run that trains on a store of ingested clips."""
 
 from dataclasses import replace
 from pathlib import Path
 
 from rsjax.config import Config, DataConfig
+from rsjax.data.clips import readable
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
-from rsjax.pipeline.clips import readable
 
 
 def on_store(config: Config, path: Path) -> Config:
-    """A configuration that learns from a store of clips, as ``experiments.ingest`` makes it.
+    """Returns the configuration with its training data replaced by a store made by ``experiments.ingest``.
 
-    ``data`` says what its clips are like, and what has to fit them is made so: the size of the tokenizer's images, and
-    the model's grid, width of actions, positions and keypoints. All else stays.
+    Image size, token grid and action width follow from its clips.
 
     Raises:
-        StoreError: there is no such store, it holds no clips, or was made without a content key.
-        ConfigError: pictures of this size have no whole number of tokens; the message names the fields.
+        StoreError: the store is missing, is not of clips, or has no content key.
+        ConfigError: the model or the tokenizer does not fit its clips; the message names the fields.
     """
-    data = _data(open_store(path))
-    tokenizer = replace(config.tokenizer, image_size=data.image_size)
-    width = data.action_dim * (2 if config.model.integrate_actions else 1)
-    model = replace(
-        config.model,
-        grid=tokenizer.grid,
-        frames=max(config.model.frames, data.frames),
-        action_dim=width if config.model.action_dim else 0,
-    )
-    loss = replace(config.loss, num_keypoints=min(config.loss.num_keypoints, data.tracks))
-    return replace(config, data=data, tokenizer=tokenizer, model=model, loss=loss)
+    return replace(config, data=_data(open_store(path)))
 
 
 def relocated(config: Config, path: Path) -> Config:
-    """The configuration of a run whose store was moved to ``path``.
+    """Returns the configuration of a run with the new path of its store, which was moved.
 
     Raises:
-        StoreError: there is no such store, or the run was not made on one.
+        StoreError: the store is missing, or the run's clips were simulated.
     """
     if not config.data.key:
-        raise StoreError(f"{path}: this run's clips were simulated; say where they lie with --data-dir")
+        raise StoreError(f"{path}: this run's clips were simulated; name their directory with --data-dir")
     return replace(config, data=replace(config.data, store=str(open_store(path).path.absolute())))
 
 

@@ -1,4 +1,4 @@
-"""What made a run: configuration, code, packages, machine and data, in ``run.json`` with an entry for every start."""
+"""Records configuration, code, packages, machine and data of every start of a run in ``run.json``."""
 
 import hashlib
 import importlib.metadata
@@ -21,7 +21,7 @@ from rsjax.files import disk_guard, read_json, write_atomically
 from rsjax.pipeline.run import Run
 
 NAME = "run.json"
-DECIDE = ("code", "packages", "data")  # they may change results although the configuration is the same
+DECIDE = ("code", "packages", "data")  # entries that may change results under the same configuration
 
 
 def read_starts(directory: Path) -> list[dict[str, Any]]:
@@ -29,7 +29,7 @@ def read_starts(directory: Path) -> list[dict[str, Any]]:
 
     Returns:
         Dicts of ``time`` (ISO 8601, UTC), ``command``, ``config`` (resolved), ``keys`` (of the stages), ``code``,
-        ``packages``, ``machine`` and ``data``. Empty where the run was never started.
+        ``packages``, ``machine`` and ``data``. Empty if the run was never started.
 
     Raises:
         FileError: the file is damaged.
@@ -39,13 +39,13 @@ def read_starts(directory: Path) -> list[dict[str, Any]]:
 
 
 def record_start(run: Run, command: str) -> list[str]:
-    """Appends this start; called once by the lead process, after the devices are set up and the directory is made.
+    """Appends this start. The lead process calls it once, after the devices are set up and the directory is made.
 
     Args:
-        command: how the run was started.
+        command: the command that started the run.
 
     Returns:
-        Which of ``DECIDE`` have changed since the last start. Data and packages that are new are no change.
+        The entries of ``DECIDE`` that changed since the last start; additional data and packages are not changes.
 
     Raises:
         FileError: the file is damaged, or the disk is full.
@@ -67,14 +67,14 @@ def record_start(run: Run, command: str) -> list[str]:
 
 
 def _differ(before: Any, now: Any) -> bool:
-    """Whether two entries differ in more than the place of the data."""
+    """Returns whether two entries differ in more than the path of the data."""
     if isinstance(before, dict) and isinstance(now, dict):
         return before | {"path": ""} != now | {"path": ""}
     return before != now
 
 
 def record_data(run: Run) -> None:
-    """Adds the data that the last start has made since to its entry."""
+    """Updates the last start's entry with the data that it has made since."""
     starts = read_starts(run.directory)
     if starts:
         _write(run.directory, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
@@ -86,20 +86,22 @@ def _write(directory: Path, starts: list[dict[str, Any]]) -> None:
 
 
 def data_fingerprints(run: Run) -> dict[str, Any]:
-    """Returns path, content key, manifest hash and the size of each split of every data set that exists.
+    """Returns path, content key, manifest hash and split sizes of every existing data set.
 
     The manifest names all files with their sizes and numbers of records, so its hash changes with them.
     """
     stores = {"clips": run.clips, "tokens": run.output("tokens")}
     loops = (run.config.tokenizer_train, run.config.train)
-    stores |= {p.store: Path(p.store) for loop in loops for stage in loop.stages for p in stage.parts if p.store}
+    stores |= {
+        p.store: Path(p.store) for loop in loops for stage in loop.curriculum for p in stage.components if p.store
+    }
     return {name: _fingerprint(path) for name, path in stores.items() if (path / MANIFEST).exists()}
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
     raw = (path / MANIFEST).read_bytes()
     known: dict[str, Any] = {"path": str(path.absolute()), "manifest_sha256": hashlib.sha256(raw).hexdigest()}
-    with suppress(ValueError, KeyError, TypeError):  # the stage that reads a damaged one reports it
+    with suppress(ValueError, KeyError, TypeError):  # damage is reported by the stage that reads it
         manifest = json.loads(raw)
         files = {name: split["files"] for name, split in manifest["splits"].items()}
         splits = {name: {of: sum(file[of] for file in files[name]) for of in ("count", "bytes")} for name in files}
@@ -113,7 +115,7 @@ def code_version(root: Path) -> dict[str, Any]:
     All but the version are null without a checkout. The diff does not include new files.
     """
     code: dict[str, Any] = {"version": rsjax.__version__, "revision": None, "dirty": None, "diff_sha256": None}
-    # An environment inside somebody else's checkout is not that checkout's code.
+    # rsjax may be installed inside another project's checkout.
     if _git(root, "rev-parse", "--show-toplevel") != str(root.resolve()):
         return code
     status, diff = _git(root, "status", "--porcelain"), _git(root, "diff", "HEAD")

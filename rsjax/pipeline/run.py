@@ -1,10 +1,11 @@
-"""A run directory: which stages it holds, by which configuration, and how long they took.
+"""A run directory: its stages, the configuration that made them, and their durations.
 
-Every stage has a content key of all that its output depends on; a stage whose mark has this key and says "finished" is
-skipped. A mark under another key means another configuration.
+The content key of a stage covers everything that its output depends on. A stage is skipped if its mark (``stage.json``)
+has this key and says "finished"; a mark with another key was made by another configuration.
 """
 
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from rsjax.config import Config, ConfigError, content_key, from_dict, to_dict
+from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_settings, to_dict
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
@@ -21,97 +22,107 @@ from rsjax.files import disk_guard, write_atomically
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
-TRAINED = ("tokenizer", "world_model")  # never replaced unasked
+TRAINED = ("tokenizer", "world_model")  # replaced only with --overwrite
 DECIDED_BY = {  # sections of the configuration that a trained stage depends on
     "tokenizer": ("sim", "data", "tokenizer", "tokenizer_train"),
-    "world_model": ("sim", "data", "tokenizer", "tokenizer_train", "model", "mask", "loss", "train"),
+    "world_model": ("sim", "data", "tokenizer", "tokenizer_train", "model", "prompt_frames", "train"),
 }
-OUTPUTS = {  # in the run directory; clips lie outside, and so do the tokens that the link there leads to
+OUTPUTS = {  # in the run directory; clips are elsewhere, and "tokens" is a link
     "tokenizer": "tokenizer/weights",
     "tokens": "tokens/store",
     "world_model": "world_model/weights",
     "evaluation": "evaluation/result.msgpack",
     "report": "report.html",
 }
-RECIPE = 1  # raise it when the same configuration gives other results
+RECIPE = 1  # increase it when the same configuration gives new results
 
 
 class RunError(UserError):
-    """A run directory that cannot be used as asked."""
+    """A run directory that belongs to another configuration."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: a configuration, its directory, and where data sets are kept."""
+    """One run: its configuration, its directory, and the directory of simulated data sets."""
 
     config: Config
     directory: Path
     data_directory: Path
 
     @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of this run; a model without tokens needs no tokenizer."""
+        return tuple(stage for stage in STAGES if stage != "tokenizer" or self.config.model.uses_tokenizer)
+
+    @property
     def clips(self) -> Path:
-        """The store of clips; shared by all runs that use the same episodes."""
+        """The path of the store of clips, which all runs on the same episodes share."""
         return Path(self.config.data.store or self.data_directory / f"lift-{self.keys()['collect']}")
 
     def open_clips(self) -> Store:
-        """The store of clips.
+        """Opens the store of clips.
 
         Raises:
-            StoreError: it is gone or damaged, or another one than the run was made for lies there.
+            StoreError: it is missing or damaged, or another store was put in its place.
         """
         key = self.config.data.key
         if key and not (self.clips / MANIFEST).exists():
-            raise StoreError(f"{self.clips}: no store is there; if it was moved, say where it lies with --store")
+            raise StoreError(f"{self.clips}: the store is missing; if it was moved, name its new path with --store")
         store = open_store(self.clips)
         if key and store.manifest.get("key") != key:
             raise StoreError(
                 f"{self.clips}: is not the store that the run began with (key {store.manifest.get('key')}, not {key}); "
-                f"train on it in another --run-dir, or put the old one back"
+                f"train on it in another --run-dir, or restore the old one"
             )
         return store
 
-    def open_tokens(self) -> Store:
-        """The store of tokens, where it really lies.
+    def open_prepared(self) -> Store:
+        """Opens the store that the world model trains on: tokens, or the clips themselves.
 
         Raises:
-            StoreError: it is gone or damaged, or the tokens of other clips are there now.
+            StoreError: it is missing or damaged, or was made from other clips.
         """
         store = open_store(self.output("tokens").resolve())
         if not self._made_of_these_clips(store.manifest):
             raise StoreError(f"{store.path}: holds tokens of other clips; the train command of this run makes its own")
         return store
 
-    def _made_of_these_clips(self, tokens: dict[str, Any]) -> bool:
-        """Whether a store of tokens with this manifest belongs to the run's own store, which may have been moved."""
-        key, cfg = self.config.data.key, self.config
-        return not key or tokens.get("key") == tokens_key(key, tokenizer_key(cfg, str(tokens.get("tokenizer"))))
+    def _made_of_these_clips(self, prepared: dict[str, Any]) -> bool:
+        """Returns whether a store with this manifest was made from the run's clips, which may have moved."""
+        key = self.config.data.key
+        if not key or not self.config.model.uses_tokenizer:
+            return not key or prepared.get("key") == key
+        tokenizer = tokenizer_key(self.config.tokenizer, str(prepared.get("tokenizer")))
+        return prepared.get("key") == tokens_key(key, tokenizer)
 
     def keys(self) -> dict[str, str]:
-        """Each stage's content key: its own settings and the key of the stage before."""
+        """Returns each stage's content key, a hash of its settings and the previous stage's key."""
         cfg = self.config
         key = content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.tokenizer, cfg.tokenizer_train),
             "tokens": (),
-            "world_model": (cfg.model, cfg.mask, cfg.loss, cfg.train),
-            "evaluation": (cfg.sample, cfg.eval),
+            "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
+            "evaluation": (sampling_settings(cfg.model), cfg.eval),
             "report": (),
         }
         for stage, parts in settings.items():
+            if stage not in self.stages:
+                continue
             key = keys[stage] = content_key(RECIPE, stage, key, *parts)
         return keys
 
     def prepare(self, overwrite: bool) -> None:
-        """Makes the directory, or checks that it belongs to this configuration, and writes ``config.json``.
+        """Makes the directory, or checks that it fits this configuration, and writes ``config.json``.
 
         Args:
-            overwrite: throw trained stages of another configuration away instead of refusing.
+            overwrite: delete trained stages of another configuration instead of refusing.
 
         Raises:
-            RunError: it holds a trained stage of another configuration; the message names the differing fields.
+            RunError: it contains a trained stage of another configuration; the message names the differing fields.
         """
-        for stage in TRAINED:
+        for stage in (stage for stage in TRAINED if stage in self.stages):
             if self.mark(stage).get("key", self.keys()[stage]) != self.keys()[stage]:
                 if not overwrite:
                     raise RunError(
@@ -124,29 +135,29 @@ class Run:
             write_atomically(self.directory / "config.json", json.dumps(to_dict(self.config), indent=1).encode())
 
     def _differences(self, stage: str) -> str:
-        """The fields that make the stage in the directory another one; not those that change no result."""
+        """Describes the fields that differ from the saved stage's, except those without effect on results."""
         try:
             saved = _flat(to_dict(from_dict(Config, json.loads((self.directory / "config.json").read_text()))))
         except ConfigError as error:
             return f"of another version: {error}"
         except (OSError, ValueError, TypeError):
             return "its config.json is missing or damaged"
-        here, free = _flat(to_dict(self.config)), _runtime_fields(self.config)
+        here, free = _flat(to_dict(self.config)), _free_fields(self.config)
         names = [
             name
             for name in here | saved
             if here.get(name) != saved.get(name) and name not in free and name.partition(".")[0] in DECIDED_BY[stage]
         ]
-        return "; ".join(f"{name} is {_told(saved, name)} there, {_told(here, name)} here" for name in names) or (
+        return "; ".join(f"{name} is {_shown(saved, name)} there, {_shown(here, name)} here" for name in names) or (
             "older code"
         )
 
     def output(self, stage: str) -> Path:
-        """What the stage leaves: a file or directory that appears whole."""
+        """Returns the path of the stage's output, a file or directory that is written atomically."""
         return self.clips if stage == "collect" else self.directory / OUTPUTS[stage]
 
     def finished(self, stage: str) -> bool:
-        """Whether the stage's output is there and was made by this configuration."""
+        """Returns whether the stage's output exists and was made by this configuration."""
         mark = self.mark(stage)
         done = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
         if not (done and self.output(stage).exists()):
@@ -157,11 +168,11 @@ class Run:
         try:
             manifest = json.loads((self.output("tokens") / MANIFEST).read_text())
         except (OSError, ValueError):
-            return True  # the stage that reads them says what is wrong
+            return True  # the stage that reads them reports the damage
         return self._made_of_these_clips(manifest)
 
     def mark(self, stage: str) -> dict[str, Any]:
-        """What the directory knows of a stage: key, finished, seconds. Empty where it was not begun."""
+        """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started."""
         try:
             return json.loads(self._mark_path(stage).read_text())
         except (OSError, ValueError):
@@ -172,9 +183,9 @@ class Run:
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Path]:
-        """Around a stage's work: gives its directory, and marks it as begun, then finished, with the seconds it took.
+        """Marks a stage as begun, and after its work as finished, with its duration; yields its directory.
 
-        Seconds add up over interruptions (but a killed process takes its own along).
+        Durations add up over interruptions, except those of killed processes.
         """
         folder, began = self.directory / stage, time.monotonic()
         mark = self.mark(stage)
@@ -196,7 +207,7 @@ class Run:
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted names, such as ``train.stages.0.epochs``."""
+    """Returns values by dotted names, such as ``train.curriculum.0.epochs``."""
     out: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, list) and any(isinstance(item, dict) for item in value):
@@ -205,17 +216,29 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def _told(values: dict[str, Any], name: str) -> Any:
+def _shown(values: dict[str, Any], name: str) -> Any:
     value = values.get(name, "not set")
     return "empty" if value == "" else value
 
 
-def _runtime_fields(config: Any, prefix: str = "") -> set[str]:
+def _free_fields(config: Any, prefix: str = "") -> set[str]:
     names: set[str] = set()
     for field in fields(config):
         value, name = getattr(config, field.name), prefix + field.name
         if field.metadata.get("runtime"):
             names.add(name)
+        elif field.metadata.get("sampling"):
+            names |= set(_flat({name: to_dict(value)}))
         elif is_dataclass(value):
-            names |= _runtime_fields(value, f"{name}.")
+            names |= _free_fields(value, f"{name}.")
     return names
+
+
+def link(target: Path, at: Path) -> None:
+    """Makes ``at`` a link to ``target``, atomically, and replaces what was at that path."""
+    temporary = at.with_name(f"{at.name}.{os.getpid()}.tmp")
+    temporary.unlink(missing_ok=True)
+    if at.is_dir() and not at.is_symlink():  # a copied run contains the tokens themselves
+        shutil.rmtree(at)
+    temporary.symlink_to(target)
+    os.replace(temporary, at)

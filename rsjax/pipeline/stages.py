@@ -1,70 +1,62 @@
-"""The stages of the main job; each reads what the one before left and can be run again."""
+"""The stages of the pipeline. Each reads the output of the previous one and can be run again."""
 
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 
-from rsjax.config import ModelConfig, TokenizerConfig
 from rsjax.data.curriculum import check_stages
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard
-from rsjax.pipeline.generator import Generator, load_tokenizer
-from rsjax.pipeline.jobs import tokenizer_job, world_model_job
+from rsjax.models.base import Assets, create_model
 from rsjax.pipeline.provenance import record_data, record_start
-from rsjax.pipeline.run import STAGES, TRAINED, Run
+from rsjax.pipeline.run import TRAINED, Run, link
+from rsjax.pipeline.setup import note_curriculum, starting, tokenizer_setup, world_model_setup
 from rsjax.pipeline.summary import write_summary
-from rsjax.pipeline.tokens import link, tokenize_store
+from rsjax.pipeline.trained import load, load_tokenizer
+from rsjax.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.sim.collect import collect
+from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.training.checkpoint import save_weights
 from rsjax.training.distributed import agree, barrier, is_lead, on_lead
-from rsjax.training.placement import Placement
-from rsjax.training.pretrained import check_part
+from rsjax.training.loop import Monitor, fit
+from rsjax.training.sharding import Sharding
 from rsjax.training.wandb_run import find_wandb
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
-    """Runs every stage that is not finished, in order, and says which were skipped.
+    """Runs every unfinished stage in order, and prints which are skipped.
 
-    Several processes, which have one run directory, train together; the lead alone does the other stages.
+    Several processes with a common run directory train together; the lead process runs the other stages.
 
     Args:
-        resume: False starts an unfinished training stage over instead of going on from its checkpoint.
-        command: how to repeat the run, for the report.
+        resume: False restarts an unfinished training stage instead of resuming from its checkpoint.
+        command: the command that repeats the run, for the report.
     """
     _check_starts(run)
-    on_lead("run.json", partial(_record_start, run, command))
-    works: dict[str, Callable[[Run], None]] = {
-        "collect": collect_clips,
-        "tokenizer": partial(train_tokenizer, resume=resume),
-        "tokens": tokenize,
-        "world_model": partial(train_world_model, resume=resume),
-        "evaluation": evaluate,
-        "report": partial(write_summary, command=command),
+    on_lead("run.json", lambda: _record_start(run, command))
+    works: dict[str, tuple[str, Callable[[], None]]] = {
+        "collect": (_collecting(run), lambda: collect_clips(run)),
+        "tokenizer": ("training the tokenizer", lambda: train_tokenizer(run, resume)),
+        "tokens": ("preparing all clips for the model", lambda: prepare(run)),
+        "world_model": ("training the world model", lambda: train_world_model(run, resume)),
+        "evaluation": ("evaluating on the test split", lambda: evaluate(run)),
+        "report": ("writing the report", lambda: write_summary(run, command)),
     }
-    notes = {
-        "collect": _collecting(run),
-        "tokenizer": "training the tokenizer",
-        "tokens": "tokenizing all clips",
-        "world_model": "training the world model",
-        "evaluation": "generating from held-out first frames",
-        "report": "writing the report",
-    }
-    for number, name in enumerate(STAGES, 1):
+    for number, name in enumerate(run.stages, 1):
+        title, work = works[name]
         finished = agree(run.finished(name), name)
         if is_lead():
             seconds = f" ({duration(run.mark(name)['seconds'])} when it ran)" if finished else ""
-            stage(number, len(STAGES), name, f"up to date, skipped{seconds}" if finished else notes[name])
+            stage(number, len(run.stages), name, f"up to date, skipped{seconds}" if finished else title)
         if not finished:
-            _do(run, name, works[name])
+            _do(run, name, work)
 
 
-def _do(run: Run, name: str, work: Callable[[Run], None]) -> None:
+def _do(run: Run, name: str, work: Callable[[], None]) -> None:
     def marked() -> None:
         with run.stage(name):
-            work(run)
+            work()
         record_data(run)
 
     if name not in TRAINED:
@@ -72,20 +64,19 @@ def _do(run: Run, name: str, work: Callable[[Run], None]) -> None:
     elif is_lead():
         marked()
     else:
-        work(run)
+        work()
     barrier(name)
 
 
 def _check_starts(run: Run) -> None:
-    """A mistyped path, a missing package or a batch that does not divide is told before hours of work, not after."""
+    """Raises for a wrong path, a missing package or a batch that does not divide, before hours of work."""
     cfg = run.config
-    starts = {"tokenizer": (cfg.tokenizer_train, TokenizerConfig), "world_model": (cfg.train, ModelConfig)}
-    for name, (loop, kind) in starts.items():
-        if run.finished(name):
+    trained = {"tokenizer": (cfg.tokenizer_train, TokenizerTraining.create), "world_model": (cfg.train, create_model)}
+    for name, (loop, create) in trained.items():
+        if name not in run.stages or run.finished(name):
             continue
-        Placement.create(loop)
-        if loop.start_from:
-            check_part(Path(loop.start_from), kind)
+        Sharding.create(loop)
+        starting(create(cfg), loop.start_from, name)
         if loop.wandb:
             find_wandb()
 
@@ -103,13 +94,13 @@ def _record_start(run: Run, command: str) -> None:
 
 
 def collect_clips(run: Run) -> None:
-    """Stage 1: episodes from the simulator, where another run has not collected them yet; or a store that is there."""
+    """Stage 1: collects episodes in the simulator, unless another run has; or checks an existing store."""
     cfg = run.config
     if cfg.data.key:
-        if cfg.model.depth and not run.open_clips().manifest.get("depth_range"):
+        if cfg.model.uses_depth and not run.open_clips().manifest.get("depth_range"):
             note(
                 "no clip has depth, so the depth branch trains with its loss masked; "
-                "--model.depth False leaves it out, in half of the time"
+                "--model.use-depth False trains without it in half the time"
             )
         return
     with Progress("collect", cfg.sim.episodes, "episodes") as progress:
@@ -117,44 +108,68 @@ def collect_clips(run: Run) -> None:
 
 
 def train_tokenizer(run: Run, resume: bool) -> None:
-    """Stage 2."""
-    train = run.config.tokenizer_train
+    """Stage 2: trains the tokenizer, for a model on tokens."""
+    train, directory = run.config.tokenizer_train, run.directory / "tokenizer"
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
-    # Before the tokenizer is trained, whose clips the world model's stages choose from.
+    # Checks the world model's curriculum before the tokenizer is trained.
     check_stages(run.config.train, run.open_clips())
-    job = tokenizer_job(run)
-    state = job.fit(resume)
+    setup, model = tokenizer_setup(run), TokenizerTraining.create(run.config)
+    note_curriculum(setup.loader)
+    state = fit(
+        model,
+        setup.loop,
+        setup.loader,
+        directory,
+        name="tokenizer",
+        to_batch=setup.to_batch,
+        start=setup.start,
+        resume=resume,
+        monitor=Monitor(("images", train.batch_size * train.frames_per_clip), TokenizerValidation(run)),
+    )
     if is_lead():
-        save_weights(run.output("tokenizer"), job.objective.tokenizer_params(state.weights))
+        save_weights(run.output("tokenizer"), model.tokenizer_params(state.weights))
 
 
-def tokenize(run: Run) -> None:
-    """Stage 3: both token grids of every clip, beside the clips, for all runs that have this tokenizer."""
-    clips, folder = run.open_clips(), run.directory / "tokens"
+def prepare(run: Run) -> None:
+    """Stage 3: makes what the model trains on instead of clips, such as tokens, and links to it."""
+    clips, folder, cfg = run.open_clips(), run.directory / "tokens", run.config
     (folder / QUARANTINE).unlink(missing_ok=True)
-    out = tokenize_store(clips, run.config, load_tokenizer(run.config, run.directory), folder)
+    assets = Assets(Normalization.create(clips), load_tokenizer(cfg, run.directory))
+    prepared = create_model(cfg).prepare(clips, assets, folder, cfg.train.max_damaged) or clips
     with disk_guard(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        Normalization.create(clips).save(folder)
-        link(out, run.output("tokens"))
+        assets.normalization.save(folder)
+        link(prepared.path.absolute(), run.output("tokens"))
 
 
 def train_world_model(run: Run, resume: bool) -> None:
-    """Stage 4."""
+    """Stage 4: trains the world model."""
     cfg, train = run.config, run.config.train
-    if train.start_from and train.start_from != cfg.tokenizer_train.start_from:
+    if cfg.model.uses_tokenizer and train.start_from and train.start_from != cfg.tokenizer_train.start_from:
         note(
             f"train.start_from {train.start_from} is not tokenizer_train.start_from; "
             f"its model has to know the tokens of this run's tokenizer"
         )
-    state = world_model_job(run).fit(resume)
+    setup = world_model_setup(run)
+    note_curriculum(setup.loader)
+    state = fit(
+        setup.model,
+        setup.loop,
+        setup.loader,
+        run.directory / "world_model",
+        name="world model",
+        to_batch=setup.to_batch,
+        start=setup.start,
+        resume=resume,
+        monitor=Monitor(("frames", train.batch_size * cfg.clips.frames), WorldModelValidation(run)),
+    )
     if is_lead():
         save_weights(run.output("world_model"), state.weights)
 
 
 def evaluate(run: Run) -> None:
-    """Stage 5: metrics and the arrays that the report shows."""
+    """Stage 5: computes the scores, and the arrays of the report."""
     with disk_guard(run.directory):
-        result = evaluation.evaluate(Generator.load(run.directory), run.open_clips())
+        result = evaluation.evaluate(load(run.directory), run.open_clips())
         evaluation.save(run.output("evaluation"), result)

@@ -1,4 +1,4 @@
-"""The last stage: ``report.html`` to look at, and ``metrics.json`` beside it."""
+"""The last stage: writes ``report.html`` and ``metrics.json``."""
 
 import importlib.metadata
 import json
@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import LossConfig, to_dict
+from rsjax.config import to_dict
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard, write_atomically
 from rsjax.models.roboscape.keypoints import motion_magnitude
@@ -22,10 +22,10 @@ LIBRARIES = ("rsjax", "jax", "flax", "optax", "orbax-checkpoint", "grain", "nump
 
 
 def write_summary(run: Run, command: str) -> None:
-    """Writes both from what the stages before left.
+    """Writes both files from the outputs of the previous stages.
 
     Args:
-        command: how to repeat the run.
+        command: the command that repeats the run.
     """
     result = evaluation.load(run.output("evaluation"))
     seconds = {stage: run.mark(stage)["seconds"] for stage in STAGES[:-1] if run.mark(stage)}
@@ -34,7 +34,10 @@ def write_summary(run: Run, command: str) -> None:
     report = Report(
         preset=cfg.name,
         metrics=metrics,
-        clips=[_figure(result.shown, i, cfg.mask.prompt_frames, cfg.loss) for i in range(len(result.shown["clip"]))],
+        clips=[
+            _figure(result.shown, i, cfg.prompt_frames, cfg.model.marked_keypoints)
+            for i in range(len(result.shown["clip"]))
+        ],
         logs={
             "tokenizer": read_log(run.directory / "tokenizer"),
             "world model": read_log(run.directory / "world_model"),
@@ -43,26 +46,26 @@ def write_summary(run: Run, command: str) -> None:
         versions=_versions(),
         seconds=seconds,
         command=command,
-        show_targets=cfg.name == "tiny" and not cfg.data.key,  # they are those of the simulated clips
+        show_targets=cfg.name == "tiny" and not cfg.data.key,  # targets are for the simulated clips
     )
     with disk_guard(run.directory):
         write_report(run.output("report"), report)
         write_atomically(run.directory / "metrics.json", json.dumps(metrics, indent=1).encode())
 
 
-def _figure(shown: dict[str, np.ndarray], row: int, given: int, loss: LossConfig) -> ClipFigure:
+def _figure(shown: dict[str, np.ndarray], row: int, prompt_frames: int, keypoints: int) -> ClipFigure:
     names = ["truth", "prediction", "reconstruction", "other_actions"]
     names += ["true_depth", "predicted_depth"] if shown["has_depth"][row] else []
     arrays: dict[str, Any] = {name: shown[name][row] for name in names if name in shown}
-    if loss.keypoints:
+    if keypoints:
         tracks, visible = shown["tracks"][row], shown["visible"][row]
         motion = np.asarray(motion_magnitude(tracks, visible))
-        chosen = np.argsort(-motion)[: loss.num_keypoints]
+        chosen = np.argsort(-motion)[:keypoints]
         arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
-    title = f"held-out clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
-    if shown["success"].any():  # otherwise it may be that nobody said
-        title += ", and it succeeds" if shown["success"][row] else ", and it fails"
-    return ClipFigure(title=title, prompt_frames=given, **arrays)
+    title = f"test clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
+    if shown["success"].any():  # otherwise success may be unknown
+        title += " (success)" if shown["success"][row] else " (failure)"
+    return ClipFigure(title=title, prompt_frames=prompt_frames, **arrays)
 
 
 def _versions() -> dict[str, str]:
@@ -72,10 +75,10 @@ def _versions() -> dict[str, str]:
         "system": platform.platform(),
         "device": f"{jax.local_device_count()} × {device.device_kind}, {os.cpu_count()} CPU cores",
     }
-    found = {}
+    versions = {}
     for name in LIBRARIES:
         try:
-            found[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            continue  # the simulator is not needed where the clips are there already
-    return found | machine
+            continue  # without the simulator, for example
+    return versions | machine

@@ -1,4 +1,4 @@
-"""Videos from a trained run, one per clip."""
+"""Generates videos from a trained run, one per clip."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -9,29 +9,31 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rsjax.config import Config, SampleConfig
+from rsjax.clip import Video
+from rsjax.config import Config
+from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
-from rsjax.pipeline.clips import Clips
-from rsjax.pipeline.generator import Generated, Generator
+from rsjax.models.base import create_model
+from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
+from rsjax.pipeline.trained import load
 from rsjax.report.figures import ClipFigure, animation
 from rsjax.report.video import write_gif, write_mp4
 
 
 @dataclass(frozen=True)
 class Request:
-    """What to generate.
+    """The clips, actions and settings to generate with.
 
     Attributes:
         split: of the run's data set.
-        clips: numbers within the split, whose first frames are given; none: the first four.
-        actions_from: a clip of the same split whose actions drive them all; None: each clip's own.
-        actions: a .npy file of actions that drive them all, (T, A) in the data's units.
-        frames: how many to show, the given ones among them; actions that end before begin again. None: as many as there
-            are actions.
-        sample: fields of :class:`rsjax.config.SampleConfig` in which decoding differs from the run's own.
+        clips: numbers of the clips within the split; empty: the first four.
+        actions_from: a clip of the same split whose actions are used for all clips; None: each clip's own.
+        actions: a .npy file of actions that are used for all clips, (T, A) in the data's units.
+        frames: frames per video, the prompt included; shorter actions are repeated. None: as many as the actions have.
+        sample: changed fields of :class:`rsjax.config.SampleConfig`.
     """
 
     split: str
@@ -52,25 +54,24 @@ def write_videos(
     scale: int,
     store: Path | None = None,
 ) -> Iterator[Path]:
-    """Generates and writes a video per clip: truth and prediction side by side, with depth where the model has it.
+    """Generates and writes a video per clip: truth and prediction side by side, with depth if the model has it.
 
-    Under foreign actions, or beyond a clip's end, there is no truth to show, only what was generated.
+    Under other actions, or beyond a clip's end, only the prediction is shown, since there is no truth.
 
     Args:
-        run, data: the run's directory, and where simulated data sets are kept.
-        out: where the files go.
-        scale: pixels per pixel, where prediction alone is shown.
-        store: where the run's store of clips lies now, if it was ingested and has moved since.
+        run, data: the directories of the run and of simulated data sets.
+        out: the directory of the videos.
+        scale: enlargement of videos that show only the prediction.
+        store: the new path of the run's store of ingested clips, if it was moved.
 
     Yields:
-        Each file's path, once it is written.
+        The path of each written file.
 
     Raises:
-        UserError: the run or its data are missing, a clip does not exist, or the actions do not fit.
+        UserError: the run, its data or a clip is missing, or the actions do not fit.
     """
-    generator = Generator.load(run)
-    sample = dataclasses.replace(generator.config.sample, **request.sample)
-    config = relocated(generator.config, store) if store else generator.config
+    trained = load(run)
+    config = relocated(trained.config, store) if store else trained.config
     source = Run(config, run, data).open_clips().source(request.split)
     clips = request.clips or tuple(range(min(4, len(source))))
     for flag, numbers in (("--clips", clips), ("--actions-from", (request.actions_from or 0,))):
@@ -80,12 +81,12 @@ def write_videos(
                 raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
     if not fps > 0 or scale < 1:
         raise UserError(f"--fps is {fps} and --scale is {scale}; both must be positive")
-    sample.check(generator.config.model)
-    foreign = _foreign_actions(request, source, generator.config)
+    trained = resampled(trained, request.sample)
+    foreign = _foreign_actions(request, source, config)
     for number in clips:
         clip = source[number]
-        actions = _lasting(clip["actions"] if foreign is None else foreign, request, generator.config)
-        made = _generate(generator, clip, actions, sample, number)
+        actions = _lasting(clip["actions"] if foreign is None else foreign, request, config)
+        made = _generate(trained, clip, actions, number)
         alone = foreign is not None or len(actions) > len(clip["rgb"])
         name = f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}"
         path = out / f"{name}{'' if request.frames is None else f'_{request.frames}_frames'}.{kind}"
@@ -103,7 +104,7 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
         actions = np.load(request.actions, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
-    width, shortest = config.clips.action_dim, config.mask.prompt_frames + 1
+    width, shortest = config.clips.action_dim, config.prompt_frames + 1
     if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
         fits = f"(T, {width}) with T at least {shortest}"
         raise UserError(f"{request.actions}: shape {actions.shape}; this model takes {fits}")
@@ -113,21 +114,38 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
 
 
 def _lasting(actions: Float[np.ndarray, "T A"], request: Request, config: Config) -> Float[np.ndarray, "F A"]:
-    """Actions for the frames asked for: cut, or begun again after the last. Row 0 led nowhere and is not repeated."""
+    """Returns actions for the requested frames: cut, or repeated except for row 0, which is not an action."""
     if request.frames is None:
         return actions
-    if request.frames <= config.mask.prompt_frames:
-        raise UserError(f"--frames is {request.frames}, of which {config.mask.prompt_frames} are given; ask for more")
+    if request.frames <= config.prompt_frames:
+        raise UserError(f"--frames is {request.frames}, but the prompt has {config.prompt_frames}; set it higher")
     turns = 1 + np.arange(request.frames - 1) % (len(actions) - 1)
     return actions[np.concatenate([[0], turns])]
 
 
-def _generate(generator: Generator, clip: Record, actions: np.ndarray, sample: SampleConfig, number: int) -> Generated:
-    prompt = Clips.stacked([clip], [number]).tokens(generator.codec, generator.config.mask.prompt_frames)
-    return generator.generate(prompt, actions[None], sample, index=np.array([number]))
+def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
+    """Returns the model with changed fields of ``model.sample``.
+
+    Raises:
+        ConfigError: the model does not support these settings.
+    """
+    if not sample:
+        return trained
+    settings = getattr(trained.config.model, "sample", None)
+    if settings is None:
+        raise UserError(f"a model of family {trained.config.model.family!r} has no settings of sampling")
+    model = dataclasses.replace(trained.config.model, sample=dataclasses.replace(settings, **sample))  # type: ignore[call-arg]
+    config = dataclasses.replace(trained.config, model=model)
+    return dataclasses.replace(trained, config=config, model=create_model(config))
 
 
-def _side_by_side(clip: Record, made: Generated, number: int) -> UInt8[np.ndarray, "T H W 3"]:
+def _generate(trained: TrainedModel, clip: Record, actions: np.ndarray, number: int) -> Video:
+    prompt = Clips.stacked([clip], [number]).video.frames(0, trained.config.prompt_frames)
+    inputs = (trained.params, trained.assets, prompt, actions[None])
+    return trained.model.generate(*inputs, index=np.array([number]))
+
+
+def _side_by_side(clip: Record, made: Video, number: int) -> UInt8[np.ndarray, "T H W 3"]:
     shown = len(made.rgb[0])
     depth = {} if made.depth is None else {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
     return animation(ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth))

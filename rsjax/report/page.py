@@ -9,6 +9,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from rsjax.evaluation.registry import metrics
 from rsjax.report.curves import curves_svg
 from rsjax.report.figures import ClipFigure, animation, filmstrip, keypoints
 from rsjax.report.targets import judge
@@ -25,15 +26,6 @@ _SCORE_ROWS = (
     ("", "prediction"),
     ("_repeat_first", "first frame repeated"),
     ("_tokenizer", "tokenizer's reconstruction"),
-)
-_SCORE_COLUMNS = (
-    ("psnr{}", "PSNR, dB ↑", 2),
-    ("ssim{}", "SSIM ↑", 3),
-    ("depth_absrel{}", "depth AbsRel ↓", 4),
-    ("depth_delta1{}", "depth δ₁ ↑", 3),
-    ("depth_delta2{}", "depth δ₂ ↑", 3),
-    ("delta_psnr{}", "ΔPSNR, another clip's actions, dB ↑", 2),
-    ("delta_psnr_uniform{}", "ΔPSNR, uniform actions, dB ↑", 2),
 )
 _CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
 _CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
@@ -79,7 +71,9 @@ def write_report(path: Path | str, report: Report) -> None:
         report=report,
         headline=_HEADLINE_CLIPS,
         clips=[_clip_pictures(clip) for clip in report.clips],
-        scores=_table(report.metrics, _SCORE_ROWS, _SCORE_COLUMNS),
+        scores=_table(
+            report.metrics, _SCORE_ROWS, [(f"{m.name}{{}}", m.heading, m.decimals) for m in metrics().values()]
+        ),
         control=_table(report.metrics, _CONTROL_ROWS, _CONTROL_COLUMNS),
         verdicts=judge(report.metrics) if report.show_targets else [],
         curves={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},

@@ -1,1 +1,1 @@
-"""Images to discrete tokens and back: MAGVIT-2 with lookup-free quantisation, for RGB and colourised depth."""
+"""The tokenizer of RGB frames and colourised depth maps: MAGVIT-2 with lookup-free quantisation, and its training."""

@@ -1,7 +1,7 @@
 """The adversarial terms of the tokenizer's training (reference: Open-MAGVIT2). Each returns (weighted sum, weight).
 
-The generator's term moves the tokenizer alone, the discriminator's terms the discriminator alone, so that one gradient
-of their sum is both of the reference's. Both see the parameters from before the step, as there.
+The generator's term has gradients only for the tokenizer, the discriminator's terms only for the discriminator, so one
+gradient of their sum equals the reference's two. As there, both use the parameters from before the step.
 
 Axes: B images, H×W pixels.
 """
@@ -15,47 +15,46 @@ from jaxtyping import Array, Float
 
 from rsjax.config import TokenizerTrainConfig
 from rsjax.tokenizers.discriminator import Discriminator
+from rsjax.trainable import Params, Scalar, Term
 
-Scalar = Float[Array, ""]
-Term = tuple[Scalar, Scalar]
 Averages = dict[str, Scalar]  # of the logits of "real" and of "fake" images
 
 
 def initial_averages() -> Averages:
-    """LeCAM's averages before the first step."""
+    """Returns LeCAM's averages before the first step."""
     return {"real": jnp.zeros(()), "fake": jnp.zeros(())}
 
 
 def updated_averages(averages: Averages, real: Scalar, fake: Scalar, decay: float) -> Averages:
-    """LeCAM's averages after a step whose mean logits, over all devices, were ``real`` and ``fake``."""
+    """Returns LeCAM's averages after a step whose mean logits over all devices were ``real`` and ``fake``."""
     new = {"real": real, "fake": fake}
     return {name: decay * averages[name] + (1 - decay) * new[name] for name in averages}
 
 
 def adversarial_terms(
     train: TokenizerTrainConfig,
-    params: Any,
+    params: Params,
     target: Float[Array, "B H W 3"],
     output: Float[Array, "B H W 3"],
     active: Scalar,
     averages: Averages,
     axis_name: str | None,
 ) -> dict[str, Term]:
-    """The terms of one batch, named as their weights in :class:`TokenizerTrainConfig`.
+    """Returns the terms of one batch, named as their weights in :class:`TokenizerTrainConfig`.
 
     Args:
         params: the discriminator's.
         target: real images in [-1, 1].
-        output: what the tokenizer made of them.
+        output: their reconstructions.
         active: 1, or 0 before ``disc_start``.
-        averages: LeCAM's, from the step before.
-        axis_name: of pmap; None where XLA sees the whole batch.
+        averages: LeCAM's, from the previous step.
+        axis_name: pmap's axis; None if XLA sees the whole batch.
 
     Returns:
         "adversarial", the non-saturating loss of each image's mean logit; "hinge"; "lecam"; and "real_logit" and
         "fake_logit", which carry no gradient.
     """
-    # Real and fake images are normalised apart, hence three passes (two for XLA, as the fakes' values are the same).
+    # Batch norm must not mix real and fake images, hence three passes (XLA merges the two on fakes).
     judge = cast(Callable[[Any, Array], Array], lambda p, images: Discriminator(axis_name).apply({"params": p}, images))
     fooled = judge(jax.lax.stop_gradient(params), output)
     real, fake = judge(params, target), judge(params, jax.lax.stop_gradient(output))

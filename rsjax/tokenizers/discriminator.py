@@ -12,18 +12,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-MIN_SIZE = 24  # pixels along a side that leave one patch
+MIN_SIZE = 24  # smallest image side in pixels, which gives one patch
 _WIDTH = 64
 
 
 class BatchNorm(nn.Module):
     """Normalises by the batch's own mean and (biased) variance.
 
-    There are no running averages: the discriminator serves training alone, where they would never be read.
+    There are no running averages, since the discriminator is used only in training.
 
     Args:
-        axis_name: of pmap, over which the batch is cut: statistics are then those of the whole batch, so that results
-            do not depend on the placement. The public code takes each GPU's own.
+        axis_name: pmap's axis over which the batch is split. Statistics are those of the whole batch, so that results
+            do not depend on the sharding; the public code uses those of each GPU.
     """
 
     axis_name: str | None = None
@@ -42,7 +42,7 @@ class BatchNorm(nn.Module):
 
 
 class Discriminator(nn.Module):
-    """Images in [-1, 1] to one logit per patch of 70×70 pixels; positive means real.
+    """Maps images in [-1, 1] to one logit per patch of 70×70 pixels; positive means real.
 
     Args:
         axis_name: see :class:`BatchNorm`.
@@ -60,7 +60,7 @@ class Discriminator(nn.Module):
         return _conv(1, 11, bias=True)(x)[..., 0]
 
     def init_params(self, key: Array) -> Any:
-        """Fresh parameters: weights ~ N(0, 0.02²), norms' scales ~ N(1, 0.02²)."""
+        """Returns fresh parameters: weights ~ N(0, 0.02²), norms' scales ~ N(1, 0.02²)."""
         return self.init(key, jnp.zeros((1, MIN_SIZE, MIN_SIZE, 3)))["params"]
 
 

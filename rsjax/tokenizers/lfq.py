@@ -1,4 +1,4 @@
-"""Lookup-free quantisation (LFQ, MAGVIT-2): a code is the signs of D channels, a token the number they spell.
+"""Lookup-free quantisation (LFQ, MAGVIT-2): a code is the signs of D channels, a token the number with these bits.
 
 Tokens are little-endian, ``token = Σ_c bit_c·2^c``, as in the published token files and Genie weights.
 A vocabulary of 2^D is factorised into n vocabularies of 2^(D/n): sub-token k holds bits k·D/n … (k+1)·D/n - 1.
@@ -17,45 +17,45 @@ Scalar = Float[Array, ""]
 
 
 def quantize(latents: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
-    """Signs of the latents (+1 where > 0, else -1), with the straight-through gradient."""
+    """Returns the signs of the latents (+1 where > 0, else -1), with the straight-through gradient."""
     signs = jnp.where(latents > 0, 1.0, -1.0).astype(latents.dtype)
     return latents + jax.lax.stop_gradient(signs - latents)
 
 
 def codes_to_tokens(codes: Float[Array, "*batch D"]) -> Int[Array, "*batch"]:
-    """Codes in {-1, +1} to int32 tokens, 0 … 2^D - 1."""
+    """Converts codes in {-1, +1} to int32 tokens, 0 … 2^D - 1."""
     powers = 2 ** jnp.arange(codes.shape[-1], dtype=jnp.int32)
     return jnp.sum((codes > 0) * powers, axis=-1, dtype=jnp.int32)
 
 
 def tokens_to_codes(tokens: Int[Array, "*batch"], code_bits: int) -> Float[Array, "*batch D"]:
-    """Tokens to float32 codes in {-1, +1}."""
+    """Converts tokens to float32 codes in {-1, +1}."""
     bits = (tokens[..., None] >> jnp.arange(code_bits, dtype=tokens.dtype)) & 1
     return bits.astype(jnp.float32) * 2 - 1
 
 
 def split_tokens(tokens: Int[Array, "*batch"], code_bits: int, vocabularies: int) -> Int[Array, "*batch n"]:
-    """Tokens to their sub-tokens, one per factorised vocabulary; vocabulary 0 holds the lowest bits."""
+    """Splits tokens into sub-tokens, one per factorised vocabulary; vocabulary 0 has the lowest bits."""
     width = code_bits // vocabularies
     shifts = jnp.arange(vocabularies, dtype=tokens.dtype) * width
     return (tokens[..., None] >> shifts) & (2**width - 1)
 
 
 def merge_tokens(sub_tokens: Int[Array, "*batch n"], code_bits: int) -> Int[Array, "*batch"]:
-    """The inverse of :func:`split_tokens`."""
+    """Merges sub-tokens into tokens; the inverse of :func:`split_tokens`."""
     vocabularies = sub_tokens.shape[-1]
     shifts = jnp.arange(vocabularies, dtype=sub_tokens.dtype) * (code_bits // vocabularies)
     return jnp.sum(sub_tokens << shifts, axis=-1, dtype=sub_tokens.dtype)
 
 
 def vocabulary_codes(code_bits: int, vocabularies: int) -> Float[Array, "V d"]:
-    """The code bits in {-1, +1} of every entry of one factorised vocabulary, d = D/n."""
+    """Returns the code bits in {-1, +1} of every entry of one factorised vocabulary, d = D/n."""
     width = code_bits // vocabularies
     return tokens_to_codes(jnp.arange(2**width, dtype=jnp.int32), width)
 
 
 def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
-    """mean((x - sg(q))²), float32: keeps the latents near their codes."""
+    """Returns mean((x - sg(q))²), float32, which keeps the latents near their codes."""
     latents = latents.astype(jnp.float32)
     return jnp.mean(jnp.square(latents - jax.lax.stop_gradient(quantize(latents))))
 
@@ -63,14 +63,14 @@ def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
 def entropy_loss(
     latents: Float[Array, "*batch D"], temperature: float, total: Callable[[Any], Any] = lambda x: x
 ) -> Scalar:
-    """Mean entropy of a token's code less the entropy of the batch's average code, over all 2^D codes, in nats.
+    """Returns the mean entropy of a token's code minus the entropy of the batch's average code, in nats.
 
-    Code c has probability ∝ exp(2·x·c/τ), so its bits are independent: p_d = σ(4·x_d/τ). Hence the first term is a
-    sum of binary entropies, and the average over the batch is a product of two half-code tables of 2^(D/2) entries:
-    no array of N × 2^D is made. float32, also in its products.
+    It is exact over all 2^D codes without an array of N × 2^D: code c has probability ∝ exp(2·x·c/τ), so its bits are
+    independent with p_d = σ(4·x_d/τ), the first term is a sum of binary entropies, and the average over the batch is a
+    product of two tables of 2^(D/2) half-codes. Everything is float32, products included.
 
     Args:
-        total: adds arrays over devices. The average is that of all devices' tokens, the mean of this one's.
+        total: adds arrays over devices. The average code covers all devices' tokens, the mean entropy this device's.
     """
     logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
     log_one, log_zero = jax.nn.log_sigmoid(logits), jax.nn.log_sigmoid(-logits)

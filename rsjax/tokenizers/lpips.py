@@ -1,13 +1,11 @@
 """LPIPS, the learned perceptual distance of images (Zhang et al. 2018, version 0.1), with AlexNet or VGG16.
 
-Its weights are not part of this project: they are read from one safetensors file, which
-``python -m rsjax.convert lpips`` writes from the public ones:
+Its weights are not part of this project. They are read from one safetensors file, which
+``python -m rsjax.convert lpips`` makes from the public weights:
 
     backbone.{i}.weight, .bias   torchvision's ``features.{i}``: (out, in, kernel, kernel), (out,)
     head.{k}.weight              of tap k: (1, channels, 1, 1)
     metadata                     {"net": "alexnet" | "vgg16"}
-
-Without that file there is no LPIPS.
 """
 
 from pathlib import Path
@@ -23,11 +21,11 @@ from rsjax.errors import UserError
 
 
 class LpipsError(UserError):
-    """LPIPS weights that are missing or are not what their file claims."""
+    """LPIPS weights that are missing, damaged or of another network."""
 
 
 class _Conv(NamedTuple):
-    """One convolution with its ReLU, as torchvision numbers and shapes it."""
+    """One convolution with its ReLU, with torchvision's number and shape."""
 
     number: int
     channels: int
@@ -35,7 +33,7 @@ class _Conv(NamedTuple):
     stride: int = 1
     padding: int = 1
     pool: int = 0  # side of the max pooling before it, of stride 2; 0: none
-    tap: bool = False  # its output is compared
+    tap: bool = False  # whether its output is compared
 
 
 NETS: dict[str, tuple[_Conv, ...]] = {
@@ -63,7 +61,7 @@ NETS: dict[str, tuple[_Conv, ...]] = {
     ),
 }
 
-# Pixels along a side that leave one position in the last tap.
+# Smallest image side in pixels, which gives one position in the last tap.
 MIN_SIZES: dict[str, int] = {"alexnet": 31, "vgg16": 16}
 
 _SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
@@ -71,11 +69,11 @@ _SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 
 
 def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Array, "*B H W 3"]) -> Float[Array, "*B"]:
-    """The distance of each pair of images; 0 where they are the same.
+    """Returns the distance of each pair of images; 0 for equal images.
 
     Args:
-        params: as :func:`load_lpips` gives them; their numbering tells the network. Any width will do.
-        one: values in [-1, 1]; both sides at least :func:`min_size` pixels, below which the distance is not a number.
+        params: from :func:`load_lpips`; the layers' numbers identify the network, and layers may have any width.
+        one: values in [-1, 1]; both sides at least :func:`min_size` pixels, or else the distance is NaN.
         other: the same shape.
     """
     batch = one.shape[:-3]
@@ -90,10 +88,10 @@ def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Ar
 
 
 def load_lpips(path: str | Path) -> dict[str, Any]:
-    """The weights in a file, as a nested dict by the parts of their names: ``["backbone"]["0"]["weight"]``.
+    """Loads the weights of a file as a nested dict, such as ``["backbone"]["0"]["weight"]``.
 
     Raises:
-        LpipsError: there is no such file, it is damaged, or a tensor is missing, left over or misshapen.
+        LpipsError: the file is missing or damaged, or a tensor is missing, unexpected or of another shape.
     """
     if not Path(path).is_file():
         raise LpipsError(f"{path}: no such LPIPS weights; make them with python -m rsjax.convert lpips")
@@ -107,9 +105,9 @@ def load_lpips(path: str | Path) -> dict[str, Any]:
         raise LpipsError(f"{path}: its metadata name the net {net!r}, not one of {', '.join(NETS)}; make it again")
     wanted = lpips_shapes(net)
     for name in sorted(wanted.keys() | tensors.keys()):
-        found = tensors[name].shape if name in tensors else "missing"
-        if found != wanted.get(name, "none"):
-            raise LpipsError(f"{path}: {name} is {found}, {net} needs {wanted.get(name, 'none')}; make it again")
+        shape = tensors[name].shape if name in tensors else "missing"
+        if shape != wanted.get(name, "none"):
+            raise LpipsError(f"{path}: {name} is {shape}, {net} needs {wanted.get(name, 'none')}; make it again")
     nested: dict[str, Any] = {"backbone": {}, "head": {}}
     for name, tensor in tensors.items():
         part, index, kind = name.split(".")
@@ -118,12 +116,12 @@ def load_lpips(path: str | Path) -> dict[str, Any]:
 
 
 def min_size(params: dict[str, Any]) -> int:
-    """Pixels that an image's sides must have at least."""
+    """Returns the smallest image side in pixels."""
     return MIN_SIZES[_net(params["backbone"])]
 
 
 def lpips_shapes(net: str) -> dict[str, tuple[int, ...]]:
-    """The shape of every tensor of a file, by name."""
+    """Returns the shape of every tensor of a file by name."""
     shapes: dict[str, tuple[int, ...]] = {}
     width, taps = 3, 0
     for conv in NETS[net]:
@@ -141,7 +139,7 @@ def _net(backbone: dict[str, Any]) -> str:
 
 
 def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list[Float[Array, "B h w C"]]:
-    """The tapped outputs, from the first to the last."""
+    """Returns the tapped outputs, from the first to the last."""
     x, taps = (images - _SHIFT) / _SCALE, []
     for conv in NETS[_net(backbone)]:
         if conv.pool:
@@ -161,8 +159,8 @@ def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list
 
 
 def _unit(features: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
-    """Each position's features at length 1."""
+    """Normalises each position's features to length 1."""
     square = jnp.sum(jnp.square(features), axis=-1, keepdims=True)
-    # The root has no gradient where every feature is 0; the public code's is not a number there.
+    # The root's gradient is taken as 0 where all features are 0; the public code gets NaN there.
     length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     return features / (length + 1e-10)

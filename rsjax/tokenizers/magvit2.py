@@ -1,8 +1,7 @@
 """The MAGVIT-2 image tokenizer (paper §2.3 "Video Tokenization"; architecture of the public Open-MAGVIT2).
 
-One module for all sizes: the full preset maps 256² pixels to 16×16 tokens of 18 bits. Convolutions of the residual
-blocks have no bias, downsampling pads symmetrically, there is no attention. Submodule names follow the public
-checkpoints' keys.
+The full-size presets map 256² pixels to 16×16 tokens of 18 bits. Convolutions of the residual blocks have no bias,
+downsampling pads symmetrically, and there is no attention. Submodules are named after the public checkpoints' keys.
 
 Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
 """
@@ -25,14 +24,14 @@ def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h
 
 
 def depth_to_space(x: Float[Array, "B h w C2"], factor: int) -> Float[Array, "B H W C"]:
-    """Channels (factor, factor, C) to factor×factor blocks of pixels."""
+    """Moves channels (factor, factor, C) into factor×factor blocks of pixels."""
     b, height, width, c = x.shape
     x = x.reshape(b, height, width, factor, factor, c // factor**2)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height * factor, width * factor, c // factor**2)
 
 
 def _conv3(features: int, name: str, bias: bool = False, stride: int = 1) -> nn.Conv:
-    # Symmetric padding also where the stride is 2: 'SAME' would pad one side only.
+    # Symmetric padding even with stride 2, where 'SAME' would pad one side only.
     return nn.Conv(features, (3, 3), (stride, stride), padding=((1, 1), (1, 1)), use_bias=bias, name=name)
 
 
@@ -54,18 +53,18 @@ class ResBlock(nn.Module):
 
 
 def _norm(groups: int, name: str, affine: bool = True) -> nn.GroupNorm:
-    # E[x²] - E[x]² loses digits that parity with the public weights needs.
+    # The fast variance, E[x²] - E[x]², is too inexact for parity with the public weights.
     return nn.GroupNorm(groups, epsilon=1e-6, use_bias=affine, use_scale=affine, use_fast_variance=False, name=name)
 
 
 class AdaptiveGroupNorm(nn.Module):
-    """GroupNorm whose scale and shift of each channel are linear in the codes' deviations and means over the cells."""
+    """GroupNorm whose scale and shift are linear in the codes' standard deviations and means over the cells."""
 
     groups: int
 
     @nn.compact
     def __call__(self, x: Float[Array, "B h w C"], codes: Float[Array, "B i j D"]) -> Float[Array, "B h w C"]:
-        # The unbiased variance: the public code leaves torch's default.
+        # The unbiased variance, torch's default, as in the public code.
         deviation = jnp.sqrt(jnp.var(codes, axis=(1, 2), ddof=1) + 1e-6)
         scale = nn.Dense(x.shape[-1], name="gamma")(deviation)
         shift = nn.Dense(x.shape[-1], name="beta")(jnp.mean(codes, axis=(1, 2)))
@@ -73,7 +72,7 @@ class AdaptiveGroupNorm(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images in [-1, 1] to latents whose signs are the code."""
+    """Maps images in [-1, 1] to latents, whose signs are the code."""
 
     config: TokenizerConfig
 
@@ -95,7 +94,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Codes in {-1, +1} to images in about [-1, 1] (not clipped)."""
+    """Maps codes in {-1, +1} to images in about [-1, 1] (not clipped)."""
 
     config: TokenizerConfig
 
@@ -119,7 +118,7 @@ class Decoder(nn.Module):
 
 
 class Tokenizer(nn.Module):
-    """Encoder, lookup-free quantiser and decoder. ``apply`` with ``method=`` "encode", "decode" or neither."""
+    """Encoder, lookup-free quantiser and decoder; ``apply`` takes ``method`` "encode", "decode" or neither."""
 
     config: TokenizerConfig
 
@@ -128,29 +127,29 @@ class Tokenizer(nn.Module):
         self.decoder = Decoder(self.config)
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> tuple[Float[Array, "B H W 3"], Float[Array, "B h w D"]]:
-        """Images in [-1, 1] to (reconstruction, latents), differentiable through the quantiser."""
+        """Returns (reconstruction, latents) of images in [-1, 1], differentiable through the quantiser."""
         latents = self.encoder(images)
         return self.decoder(lfq.quantize(latents)), latents
 
     def encode(self, images: Float[Array, "B H W 3"]) -> Int[Array, "B h w"]:
-        """Images in 0–255 to tokens, 0 … 2^D - 1."""
+        """Encodes images 0–255 to tokens 0 … 2^D - 1."""
         return lfq.codes_to_tokens(self.encoder(to_unit(images)))
 
     def decode(self, tokens: Int[Array, "B h w"]) -> Float[Array, "B H W 3"]:
-        """Tokens to images in 0–255 (float32, clipped, not rounded)."""
+        """Decodes tokens to images 0–255 (float32, clipped, not rounded)."""
         return to_pixels(self.decoder(lfq.tokens_to_codes(tokens, self.config.code_bits)))
 
     def init_params(self, key: Array) -> Any:
-        """Fresh parameters."""
-        size = self.config.image_size
+        """Returns fresh parameters, which do not depend on the image size."""
+        size = 2 * self.config.downsampling
         return self.init(key, jnp.zeros((1, size, size, 3)))["params"]
 
 
 def to_unit(pixels: Any) -> Float[Array, "*batch"]:
-    """Pixels 0–255 to [-1, 1]: x/127.5 - 1."""
+    """Maps pixels 0–255 to [-1, 1]: x/127.5 - 1."""
     return jnp.asarray(pixels, jnp.float32) / 127.5 - 1.0
 
 
 def to_pixels(images: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """[-1, 1] to pixels 0–255, clipped."""
+    """Maps [-1, 1] to pixels 0–255, clipped."""
     return jnp.clip((images + 1.0) * 127.5, 0.0, 255.0)

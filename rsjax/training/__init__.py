@@ -1,1 +1,1 @@
-"""Training: the state, one train step, its placement on devices, checkpoints, and the loop around them."""
+"""Training: the state, one train step, its sharding over devices, checkpoints, and the loop around them."""

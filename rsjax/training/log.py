@@ -21,7 +21,7 @@ NAME = "log.jsonl"
 PICTURES = "pictures"
 # Scalars that measure the machine: they differ between any two runs.
 MEASURED = frozenset(
-    {"seconds_per_step", "data_wait_share", "tokens_per_second", "images_per_second"}
+    {"seconds_per_step", "data_wait_share", "frames_per_second", "images_per_second"}
     | {"device_gib", "device_peak_gib", "host_gib"}
 )
 

@@ -1,4 +1,4 @@
-"""The training loop: batches in, steps, logs and checkpoints out; stops and resumes exactly."""
+"""The training loop: steps, logs, validation and checkpoints. It stops and resumes exactly."""
 
 import dataclasses
 import shutil
@@ -7,168 +7,172 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
 from rsjax.config import LoopConfig
 from rsjax.data.loader import Loader
+from rsjax.data.order import Arrays
 from rsjax.data.prefetch import DeviceBatch, Prefetch
 from rsjax.errors import Preempted, UserError
 from rsjax.progress import Progress, note
+from rsjax.trainable import Params, Trainable
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.distributed import agree, barrier, is_lead
 from rsjax.training.log import ScalarLog
 from rsjax.training.memory import memory_scalars
-from rsjax.training.objectives import Objective
-from rsjax.training.placement import Placement
 from rsjax.training.preemption import StopRequest
 from rsjax.training.profile import Profile
+from rsjax.training.sharding import Sharding
 from rsjax.training.skipped import NAME as SKIPPED
 from rsjax.training.skipped import SkippedSteps
 from rsjax.training.state import TrainState
-from rsjax.training.validation import Evaluate, HeldOut
+from rsjax.training.step import Metrics, train_step
+from rsjax.training.validation import Validate, Validation
+
+B = TypeVar("B")
 
 
 class DivergedError(UserError):
-    """More steps were not finite than the configuration allows."""
+    """More steps were skipped than ``skip_budget`` allows."""
 
 
 @dataclass(frozen=True)
-class Watch:
-    """How a run is looked at while it goes on; nothing that it makes depends on this.
+class Monitor:
+    """Settings of progress display and validation, which do not affect the results of training.
 
     Attributes:
-        per_step: what a step works on and how much of it, such as ("tokens", 16384), for rates.
-        held_out: looks at the weights every ``loop.eval_every`` steps.
+        per_step: the unit and amount of a step's work, such as ("frames", 64), for rates.
+        validate: scores the weights every ``loop.eval_every`` steps.
     """
 
     per_step: tuple[str, float] | None = None
-    held_out: Evaluate | None = None
+    validate: Validate | None = None
 
 
 def fit(
-    objective: Objective,
+    model: Trainable[B],
     loop: LoopConfig,
     loader: Callable[[dict[str, Any] | None], Loader],
     directory: Path,
     *,
     name: str,
-    to_batch: Callable[[dict[str, Any]], Any],
-    start: Callable[[Any], Any] | None = None,
+    to_batch: Callable[[Arrays], B],
+    start: Callable[[Params], Params] | None = None,
     resume: bool = True,
     stop_at: int | None = None,
-    watch: Watch | None = None,
+    monitor: Monitor = Monitor(),
 ) -> TrainState:
-    """Trains until ``loop.steps`` steps are done, going on from the newest checkpoint in ``directory``.
+    """Trains for ``loop.steps`` steps in total, resuming from the newest checkpoint in ``directory``.
 
-    Of several processes all call this with the same arguments; the lead alone writes logs.
+    All processes call this with the same arguments; only the lead writes logs.
 
     Args:
-        loader: given a loader's saved state (or None), the loader that goes on from there.
-        directory: holds checkpoints and logs; made if it is not there.
-        name: what is trained, for the progress line.
-        to_batch: a loader's arrays to the objective's batch.
-        start: fresh parameters to those that training begins with; not asked where there is a checkpoint to resume.
-        resume: False throws earlier checkpoints away.
+        model: the model to train.
+        loader: takes a loader's saved state (or None) and returns the loader that continues from it.
+        directory: of checkpoints and logs; made if it does not exist.
+        name: of the training, for the progress line.
+        to_batch: converts a loader's arrays to the model's batch.
+        start: makes the initial parameters from fresh ones; not called on resuming from a checkpoint.
+        resume: False deletes earlier checkpoints.
         stop_at: stop (and save) after this step, as if interrupted.
 
     Returns:
-        The final state, on this process's first device; of one that devices share (``loop.fsdp``), the weights alone.
+        The final state on this process's first device; only its weights if it is sharded (``loop.fsdp``).
 
     Raises:
         CheckpointError: the newest checkpoint does not fit, or none can be read.
-        DivergedError: the loss or the gradient of too many steps was not finite; their batches are written down.
-        Preempted: SIGTERM; everything up to the step that was under way is saved.
-        StoreError: too many damaged records, or a full disk.
+        DivergedError: too many steps were skipped; their batches are recorded.
+        Preempted: the process received SIGTERM; everything up to the current step is saved.
+        StoreError: too many records are damaged, or the disk is full.
     """
     if not resume and is_lead():
         shutil.rmtree(directory / "checkpoints", ignore_errors=True)
     barrier(f"{name} begins")
-    placement = Placement.create(loop)
+    sharding = Sharding.create(loop)
     with ExitStack() as stack:
         checkpoints = Checkpoints(directory / "checkpoints", loop.keep_last, loop.keep_every, loop.keep_best)
         stack.callback(checkpoints.close)
         if agree(checkpoints.latest(), f"{name}: newest checkpoint") is None:
-            state, data = placement.init(objective, loop, start), None
+            state, data = sharding.init(model, loop, start), None
         else:
-            state, data = checkpoints.restore(placement.template(objective, loop))
-            state = placement.adopt(state)
-        run = _Run(objective, loop, directory, placement, checkpoints, watch or Watch())
+            state, data = checkpoints.restore(sharding.template(model, loop))
+            state = sharding.adopt(state)
+        training = _Training(model, loop, directory, sharding, checkpoints, monitor)
         last = min(stop_at or loop.steps, loop.steps)
-        batches = stack.enter_context(Prefetch(loader(data), lambda arrays: placement.put_batch(to_batch(arrays))))
-        state = run.steps(state, batches, last, name)
-    if placement.shares:  # the whole state need not fit one device
+        batches = stack.enter_context(Prefetch(loader(data), lambda arrays: sharding.put_batch(to_batch(arrays))))
+        state = training.steps(state, batches, last, name)
+    if sharding.shares:  # the whole state need not fit one device
         kept = "params" if state.ema is None else "ema"
-        weights = placement.gather(state.weights)
-        left = {"params": None, "opt_state": None, "ema": None, "extra": None} | {kept: weights}
-        return dataclasses.replace(state, **left)  # type: ignore[type-var]
-    return placement.gather(state)
+        rest: dict[str, Any] = dict.fromkeys(("params", "opt_state", "ema", "extra"))
+        return dataclasses.replace(state, **rest | {kept: sharding.gather(state.weights)})  # type: ignore[type-var]
+    return sharding.gather(state)
 
 
-class _Taken(NamedTuple):
-    """A step that was dispatched, and may still be computed."""
+class _Dispatched(NamedTuple):
+    """A step that the device may still be computing."""
 
     step: int
-    fed: DeviceBatch
-    metrics: dict[str, Any]
+    batch: DeviceBatch
+    metrics: Metrics
 
 
-class _Run:
+class _Training:
     """One call of :func:`fit`."""
 
     def __init__(
         self,
-        objective: Objective,
+        model: Trainable[Any],
         loop: LoopConfig,
         directory: Path,
-        placement: Placement,
+        sharding: Sharding,
         checkpoints: Checkpoints,
-        watch: Watch,
+        monitor: Monitor,
     ) -> None:
-        self.objective, self.loop, self.directory = objective, loop, directory
-        self.placement, self.checkpoints, self.watch = placement, checkpoints, watch
+        self.model, self.loop, self.directory = model, loop, directory
+        self.sharding, self.checkpoints, self.monitor = sharding, checkpoints, monitor
 
     def steps(self, state: TrainState, batches: Prefetch, last: int, name: str) -> TrainState:
-        """From the state's step to the last."""
+        """Trains from the state's step to step ``last``."""
         loop, first = self.loop, int(state.step)
-        step_fn = self.placement.compile(self.objective, loop)
+        step_fn = self.sharding.compile(train_step, self.model, loop)
         self._skips = int(state.skipped)
         self._skipped_steps = SkippedSteps(self.directory, first) if is_lead() else None
         with ExitStack() as stack:
             log = stack.enter_context(self._log(first)) if is_lead() else None
             shown = (name, loop.steps, "steps", first)
-            progress = stack.enter_context(Progress(*shown, per_unit=self.watch.per_step)) if is_lead() else None
+            progress = stack.enter_context(Progress(*shown, per_unit=self.monitor.per_step)) if is_lead() else None
             traces = (self.directory / "profile", first, last, self.loop.profile)
             profile = stack.enter_context(Profile.after(*traces))
             stop = stack.enter_context(StopRequest())
             clock, before = _Clock(batches, first), None
             for step in range(first + 1, last + 1):
                 profile.at(step, state)
-                fed = next(batches)
+                batch = next(batches)
                 with jax.profiler.StepTraceAnnotation("train", step_num=step):
-                    state, metrics = step_fn(state, fed.batch)
-                if before is not None:  # one step is computed while the next one is prepared, not more
+                    state, metrics = step_fn(state, batch.batch)
+                if before is not None:  # only one step is computed while the next is prepared
                     self._check(before, batches)
-                before = _Taken(step, fed, metrics)
+                before = _Dispatched(step, batch, metrics)
                 if progress is not None:
-                    progress.update(step, **{term: metrics[term] for term in ("loss", *self.objective.weights)})
-                asked = stop.asked(step)
+                    progress.update(step, **{term: metrics[term] for term in ("loss", *self.model.loss_weights)})
+                stopping = stop.asked(step)
                 due = {every: at > 0 and (step % at == 0 or step == last) for every, at in self._schedule().items()}
-                if asked or any(due.values()):
+                if stopping or any(due.values()):
                     self._check(before, batches)
                     before = None
                     if log is not None and due["log"]:
-                        measured = clock.lap(step, self.watch.per_step) | memory_scalars()
-                        log.write(step, self.placement.scalars(metrics) | measured)
-                    found = None
-                    if due["held_out"]:
+                        measured = clock.lap(step, self.monitor.per_step) | memory_scalars()
+                        log.write(step, self.sharding.scalars(metrics) | measured)
+                    scored = None
+                    if due["validation"]:
                         with clock.stopped():
-                            found = self._look(state, step, log)
-                    if due["checkpoint"] or asked or (found is not None and loop.keep_best):
-                        metric = None if found is None else found.metric
-                        self.checkpoints.save(step, self.placement.portable(state), batches.state(), metric)
-                if asked and step < last:
+                            scored = self._validate(state, step, log)
+                    if due["checkpoint"] or stopping or (scored is not None and loop.keep_best):
+                        metric = None if scored is None else scored.metric
+                        self.checkpoints.save(step, self.sharding.portable(state), batches.state(), metric)
+                if stopping and step < last:
                     self.checkpoints.wait()
                     raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
             profile.at(last + 1, state)
@@ -179,47 +183,47 @@ class _Run:
 
     def _schedule(self) -> dict[str, int]:
         loop = self.loop
-        held_out = loop.eval_every if self.watch.held_out is not None else 0
-        return {"log": loop.log_every, "checkpoint": loop.checkpoint_every, "held_out": held_out}
+        validation = loop.eval_every if self.monitor.validate is not None else 0
+        return {"log": loop.log_every, "checkpoint": loop.checkpoint_every, "validation": validation}
 
     def _log(self, first: int) -> ScalarLog:
         return ScalarLog(self.directory, first, self.loop.wandb, resume=first > 0)
 
-    def _check(self, taken: _Taken, batches: Prefetch) -> None:
-        """Waits for a step; writes it down if it was left out.
+    def _check(self, done: _Dispatched, batches: Prefetch) -> None:
+        """Waits for a step and records it if it was skipped.
 
         Raises:
-            DivergedError: it was one too many.
+            DivergedError: too many steps were skipped.
         """
-        skips, allowed = int(taken.metrics["skipped"]), self.loop.skip_budget
+        skips, allowed = int(done.metrics["skipped"]), self.loop.skip_budget
         if skips == self._skips:
             return
-        self._skips, scalars = skips, self.placement.scalars(taken.metrics)
+        self._skips, scalars = skips, self.sharding.scalars(done.metrics)
         if self._skipped_steps is not None:
-            self._skipped_steps.add(taken.step, scalars, batches.identify(taken.fed), taken.fed.before)
-            told = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
-            note(f"step {taken.step} is left out ({told}): {skips} of at most {allowed}")
+            self._skipped_steps.add(done.step, scalars, batches.identify(done.batch), done.batch.before)
+            norms = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
+            note(f"step {done.step} is skipped ({norms}): {skips} of at most {allowed}")
         if skips > allowed:
             raise DivergedError(
                 f"{self.directory}: {skips} steps were not finite, more than skip_budget = {allowed} (the last was "
-                f"step {taken.step}, loss {scalars['loss']}); {SKIPPED} there has their batches; raise skip_budget "
-                f"and start again, or train anew with a lower optimizer.learning-rate and --overwrite"
+                f"step {done.step}, loss {scalars['loss']}); {SKIPPED} lists their batches; raise skip_budget and "
+                f"start again, or train anew with a lower optimizer.learning-rate and --overwrite"
             )
 
-    def _look(self, state: TrainState, step: int, log: ScalarLog | None) -> HeldOut:
-        """What the lead finds on held-out clips; the others learn the metric."""
-        assert self.watch.held_out is not None
-        weights = self.placement.gather(state.weights)
-        found = self.watch.held_out(step, weights) if log is not None else HeldOut(0.0, {})
+    def _validate(self, state: TrainState, step: int, log: ScalarLog | None) -> Validation:
+        """Scores the weights on the lead process, and sends the metric to the others."""
+        assert self.monitor.validate is not None
+        weights = self.sharding.gather(state.weights)
+        scored = self.monitor.validate(step, weights) if log is not None else Validation(0.0, {})
         if log is not None:
-            log.write(step, found.scalars)
-            for name, picture in found.pictures.items():
+            log.write(step, scored.scalars)
+            for name, picture in scored.pictures.items():
                 log.image(step, name, picture)
-        return HeldOut(agree(found.metric, f"held out {step}"), found.scalars)
+        return Validation(agree(scored.metric, f"validation {step}"), scored.scalars)
 
 
 class _Clock:
-    """Seconds a step, rates, and the share of the time that steps waited for data, since the last lap."""
+    """Measures seconds per step, rates, and the share of time spent waiting for data since the last lap."""
 
     def __init__(self, batches: Prefetch, first: int) -> None:
         self._batches = batches
@@ -227,13 +231,13 @@ class _Clock:
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Around what is no training."""
+        """Stops the clock while something other than training runs."""
         began = time.monotonic()
         yield
         self._began += time.monotonic() - began
 
     def lap(self, step: int, per_step: tuple[str, float] | None) -> dict[str, float]:
-        """The scalars of the time since the last lap, or the start; ``step`` is the last one done."""
+        """Returns scalars for the time since the last lap or the start; ``step`` is the last finished step."""
         now, waited = time.monotonic(), self._batches.waited
         steps = step - self._step
         seconds = now - self._began

@@ -1,94 +1,222 @@
-"""Rules that say which axis of which array is cut over a mesh's ``fsdp`` axis, and what they give for a state.
+"""Runs the train step on one device, on many with replicated states, or on a mesh with a sharded state.
 
-An array is known by its path, such as ``params/blocks/rgb/fc1/kernel``. Optimizer moments and averaged parameters have
-their parameter's path as the end of their own, so they are cut as it is.
+A state is an ordinary tree of arrays under all three, so checkpoints do not depend on the sharding.
 """
 
-import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import prod
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import jax
-from jax.sharding import Mesh, NamedSharding
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding, SingleDeviceSharding
 from jax.sharding import PartitionSpec as P
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
-DATA, FSDP = "data", "fsdp"
-SMALL = 2**14  # elements; smaller arrays stay whole: gathering them costs more time than they take memory
+from rsjax.config import ConfigError, LoopConfig, require
+from rsjax.trainable import Extra, Params, Trainable
+from rsjax.training.sharding_rules import DATA, FSDP, SMALL, cut_elements, shardings, table
+from rsjax.training.state import TrainState, create_state
+from rsjax.training.step import Metrics
+
+Tree = TypeVar("Tree")  # a tree of arrays
+
+AXIS = "devices"  # of pmap
+
+Kind = Literal["jit", "pmap", "mesh"]
+Step = Callable[[TrainState, PyTree], tuple[TrainState, Metrics]]
+TrainStep = Callable[[Trainable[Any], LoopConfig, TrainState, PyTree, str | None], tuple[TrainState, Metrics]]
+
+
+def choose(loop: LoopConfig, local: int, processes: int) -> tuple[Kind, int]:
+    """Returns the kind of sharding that ``loop`` requires, and its number of devices.
+
+    Args:
+        local: devices per process.
+        processes: number of processes.
+
+    Raises:
+        ConfigError: the batch or the devices cannot be divided as required.
+    """
+    if loop.sharding == "auto" and processes == 1:
+        devices = max(n for n in range(1, local + 1) if loop.batch_size % (n * loop.accumulate) == 0)
+        return ("pmap", devices) if devices > 1 else ("jit", 1)
+    if loop.sharding == "jit":
+        require(processes == 1, f"sharding is jit, for one device, but {processes} processes train; set it to mesh")
+        return "jit", 1
+    devices = local * processes
+    if loop.batch_size % (devices * loop.accumulate):
+        parts = f" in accumulate = {loop.accumulate} parts" if loop.accumulate > 1 else ""
+        other = ", or set sharding to auto, which uses as many devices as divide it" if processes == 1 else ""
+        raise ConfigError(
+            f"batch_size {loop.batch_size} does not divide over {devices} devices{parts}; make it a multiple{other}"
+        )
+    require(devices % loop.fsdp == 0, f"fsdp {loop.fsdp} does not divide {devices} devices; make it one that does")
+    return "pmap" if loop.sharding == "pmap" else "mesh", devices
 
 
 @dataclass(frozen=True)
-class Rule:
-    """Arrays whose path has a match of ``pattern`` are cut along the first of ``axes`` that divides."""
+class Sharding:
+    """The layout of states and batches on devices, and the compiled step for it.
 
-    pattern: str
-    axes: tuple[int, ...]
+    Attributes:
+        kind: jit: one device. pmap: each device has the whole state and a part of the batch. mesh: likewise, but each
+            group of ``fsdp`` devices shares one state, split by :mod:`rsjax.training.sharding_rules`.
+        mesh: the devices, as data × fsdp; on one axis for jit and pmap.
+    """
+
+    kind: Kind
+    mesh: Mesh
+
+    @classmethod
+    def create(cls, loop: LoopConfig) -> "Sharding":
+        """Returns the sharding that ``loop`` requires, on the devices of all processes.
+
+        Raises:
+            ConfigError: the batch or the devices cannot be divided as required.
+        """
+        kind, devices = choose(loop, jax.local_device_count(), jax.process_count())
+        if kind == "mesh":
+            sizes = (devices // loop.fsdp, loop.fsdp)
+            return cls(kind, jax.make_mesh(sizes, (DATA, FSDP), axis_types=(AxisType.Auto,) * 2))
+        # pmap requires the devices of a process to be adjacent.
+        ordered = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+        return cls(kind, Mesh(np.array(ordered[:devices]), (AXIS,)))
+
+    def init(
+        self, model: Trainable[Any], loop: LoopConfig, start: Callable[[Params], Params] | None = None
+    ) -> TrainState:
+        """Returns :func:`rsjax.training.state.create_state`'s state, created with this sharding.
+
+        Args:
+            start: makes the initial parameters from fresh ones.
+
+        Raises:
+            ConfigError: no array can be split into ``loop.fsdp`` parts.
+        """
+        places = self._shardings(_shapes(model, loop))
+        initial = None
+        if start is not None:
+            fresh = jax.jit(lambda: model.init(jax.random.key(loop.seed)), out_shardings=places.params)()
+            initial = _place(start(fresh), places.params)
+
+        def make(initial: Params | None, extra: Extra) -> TrainState:
+            # Arrays from disk are arguments, so that they do not become constants of the compiled program.
+            state = create_state(model, loop, None if initial is None else lambda _: initial)
+            return state.replace(extra=extra)  # type: ignore[attr-defined]
+
+        extra = _place(model.init_extra(), places.extra)
+        return jax.jit(make, out_shardings=places, donate_argnums=(0, 1))(initial, extra)
+
+    def template(self, model: Trainable[Any], loop: LoopConfig) -> TrainState:
+        """Returns shapes, dtypes and shardings of :meth:`portable`'s state, to restore a checkpoint."""
+        shapes = _shapes(model, loop)
+        return jax.tree.map(
+            lambda x, place: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), shapes, self._shardings(shapes)
+        )
+
+    def compile(self, train_step: TrainStep, model: Trainable[Any], loop: LoopConfig) -> Step:
+        """Returns the compiled ``step(state, batch) -> (state, metrics)``, which donates its state.
+
+        Args:
+            train_step: :func:`rsjax.training.step.train_step`.
+        """
+        axis = AXIS if self.kind == "pmap" else None
+
+        def step(state: TrainState, batch: PyTree) -> tuple[TrainState, Metrics]:
+            return train_step(model, loop, state, batch, axis)
+
+        if self.kind == "jit":
+            return jax.jit(step, donate_argnums=0)
+        if self.kind == "pmap":
+            return jax.pmap(
+                step,
+                AXIS,
+                in_axes=(None, 0),
+                out_axes=None,
+                donate_argnums=0,
+                devices=list(self.mesh.devices.flat),
+            )
+        places, whole = self._shardings(_shapes(model, loop)), NamedSharding(self.mesh, P())
+        return jax.jit(step, donate_argnums=0, in_shardings=(places, self._rows), out_shardings=(places, whole))
+
+    def put_batch(self, batch: PyTree) -> PyTree:
+        """Puts this process's part of the global batch on its devices, split along the first axis."""
+        if self.kind == "jit":
+            return jax.device_put(batch, SingleDeviceSharding(self.mesh.devices.flat[0]))
+        if self.kind == "pmap":
+            local = self.mesh.local_mesh
+            split = jax.tree.map(lambda x: np.reshape(x, (local.size, -1, *np.shape(x)[1:])), batch)
+            return jax.device_put(split, NamedSharding(local, P(AXIS)))
+        return jax.tree.map(lambda x: jax.make_array_from_process_local_data(self._rows, np.asarray(x)), batch)
+
+    @property
+    def shares(self) -> bool:
+        """Whether several devices share one state."""
+        return self.kind == "mesh" and self.mesh.shape[FSDP] > 1
+
+    def scalars(self, metrics: Metrics) -> dict[str, float]:
+        """Returns a step's metrics as numbers, after waiting for the step."""
+        return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+    def portable(self, state: TrainState) -> TrainState:
+        """Returns the state as global arrays of all processes, for a checkpoint. No copy: the next step donates it."""
+        if self.kind == "jit" or jax.process_count() == 1:
+            return state
+        return jax.tree.map(self._shared, state)
+
+    def adopt(self, state: TrainState) -> TrainState:
+        """Returns a state of numpy arrays or another sharding in this sharding, without a copy if it already is."""
+        return _place(state, self._shardings(state))
+
+    def gather(self, tree: Tree) -> Tree:
+        """Returns a copy of a state, or of a part of one, on this process's first device, which it must fit on."""
+        first, whole = SingleDeviceSharding(jax.local_devices()[0]), NamedSharding(self.mesh, P())
+
+        def one(x: jax.Array) -> jax.Array:
+            return jax.device_put(x.addressable_data(0) if x.is_fully_replicated else x, first, may_alias=False)
+
+        if not all(x.is_fully_replicated or x.is_fully_addressable for x in jax.tree.leaves(tree)):
+            tree = jax.jit(lambda tree: tree, out_shardings=whole)(tree)  # other processes have parts
+        return jax.tree.map(one, tree)
+
+    @property
+    def _rows(self) -> NamedSharding:
+        return NamedSharding(self.mesh, P((DATA, FSDP)))
+
+    def _shared(self, x: jax.Array) -> jax.Array:
+        if not x.is_fully_addressable:
+            return x
+        return multihost_utils.host_local_array_to_global_array(x, self.mesh, P())
+
+    def _shardings(self, tree: PyTree) -> PyTree:
+        if self.kind == "mesh":
+            rows, parts = table(tree, self.mesh.shape[FSDP]), self.mesh.shape[FSDP]
+            large = any(np.prod(row.shape) >= SMALL for row in rows)
+            require(
+                parts == 1 or not large or cut_elements(rows) > 0,
+                f"fsdp {parts} divides no axis of this model's arrays; choose one that divides its width",
+            )
+            return shardings(tree, self.mesh)
+        one = SingleDeviceSharding(self.mesh.devices.flat[0])
+        place = one if self.kind == "jit" else NamedSharding(self.mesh, P())
+        return jax.tree.map(lambda _: place, tree)
 
 
-# The first rule that matches decides. Arrays that none matches are cut along their largest axis that divides.
-RULES = (
-    Rule(r"^extra/", ()),  # LPIPS's weights and averages: read whole, never trained
-    # Blocks are stacked on axis 0, which a scan walks along: cut there, each turn would read from one device.
-    Rule(r"(^|/)blocks/.*/kernel$", (2, 1)),  # (blocks, in, out)
-    Rule(r"(^|/)blocks/.*/(bias|scale)$", (1,)),
-    Rule(r"(^|/)(embedding|pos_embed)$", (-1,)),  # width: a look-up reads its part of every row
-    Rule(r"(^|/)kernel$", (-1, -2)),  # heads and convolutions: output channels, else input channels
-)
+def _shapes(model: Trainable[Any], loop: LoopConfig) -> TrainState:
+    return jax.eval_shape(lambda: create_state(model, loop))
 
 
-@dataclass(frozen=True)
-class Row:
-    """One array of a state: where it is, and how it lies."""
+def _place(tree: Tree, places: PyTree) -> Tree:
+    """Puts arrays of the host or of any devices into the shardings ``places``."""
 
-    path: str
-    shape: tuple[int, ...]
-    spec: P
+    def put(x: ArrayLike, place: jax.sharding.Sharding) -> jax.Array:
+        if place.is_fully_addressable or (isinstance(x, jax.Array) and not x.is_fully_addressable):
+            return jax.device_put(x, place)
+        # All processes have the same array, so each takes its own part; device_put would also compare them.
+        host = np.asarray(x)
+        return jax.make_array_from_callback(host.shape, place, lambda index: host[index])
 
-
-def spec_of(path: str, shape: tuple[int, ...], parts: int) -> P:
-    """How the array at ``path`` is cut into ``parts``; ``P()`` where it stays whole."""
-    if parts == 1 or prod(shape) < SMALL:
-        return P()
-    for rule in RULES:
-        if re.search(rule.pattern, path):
-            axes = [axis % len(shape) for axis in rule.axes if -len(shape) <= axis < len(shape)]
-            break
-    else:
-        axes = sorted(range(len(shape)), key=lambda axis: -shape[axis])
-    for axis in axes:
-        if shape[axis] % parts == 0:
-            return P(*[None] * axis, FSDP)
-    return P()
-
-
-def table(tree: Any, parts: int) -> list[Row]:
-    """Every array of a tree of arrays or their shapes, with its cut into ``parts``."""
-    paths = ((_path(keys), leaf) for keys, leaf in jax.tree.leaves_with_path(tree))
-    return [Row(path, leaf.shape, spec_of(path, leaf.shape, parts)) for path, leaf in paths]
-
-
-def shown(rows: list[Row]) -> str:
-    """The table as text: path, shape with the cut axis in brackets, and the share of all elements that is cut."""
-    lines = [f"{row.path:<72} {_shape(row)}" for row in rows]
-    total = sum(prod(row.shape) for row in rows)
-    return "\n".join([*lines, f"{total:,} elements, {cut_elements(rows) / total:.1%} of them cut"])
-
-
-def cut_elements(rows: list[Row]) -> int:
-    """How many elements lie in arrays that are cut."""
-    return sum(prod(row.shape) for row in rows if row.spec != P())
-
-
-def shardings(tree: Any, mesh: Mesh) -> Any:
-    """The same tree of :class:`NamedSharding`, as the rules say for the mesh's ``fsdp`` axis."""
-    parts = mesh.shape[FSDP]
-    return jax.tree.map_with_path(lambda keys, leaf: NamedSharding(mesh, spec_of(_path(keys), leaf.shape, parts)), tree)
-
-
-def _path(keys: Any) -> str:
-    return jax.tree_util.keystr(keys, simple=True, separator="/")
-
-
-def _shape(row: Row) -> str:
-    cut = len(row.spec) - 1  # a spec ends with the axis that is cut
-    return f"({', '.join(f'[{size}]' if axis == cut else str(size) for axis, size in enumerate(row.shape))})"
+    return jax.tree.map(put, tree, places)

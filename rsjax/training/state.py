@@ -1,4 +1,4 @@
-"""The training state and its optimizer."""
+"""The training state, the optimizer and the learning rate schedule."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,31 +7,32 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.tree_util import KeyPath
 from jaxtyping import Array, Int32
 
 from rsjax.config import LoopConfig, OptimizerConfig
-from rsjax.training.objectives import Objective
+from rsjax.trainable import Extra, Params, Trainable
 
 
 @struct.dataclass
 class TrainState:
-    """Everything that a step reads and writes; what a checkpoint holds, with the place in the data."""
+    """Everything that a step reads and writes. Checkpoints contain it and the position in the data."""
 
     step: Int32[Array, ""]
-    params: Any
-    opt_state: Any
-    ema: Any  # averaged parameters, or None
-    extra: Any  # what else the objective carries from step to step, or None
-    skipped: Int32[Array, ""]  # steps that were left out, for their loss or gradient was not finite
+    params: Params
+    opt_state: optax.OptState
+    ema: Params | None  # averaged parameters, if loop.ema is on
+    extra: Extra  # what else the model carries from step to step
+    skipped: Int32[Array, ""]  # number of skipped steps, whose loss or gradient was not finite
 
     @property
-    def weights(self) -> Any:
-        """The parameters that later stages use: the averaged ones where they are kept."""
+    def weights(self) -> Params:
+        """The parameters that later stages use: the averaged ones if they exist."""
         return self.params if self.ema is None else self.ema
 
 
 def learning_rate(loop: LoopConfig) -> optax.Schedule:
-    """Warm-up and schedule over the whole run, or over each stretch between ``loop.restarts``."""
+    """Returns the learning rate schedule with warm-up, which starts again at each of ``loop.restarts``."""
     begins = [0, *loop.restarts]
     ends = [*loop.restarts, loop.steps]
     stretches = [_schedule(loop.optimizer, max(end - begin, 1)) for begin, end in zip(begins, ends, strict=True)]
@@ -55,7 +56,7 @@ def _schedule(opt: OptimizerConfig, steps: int) -> optax.Schedule:
 
 
 def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
-    """Clipping by the global norm (where it is on), then AdamW or Muon."""
+    """Returns the optimizer: clipping by the global norm (if it is on), then AdamW or Muon."""
     opt = loop.optimizer
     if opt.kind == "muon":
         inner = optax.contrib.muon(
@@ -72,24 +73,26 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(opt.grad_clip) if opt.grad_clip else optax.identity(), inner)
 
 
-def _block_matrices(params: Any) -> Any:
-    """Which parameters are matrices inside blocks, (blocks, in, out); None for embeddings, heads, biases and norms."""
+def _block_matrices(params: Params) -> Params:
+    """Marks the matrices inside blocks, (blocks, in, out), for Muon; None for embeddings, heads, biases and norms."""
 
-    def axes(path: Any, value: Any) -> optax.contrib.MuonDimensionNumbers | None:
-        names = [key.key for key in path]
+    def axes(path: KeyPath, value: jax.Array) -> optax.contrib.MuonDimensionNumbers | None:
+        names = [getattr(key, "key", "") for key in path]
         matrix = "blocks" in names and names[-1] == "kernel"
         return optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2) if matrix else None
 
     return jax.tree.map_with_path(axes, params)
 
 
-def create_state(objective: Objective, loop: LoopConfig, start: Callable[[Any], Any] | None = None) -> TrainState:
-    """The state before the first step; a function of the configuration alone.
+def create_state(
+    model: Trainable[Any], loop: LoopConfig, start: Callable[[Params], Params] | None = None
+) -> TrainState:
+    """Returns the state before the first step, which depends only on the configuration and ``start``.
 
     Args:
-        start: fresh parameters to those that training begins with; the fresh ones if not given.
+        start: makes the initial parameters from fresh ones; None: fresh ones are used.
     """
-    params = objective.init(jax.random.key(loop.seed))
+    params = model.init(jax.random.key(loop.seed))
     if start is not None:
         params = start(params)
     ema = jax.tree.map(jnp.copy, params) if loop.ema else None  # a copy: donated buffers must not be shared
@@ -98,6 +101,6 @@ def create_state(objective: Objective, loop: LoopConfig, start: Callable[[Any], 
         params=params,
         opt_state=make_optimizer(loop).init(params),
         ema=ema,
-        extra=objective.init_extra(),
+        extra=model.init_extra(),
         skipped=jnp.int32(0),
     )

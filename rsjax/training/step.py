@@ -1,116 +1,114 @@
-"""The one train step, for the tokenizer and the world model, for one device and many."""
+"""The train step of the tokenizer and the world model, on one device or many."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float
 
 from rsjax.config import LoopConfig
-from rsjax.models.roboscape import losses
-from rsjax.models.roboscape.losses import Term
-from rsjax.training.objectives import Objective, Surroundings
+from rsjax.trainable import Params, Scalar, StepContext, Term, Trainable, combine
 from rsjax.training.state import TrainState, learning_rate, make_optimizer
 
-Metrics = dict[str, Float[Array, ""]]
+Metrics: TypeAlias = dict[str, Scalar]
+B = TypeVar("B")
 
 
 def train_step(
-    objective: Objective, loop: LoopConfig, state: TrainState, batch: Any, axis_name: str | None = None
+    model: Trainable[B], loop: LoopConfig, state: TrainState, batch: B, axis_name: str | None = None
 ) -> tuple[TrainState, Metrics]:
-    """One optimizer step; a pure function, the same under jit, pmap and jit over a sharded mesh.
+    """Does one optimizer step. A pure function, the same under jit, pmap and jit over a sharded mesh.
 
-    Where the loss or the gradient is not finite, the state stays as it was, but for ``step``, ``skipped`` and the place
-    in the learning rate's schedule.
+    If the loss or the gradient is not finite, the step is skipped: of the state only ``step``, ``skipped`` and the
+    position in the learning rate schedule change.
 
     Args:
-        objective: static; what is trained.
-        loop: static; optimizer, averaging, seed, and the parts that the batch is computed in.
-        state: replicated where there are several devices.
-        batch: this device's part.
-        axis_name: of pmap, over which sums and weights are added (separately); None where XLA sees the whole batch.
+        model: static; the model to train.
+        loop: static; settings of the optimizer, averaging, seed and accumulation.
+        state: replicated under pmap.
+        batch: this device's part of the batch.
+        axis_name: pmap's axis, over which sums and weights are added separately; None if XLA sees the whole batch.
 
     Returns:
-        The new state, and float32 scalars: the objective, its terms, the norms of gradient, parameters and update, and
-        how many steps were left out so far.
+        The new state, and float32 scalars: the loss, its terms, the norms of gradient, parameters and update, the
+        learning rate, and the number of skipped steps so far.
     """
-    # Keys follow from the step alone, so a resumed run draws what an uninterrupted one would have drawn.
+    # Keys depend only on the step, so a resumed run draws the same numbers as an uninterrupted one.
     key = jax.random.fold_in(jax.random.key(loop.seed + 1), state.step)
     total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
-    around = Surroundings(state.step, state.extra, axis_name)
+    context = StepContext(state.step, state.extra, axis_name)
 
-    def terms(params: Any, part: Any) -> dict[str, Term]:
-        return objective.terms(params, part, key, around)
+    def terms(params: Params, part: B) -> dict[str, Term]:
+        return model.loss_terms(params, part, key, context)
 
-    grads, metrics = _gradients(terms, objective.weights, total, state.params, batch, loop.accumulate)
+    grads, metrics = _gradients(terms, model.loss_weights, total, state.params, batch, loop.accumulate)
     grads, metrics = total(grads), total(metrics)
     grad_norm = optax.global_norm(grads)
-    sound = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
+    finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
 
     updates, opt_state = make_optimizer(loop).update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     ema = state.ema
     if ema is not None:
-        # A young average would remember the initial weights: its decay grows with its age.
+        # The decay grows with the average's age; otherwise a young average would consist of the initial weights.
         decay = jnp.minimum(loop.ema, (1.0 + state.step) / (10.0 + state.step))
         ema = optax.incremental_update(params, ema, 1 - decay)
-    new = (params, opt_state, ema, objective.next_extra(state.extra, metrics))
+    new = (params, opt_state, ema, model.next_extra(state.extra, metrics))
     old = (state.params, state.opt_state, state.ema, state.extra)
-    params, opt_state, ema, extra = jax.tree.map(lambda new, old: jnp.where(sound, new, old), new, old)
-    # A step that was left out counts in the schedule of the learning rate, or the stages' restarts would come late.
+    params, opt_state, ema, extra = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, old)
+    # The learning rate schedule counts skipped steps; otherwise its restarts would come late.
     opt_state = optax.tree_utils.tree_set(opt_state, _is_schedule, count=state.step + 1)
-    skipped = state.skipped + ~sound
+    skipped = state.skipped + ~finite
     metrics |= {
         "grad_norm": grad_norm,
         "param_norm": optax.global_norm(params),
-        "update_norm": jnp.where(sound, optax.global_norm(updates), 0.0),
+        "update_norm": jnp.where(finite, optax.global_norm(updates), 0.0),
         "learning_rate": jnp.float32(learning_rate(loop)(state.step)),
         "skipped": skipped.astype(jnp.float32),
     }
     return TrainState(state.step + 1, params, opt_state, ema, extra, skipped), metrics
 
 
-def _is_schedule(path: Any, value: Any) -> bool:
+def _is_schedule(path: tuple[object, ...], value: object) -> bool:
     return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
 
 
 def _gradients(
-    terms: Callable[[Any, Any], dict[str, Term]],
+    terms: Callable[[Params, B], dict[str, Term]],
     weights: dict[str, float],
-    total: Callable[[Any], Any],
-    params: Any,
-    batch: Any,
+    total: Callable[[Scalar], Scalar],
+    params: Params,
+    batch: B,
     parts: int,
-) -> tuple[Any, Metrics]:
-    """This device's share of the gradient, and of the objective and its terms.
+) -> tuple[Params, Metrics]:
+    """Returns this device's share of the gradient, and of the loss and its terms.
 
-    A batch in several parts gives the same, to rounding: every part is divided by the weights of the whole batch, which
-    are found first (no network is run for them). Only what the tokenizer finds over a batch (its codes' entropy, the
-    discriminator's normalisation, LeCAM's averages) is then a part's own.
+    Splitting a batch into parts changes only rounding: each part is divided by the weights of the whole batch, which
+    are computed first (XLA removes the network from that computation). Exceptions are the tokenizer's batch statistics,
+    which are computed for each part: its codes' entropy, the discriminator's batch norm, LeCAM's averages.
     """
 
-    def share(params: Any, part: Any, whole: dict[str, Float[Array, ""]] | None) -> tuple[Float[Array, ""], Metrics]:
-        found = terms(params, part)
+    def share(params: Params, part: B, whole: dict[str, Scalar] | None) -> tuple[Scalar, Metrics]:
+        values = terms(params, part)
         if whole is not None:
-            found = {name: (value, whole[name]) for name, (value, _) in found.items()}
-        loss, shares = losses.combine(found, weights, total)
+            values = {name: (value, whole[name]) for name, (value, _) in values.items()}
+        loss, shares = combine(values, weights, total)
         return loss, {"loss": loss, **shares}
 
     gradient = jax.grad(share, has_aux=True)
     if parts == 1:
         return gradient(params, batch, None)
-    # Every parts-th row, so that rows that lie on one device of a mesh stay there.
-    cut = jax.tree.map(lambda x: x.reshape(-1, parts, *x.shape[1:]).swapaxes(0, 1), batch)
-    of_parts = jax.lax.map(lambda part: {name: weight for name, (_, weight) in terms(params, part).items()}, cut)
+    # A part takes every parts-th row, so that rows stay on their device of a mesh.
+    stacked = jax.tree.map(lambda x: x.reshape(-1, parts, *x.shape[1:]).swapaxes(0, 1), batch)
+    of_parts = jax.lax.map(lambda part: {name: weight for name, (_, weight) in terms(params, part).items()}, stacked)
     whole = jax.tree.map(lambda x: jnp.sum(x, axis=0), of_parts)
 
-    def add(carry: Any, part: Any) -> tuple[Any, None]:
+    def add(carry: tuple[Params, Metrics], part: B) -> tuple[tuple[Params, Metrics], None]:
         return jax.tree.map(jnp.add, carry, gradient(params, part, whole)), None
 
     zeros = jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype),
-        jax.eval_shape(gradient, params, jax.tree.map(lambda x: x[0], cut), whole),
+        jax.eval_shape(gradient, params, jax.tree.map(lambda x: x[0], stacked), whole),
     )
-    return jax.lax.scan(add, zeros, cut)[0]
+    return jax.lax.scan(add, zeros, stacked)[0]

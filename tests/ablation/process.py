@@ -20,7 +20,7 @@ from rsjax.ablation import sweep
 from rsjax.ablation.grid import Choice
 from tests.ablation import toy
 
-AXES = ("loss.keypoints=True,False", "tokenizer_train.entropy=0.1,0.2", "model.depth=True,False")
+AXES = ("model.loss.use_keypoints=True,False", "tokenizer_train.entropy_weight=0.1,0.2", "model.use_depth=True,False")
 SCENARIOS = ("together", "together", "tokens", "link")
 
 

@@ -26,17 +26,17 @@ from rsjax.ablation.grid import (
     values_of,
 )
 from rsjax.config import ConfigError, presets
-from rsjax.config.leaves import leaves
+from rsjax.config.leaves import leaves, with_values
 from tests.ablation import toy
 
 DEBUG = presets.debug()
 VALUES = {
-    "model.depth": st.booleans(),
-    "loss.keypoints": st.booleans(),
-    "loss.depth": st.floats(0, 10),
-    "loss.gamma": st.floats(0, 100),
-    "loss.num_keypoints": st.integers(1, DEBUG.sim.tracks),
-    "sample.unmask": st.sampled_from(["random", "greedy"]),
+    "model.use_depth": st.booleans(),
+    "model.loss.use_keypoints": st.booleans(),
+    "model.loss.depth_weight": st.floats(0, 10),
+    "model.loss.gamma": st.floats(0, 100),
+    "model.loss.num_keypoints": st.integers(1, DEBUG.sim.tracks),
+    "model.sample.unmask": st.sampled_from(["random", "greedy"]),
     "train.start_from": st.text("ab /é|,=", max_size=4).map(lambda text: f"x{text.replace(',', '')}".strip()),
 }
 grids = st.lists(st.sampled_from(sorted(VALUES)), unique=True, max_size=3).flatmap(
@@ -72,7 +72,10 @@ def test_names_are_safe_for_file_systems(values: dict[str, str], seed: int) -> N
 def test_names_that_had_to_be_changed_stay_apart() -> None:
     assert cell_name({"a": "x/y"}, 0) != cell_name({"a": "x y"}, 0) != cell_name({"a": "x-y"}, 0)
     assert cell_name({"a": "x" * 300}, 0) != cell_name({"a": "x" * 301}, 0)
-    assert cell_name({"loss.gamma": 5.0, "model.depth": True}, 3) == "loss.gamma=5.0,model.depth=True,seed=3"
+    assert (
+        cell_name({"model.loss.gamma": 5.0, "model.use_depth": True}, 3)
+        == "model.loss.gamma=5.0,model.use_depth=True,seed=3"
+    )
 
 
 def test_without_axes_there_is_a_cell_per_seed() -> None:
@@ -80,8 +83,8 @@ def test_without_axes_there_is_a_cell_per_seed() -> None:
 
 
 def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
-    cells = toy.grid(*DEFAULT_AXES).cells.values()
-    assert [(c.model.depth, c.loss.keypoints) for c in cells] == list(product((True, False), repeat=2))
+    models = map(toy.roboscape, toy.grid(*DEFAULT_AXES).cells.values())
+    assert [(m.use_depth, m.loss.use_keypoints) for m in models] == list(product((True, False), repeat=2))
 
 
 def test_the_named_fields_exist() -> None:
@@ -98,11 +101,11 @@ def test_a_value_as_printed_is_read_back() -> None:
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
-        ("model.depth", "Tru", "model.depth is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
-        ("sample.unmask", "greed", "did you mean 'greedy'? (choices: random, greedy)"),
-        ("loss.gamma", "five", "loss.gamma is 'five' in the grid; it takes a number"),
-        ("loss.gamma", "nan", "it takes a number"),
-        ("loss.num_keypoints", "8.5", "it takes a whole number"),
+        ("model.use_depth", "Tru", "model.use_depth is 'Tru' in the grid; did you mean 'True'? (choices: True, False)"),
+        ("model.sample.unmask", "greed", "did you mean 'greedy'? (choices: random, greedy)"),
+        ("model.loss.gamma", "five", "model.loss.gamma is 'five' in the grid; it takes a number"),
+        ("model.loss.gamma", "nan", "it takes a number"),
+        ("model.loss.num_keypoints", "8.5", "it takes a whole number"),
         ("tokenizer.channel_multipliers", "1", "takes several values"),
     ],
 )
@@ -115,15 +118,15 @@ def test_a_value_of_another_type_is_refused(name: str, text: str, line: str) -> 
 @pytest.mark.parametrize(
     ("texts", "line"),
     [
-        (["loss.gama=1"], "no field 'loss.gama'; did you mean 'loss.gamma'?"),
-        (["gamma=1"], "did you mean 'loss.gamma'?"),
-        (["loss.gamma"], "write FIELD=VALUE,VALUE"),
-        (["loss.gamma="], "write FIELD=VALUE,VALUE"),
-        (["loss.gamma=1,1.0"], "a value is repeated"),
-        (["loss.gamma=1", "--loss.gamma=2"], "loss.gamma has an axis already"),
+        (["loss.gama=1"], "no field 'loss.gama'; did you mean 'model.loss.gamma'?"),
+        (["gamma=1"], "did you mean 'model.loss.gamma'?"),
+        (["model.loss.gamma"], "write FIELD=VALUE,VALUE"),
+        (["model.loss.gamma="], "write FIELD=VALUE,VALUE"),
+        (["model.loss.gamma=1,1.0"], "a value is repeated"),
+        (["model.loss.gamma=1", "--model.loss.gamma=2"], "model.loss.gamma has an axis already"),
         (["train.seed=1,2"], "seeds have their own option, --seeds 1 2"),
         (["name=a"], "the preset's name has no effect"),
-        (["loss.num-keypoints=1,x"], "loss.num_keypoints is 'x' in the grid; it takes a whole number"),
+        (["model.loss.num-keypoints=1,x"], "model.loss.num_keypoints is 'x' in the grid; it takes a whole number"),
     ],
 )
 def test_each_mistake_in_an_axis_gets_a_line(texts: list[str], line: str) -> None:
@@ -134,11 +137,9 @@ def test_each_mistake_in_an_axis_gets_a_line(texts: list[str], line: str) -> Non
 
 def test_cells_that_cannot_run_are_named_before_any_runs() -> None:
     with pytest.raises(ConfigError) as caught:
-        toy.grid("loss.num_keypoints=8,65", "loss.keypoints=True,False")
-    assert "1 of 4 cells cannot run; the first is loss.num_keypoints=65,loss.keypoints=True,seed=0: " in str(
-        caught.value
-    )
-    assert "only sim.tracks = 64 are tracked" in str(caught.value)
+        toy.grid("train.batch_size=2,3", "train.accumulate=1,2")
+    line = "1 of 4 cells cannot run; the first is train.batch_size=3,train.accumulate=2,seed=0: batch_size 3 does not"
+    assert line in str(caught.value)
 
 
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,), (2**32,)])
@@ -148,10 +149,11 @@ def test_seeds_are_distinct_and_in_range(seeds: tuple[int, ...]) -> None:
 
 
 def test_a_weight_of_a_term_that_is_off_is_reported() -> None:
-    assert repeated_cells(toy.grid("loss.gamma=4,5", "loss.keypoints=True,False")) == [
-        "loss.gamma has no effect where loss.keypoints is False; cells that differ in it alone are the same"
+    gamma, switch = "model.loss.gamma", "model.loss.use_keypoints"
+    assert repeated_cells(toy.grid(f"{gamma}=4,5", f"{switch}=True,False")) == [
+        f"{gamma} has no effect where {switch} is False; cells that differ in it alone are the same"
     ]
-    assert not repeated_cells(toy.grid("loss.gamma=4,5", "model.depth=True,False"))
+    assert not repeated_cells(toy.grid("model.loss.gamma=4,5", "model.use_depth=True,False"))
 
 
 def test_cells_are_chosen_by_number_name_and_pattern() -> None:
@@ -159,7 +161,7 @@ def test_cells_are_chosen_by_number_name_and_pattern() -> None:
     assert list(Choice().of(names)) == names
     assert list(Choice(number=3).of(names)) == [names[3]]
     assert list(Choice(only=("*seed=1", names[0])).of(names)) == [names[0], *names[4:]]
-    assert list(Choice(only=("*seed=1",), skip=("model.depth=True,*",)).of(names)) == names[6:]
+    assert list(Choice(only=("*seed=1",), skip=("model.use_depth=True,*",)).of(names)) == names[6:]
     assert Choice(number=0, only=("*seed=1",)).of(names) == ()
     for choice, line in (
         (Choice(number=8), "cell 8 is not in this grid; its cells are 0 … 7"),
@@ -177,56 +179,56 @@ def add(out: Path, grid: Grid) -> tuple[str, ...]:
 
 def test_a_grid_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read_grid(tmp_path) is None
-    grid = toy.grid("loss.gamma=4,5", "sample.unmask=greedy", seeds=(0, 7))
+    grid = toy.grid("model.loss.gamma=4,5", "model.sample.unmask=greedy", seeds=(0, 7))
     assert add(tmp_path, grid) == tuple(grid.cells)
     assert read_grid(tmp_path) == grid
-    assert grid.fields == ("loss.gamma", "sample.unmask")
+    assert grid.fields == ("model.loss.gamma", "model.sample.unmask")
     assert json.loads((tmp_path / "grid.json").read_text())["versions"]["jax"]
 
 
 def test_more_values_fields_and_seeds_add_cells_and_keep_those_there_are(tmp_path: Path) -> None:
-    first = toy.grid("model.depth=True,False")
+    first = toy.grid("model.use_depth=True,False")
     add(tmp_path, first)
-    names = add(tmp_path, toy.grid("loss.gamma=4,5", seeds=(0, 1)))
-    assert names[0] == "model.depth=True,loss.gamma=4.0,seed=0"
-    assert names[1] == "model.depth=True,seed=0", "γ is 5 already: that cell is there"
+    names = add(tmp_path, toy.grid("model.loss.gamma=4,5", seeds=(0, 1)))
+    assert names[0] == "model.use_depth=True,model.loss.gamma=4.0,seed=0"
+    assert names[1] == "model.use_depth=True,seed=0", "γ is 5 already: that cell is there"
     grid = read_grid(tmp_path)
     assert grid is not None
-    assert list(grid.cells) == ["model.depth=True,seed=0", "model.depth=False,seed=0", names[0], *names[2:]]
+    assert list(grid.cells) == ["model.use_depth=True,seed=0", "model.use_depth=False,seed=0", names[0], *names[2:]]
     assert list(grid.cells.values())[:2] == list(first.cells.values())
-    assert grid.fields == ("model.depth", "loss.gamma")
+    assert grid.fields == ("model.use_depth", "model.loss.gamma")
     assert len(set(grid.cells.values())) == len(grid.cells) == 5
 
 
 def test_cells_of_several_bases_keep_their_values_and_names_apart(tmp_path: Path) -> None:
     """A field that was varied may differ in the configuration; each cell still has the value it was made with."""
-    add(tmp_path, toy.grid("loss.gamma=4,5"))
+    add(tmp_path, toy.grid("model.loss.gamma=4,5"))
     for gamma in (6.0, 7.0):
-        base = replace(DEBUG, loss=replace(DEBUG.loss, gamma=gamma))
-        add(tmp_path, toy.grid("model.depth=True", base=base))
+        base = with_values(DEBUG, {"model.loss.gamma": gamma})
+        add(tmp_path, toy.grid("model.use_depth=True", base=base))
     grid = read_grid(tmp_path)
     assert grid is not None
-    assert [config.loss.gamma for config in grid.cells.values()] == [4.0, 5.0, 6.0, 7.0]
+    assert [toy.roboscape(config).loss.gamma for config in grid.cells.values()] == [4.0, 5.0, 6.0, 7.0]
 
 
 def test_another_configuration_is_refused_by_name_and_nothing_changes(tmp_path: Path) -> None:
-    add(tmp_path, toy.grid("loss.gamma=4,5"))
+    add(tmp_path, toy.grid("model.loss.gamma=4,5"))
     before = (tmp_path / "grid.json").read_bytes()
-    wide = replace(DEBUG, model=replace(DEBUG.model, width=64))
+    wide = with_values(DEBUG, {"model.width": 64})
     with pytest.raises(ConfigError) as caught:
-        add(tmp_path, toy.grid("loss.gamma=4,5", base=wide))
+        add(tmp_path, toy.grid("model.loss.gamma=4,5", base=wide))
     assert "another configuration (model.width is 32 there, 64 here); choose another --out" in str(caught.value)
     assert (tmp_path / "grid.json").read_bytes() == before
 
 
 def test_how_runs_are_carried_out_and_the_seed_may_differ(tmp_path: Path) -> None:
     base = replace(DEBUG, train=replace(DEBUG.train, log_every=1, seed=9))
-    grid, names = merge(toy.grid("loss.gamma=4"), toy.grid("loss.gamma=4", base=base), tmp_path)
+    grid, names = merge(toy.grid("model.loss.gamma=4"), toy.grid("model.loss.gamma=4", base=base), tmp_path)
     assert list(grid.cells) == list(names)
 
 
 def test_other_versions_of_the_libraries_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    grid = toy.grid("loss.gamma=4")
+    grid = toy.grid("model.loss.gamma=4")
     add(tmp_path, replace(grid, versions={"jax": "0.1"}))
     assert not capsys.readouterr().out
     add(tmp_path, grid)

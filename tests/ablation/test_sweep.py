@@ -19,6 +19,7 @@ from rsjax.files import lock
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import STAGES, Run
 from tests.ablation import process, toy
+from tests.models.toy_family import ToyConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -64,7 +65,7 @@ def fail_in(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) ->
 
 
 def test_every_cell_is_a_whole_run_and_what_is_shared_is_made_once(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5", "tokenizer_train.entropy=0.1,0.2", seeds=(0, 1, 2))
+    grid = toy.grid("model.loss.gamma=4,5", "tokenizer_train.entropy_weight=0.1,0.2", seeds=(0, 1, 2))
     assert sweep_in(tmp_path, grid) == ["finished"] * 12
     assert counts(tmp_path) == {"collect": 1, "tokenizer": 2, "tokens": 2} | dict.fromkeys(STAGES[3:], 12)
     for there in runs(tmp_path, grid):
@@ -78,11 +79,15 @@ def test_every_cell_is_a_whole_run_and_what_is_shared_is_made_once(tmp_path: Pat
 
 
 def test_the_table_is_numpys_over_the_metrics_of_the_runs(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5", seeds=(0, 1, 2))
+    grid = toy.grid("model.loss.gamma=4,5", seeds=(0, 1, 2))
     sweep_in(tmp_path, grid)
     rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
     for row in rows:
-        cells = [config for config in grid.cells.values() if config.loss.gamma == row["values"]["loss.gamma"]]
+        cells = [
+            config
+            for config in grid.cells.values()
+            if toy.roboscape(config).loss.gamma == row["values"]["model.loss.gamma"]
+        ]
         scores = [toy.psnr(config) for config in cells]
         assert row["psnr"] == {"mean": np.mean(scores), "std": np.std(scores, ddof=1), "n": 3}
     assert {path.name for path in (tmp_path / "out").glob("table.*")} == {
@@ -91,7 +96,7 @@ def test_the_table_is_numpys_over_the_metrics_of_the_runs(tmp_path: Path) -> Non
 
 
 def test_the_same_command_again_does_nothing(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5")
+    grid = toy.grid("model.loss.gamma=4,5")
     sweep_in(tmp_path, grid)
     kept = {path: time for path, time in files(tmp_path).items() if "seed=0" in str(path) or "shared" in str(path)}
     assert sweep_in(tmp_path, grid) == ["finished", "finished"]
@@ -101,7 +106,7 @@ def test_the_same_command_again_does_nothing(tmp_path: Path) -> None:
 def test_a_cell_that_fails_is_recorded_and_the_others_run_then_it_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    grid = toy.grid("loss.gamma=4,5,6")
+    grid = toy.grid("model.loss.gamma=4,5,6")
     failing = list(grid.cells)[1]
     with monkeypatch.context() as patch:
         fail_in(patch, failing, ZeroDivisionError("by\nzero"))
@@ -120,7 +125,7 @@ def test_a_cell_that_fails_is_recorded_and_the_others_run_then_it_is_tried_again
 def test_what_ends_the_command_is_not_the_cells_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    grid = toy.grid("loss.gamma=4,5,6")
+    grid = toy.grid("model.loss.gamma=4,5,6")
     with monkeypatch.context() as patch:
         fail_in(patch, list(grid.cells)[1], error)
         with pytest.raises(type(error)):
@@ -132,17 +137,25 @@ def test_what_ends_the_command_is_not_the_cells_failure(
 
 def test_cells_that_are_only_decoded_otherwise_share_the_world_model(tmp_path: Path) -> None:
     """Also with cells of an earlier command, which trained it for themselves."""
-    sweep_in(tmp_path, toy.grid("loss.gamma=4,5"))
+    sweep_in(tmp_path, toy.grid("model.loss.gamma=4,5"))
     assert counts(tmp_path)["world_model"] == 2
-    sweep_in(tmp_path, toy.grid("loss.gamma=4,5", "sample.steps=2,3,4"))
+    sweep_in(tmp_path, toy.grid("model.loss.gamma=4,5", "model.sample.steps=2,3,4"))
     assert counts(tmp_path)["world_model"] == 2, "the earlier cells have it"
-    sweep_in(tmp_path, toy.grid("loss.gamma=6", "sample.steps=2,3,4"))
+    sweep_in(tmp_path, toy.grid("model.loss.gamma=6", "model.sample.steps=2,3,4"))
     assert counts(tmp_path)["world_model"] == 3
-    assert states(tmp_path, toy.grid("loss.gamma=4,5")) == ["finished", "finished"]
+    assert states(tmp_path, toy.grid("model.loss.gamma=4,5")) == ["finished", "finished"]
+
+
+def test_a_family_without_tokens_has_no_tokenizer_to_share(tmp_path: Path) -> None:
+    grid = toy.grid(
+        "model.start=0,1", "tokenizer_train.entropy_weight=0.1,0.2", base=toy.DEBUG.with_family(ToyConfig.family)
+    )
+    assert sweep_in(tmp_path, grid) == ["finished"] * 4
+    assert counts(tmp_path) == {"collect": 1, "tokens": 1, "world_model": 2} | dict.fromkeys(STAGES[4:], 4)
 
 
 def test_lost_numbers_are_counted_again_from_what_is_there(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5")
+    grid = toy.grid("model.loss.gamma=4,5")
     sweep_in(tmp_path, grid)
     metrics = runs(tmp_path, grid)[0].directory / "metrics.json"
     before = metrics.read_bytes()
@@ -153,7 +166,7 @@ def test_lost_numbers_are_counted_again_from_what_is_there(tmp_path: Path) -> No
 
 
 def test_a_cell_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5")
+    grid = toy.grid("model.loss.gamma=4,5")
     with lock(lock_of(runs(tmp_path, grid)[0])) as free:
         assert free
         assert sweep_in(tmp_path, grid) == ["running", "finished"]
@@ -162,13 +175,13 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> N
 
 
 def test_only_the_chosen_cells_run_and_the_table_names_all(tmp_path: Path) -> None:
-    grid = toy.grid("loss.gamma=4,5", seeds=(0, 1))
+    grid = toy.grid("model.loss.gamma=4,5", seeds=(0, 1))
     assert sweep_in(tmp_path, grid, Choice(number=2)) == ["finished"]
     assert states(tmp_path, grid) == ["missing", "missing", "finished", "missing"]
     rows = sweep.write_tables(tmp_path / "out", tmp_path / "data")
     assert [len(row.results) for row in rows] == [2, 2]
     with pytest.raises(UserError, match="--only x"):
-        sweep_in(tmp_path, toy.grid("loss.gamma=9"), Choice(only=("x",)))
+        sweep_in(tmp_path, toy.grid("model.loss.gamma=9"), Choice(only=("x",)))
     assert "9.0" not in (tmp_path / "out" / "grid.json").read_text(), "a mistake leaves nothing behind"
 
 
@@ -177,7 +190,7 @@ def test_where_hard_links_do_not_go_there_are_copies(tmp_path: Path, monkeypatch
         raise OSError(18, "Invalid cross-device link")
 
     monkeypatch.setattr("rsjax.ablation.sweep.os.link", refused)
-    grid = toy.grid("loss.gamma=4,5")
+    grid = toy.grid("model.loss.gamma=4,5")
     assert sweep_in(tmp_path, grid) == ["finished", "finished"]
     there = runs(tmp_path, grid)[1]
     assert (there.output("tokens") / "weights").read_text() == there.keys()["tokens"]
@@ -230,14 +243,14 @@ def test_the_command_runs_lists_and_reports(
             return int(stop.code or 0)
         return 0
 
-    axes = ("--grid", "loss.gamma=4,5", "--grid", "loss.keypoints=True", "--seeds", "0", "1")
+    axes = ("--grid", "model.loss.gamma=4,5", "--grid", "model.loss.use_keypoints=True", "--seeds", "0", "1")
     assert main("--table") == 2
     assert "holds no grid" in capsys.readouterr().err
     assert main(*axes, "--list") == 0
     assert capsys.readouterr().out.splitlines()[1].split() == [
         "1",
         "missing",
-        "loss.gamma=5.0,loss.keypoints=True,seed=0",
+        "model.loss.gamma=5.0,model.loss.use_keypoints=True,seed=0",
     ]
     assert not (tmp_path / "out").exists()
     with monkeypatch.context() as patch:
@@ -246,11 +259,11 @@ def test_the_command_runs_lists_and_reports(
     assert main(*axes, "--list") == 0
     assert [row.split()[1] for row in capsys.readouterr().out.splitlines()[-4:]] == ["missing"] * 3 + ["finished"]
     with monkeypatch.context() as patch:
-        fail_in(patch, "loss.gamma=4.0,loss.keypoints=True,seed=0", UserError("its cure"))
+        fail_in(patch, "model.loss.gamma=4.0,model.loss.use_keypoints=True,seed=0", UserError("its cure"))
         assert main(*axes) == 1
     assert "seed=0: failed (its cure)" in capsys.readouterr().out
     assert main("--table") == 0
     assert "seed=0: failed (its cure)" in capsys.readouterr().out
-    assert main(*axes, "--skip", "*gamma=4.0*", "--loss.depth", "2") == 2
-    assert "another configuration (loss.depth is 1.0 there, 2.0 here)" in capsys.readouterr().err
+    assert main(*axes, "--skip", "*gamma=4.0*", "--model.loss.depth-weight", "2") == 2
+    assert "another configuration (model.loss.depth_weight is 1.0 there, 2.0 here)" in capsys.readouterr().err
     assert main(*axes) == 0

@@ -1,6 +1,7 @@
 import csv
 import io
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from PIL import Image
 from rsjax.ablation.figure import draw
 from rsjax.ablation.sweep import runs_of
 from rsjax.ablation.table import (
-    COLUMNS,
     Result,
     Row,
     as_csv,
@@ -24,10 +24,12 @@ from rsjax.ablation.table import (
     spread,
     tabulate,
 )
+from rsjax.evaluation.registry import metrics
 from tests.ablation import toy
 
-PSNR = COLUMNS[0]
-GRID = toy.grid("model.depth=True,False", "loss.keypoints=True,False", seeds=(0, 1, 2))
+COLUMNS = tuple(metrics().values())
+PSNR = metrics()["psnr"]
+GRID = toy.grid("model.use_depth=True,False", "model.loss.use_keypoints=True,False", seeds=(0, 1, 2))
 RUNS = list(runs_of(GRID, Path("out"), Path("data")).values())
 
 
@@ -43,7 +45,11 @@ def rows_of(metrics: Mapping[int, Mapping[str, float]]) -> list[Row]:
 def full(rng: np.random.Generator) -> dict[int, dict[str, float]]:
     """Metrics of all cells; those without depth have no depth metrics."""
     return {
-        i: {c.name: float(rng.normal()) for c in COLUMNS if run.config.model.depth or not c.name.startswith("depth")}
+        i: {
+            c.name: float(rng.normal())
+            for c in COLUMNS
+            if run.config.model.uses_depth or not c.name.startswith("depth")
+        }
         for i, run in enumerate(RUNS)
     }
 
@@ -76,7 +82,7 @@ def test_the_best_mean_is_the_largest_or_smallest_as_the_metric_wants() -> None:
     for column in COLUMNS:
         means = [row.spreads[column.name].mean if column.name in row.spreads else np.nan for row in rows]
         assert best(rows, column) == {int(np.nanargmax(means) if column.better == "higher" else np.nanargmin(means))}
-        less = column._replace(decimals=-1)
+        less = replace(column, decimals=-1)
         assert best(rows, less) == {i for i, mean in enumerate(means) if not np.isnan(mean)}, "all are shown as 0"
     assert best(rows[:1], PSNR) == set(), "nothing to compare with"
     same = rows_of({i: {"psnr": 1.0} for i in range(12)})
@@ -89,13 +95,13 @@ def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
     metrics = {0: {"psnr": 20.0, "depth_absrel": 0.1}, 4: {"psnr": 21.0, "depth_absrel": 0.3}, 2: {"psnr": 22.0}}
     text = as_markdown(rows_of(metrics))
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
-    assert lines[0] == ["model.depth", "loss.keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
+    assert lines[0] == ["model.use_depth", "model.loss.use_keypoints", "seeds", "PSNR, dB ↑", "depth AbsRel ↓"]
     assert lines[2] == ["True", "True", "2/3", "20.50 ± 0.71", "0.2000 ± 0.1414"]
     assert lines[3] == ["True", "False", "0/3", "–", "–"]
     assert lines[4] == ["False", "True", "1/3", "**22.00**", "–"]
     assert len({len(line) for line in text.splitlines() if line.startswith("|")}) == 1
-    assert text.count("- model.depth=") == 9
-    assert "- model.depth=False,loss.keypoints=False,seed=2: missing (its reason)" in text
+    assert text.count("- model.use_depth=") == 9
+    assert "- model.use_depth=False,model.loss.use_keypoints=False,seed=2: missing (its reason)" in text
 
 
 def test_a_whole_table_names_no_cell() -> None:
@@ -108,7 +114,7 @@ def test_files_have_every_metric_at_full_precision() -> None:
     lines = list(csv.DictReader(io.StringIO(as_csv(rows))))
     saved = as_json(rows)
     for row, line, entry in zip(rows, lines, saved["rows"], strict=True):
-        assert line["model.depth"] == str(row.values["model.depth"])
+        assert line["model.use_depth"] == str(row.values["model.use_depth"])
         assert entry["values"] == row.values
         for name, numbers in row.spreads.items():
             assert [float(line[f"{name}_{part}"]) for part in ("mean", "std", "n")] == list(numbers)

@@ -7,9 +7,9 @@ import pytest
 
 from rsjax.ablation import sweep
 from rsjax.ablation.grid import Grid, expand, parse_axes
-from rsjax.config import Config, presets
+from rsjax.config import Config, RoboScapeConfig, presets
 from rsjax.pipeline import stages
-from rsjax.pipeline.run import STAGES, Run
+from rsjax.pipeline.run import Run
 
 DEBUG = presets.debug()
 
@@ -18,9 +18,16 @@ def grid(*axes: str, seeds: tuple[int, ...] = (0,), base: Config = DEBUG) -> Gri
     return expand(base, parse_axes(base, axes), seeds)
 
 
+def roboscape(config: Config) -> RoboScapeConfig:
+    """The model's settings."""
+    assert isinstance(config.model, RoboScapeConfig)
+    return config.model
+
+
 def psnr(config: Config) -> float:
     """The score of a cell with this configuration."""
-    return 20.0 + config.loss.gamma + config.train.seed / 8
+    gamma = config.model.loss.gamma if isinstance(config.model, RoboScapeConfig) else 0.0
+    return 20.0 + gamma + config.train.seed / 8
 
 
 def log(directory: Path, word: str) -> None:
@@ -50,7 +57,7 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
         log(record, f"{stage} {run.directory.name}")
 
     def everything(run: Run, command: str = "") -> None:
-        for stage in STAGES:
+        for stage in run.stages:
             if not run.finished(stage):
                 with run.stage(stage):
                     leave(run, stage)
@@ -60,6 +67,6 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
     monkeypatch.setattr(stages, "run_all", everything)
     monkeypatch.setattr(stages, "collect_clips", lambda run: None if run.clips.exists() else leave(run, "collect"))
     monkeypatch.setattr(stages, "train_tokenizer", lambda run, resume: leave(run, "tokenizer"))
-    monkeypatch.setattr(stages, "tokenize", lambda run: leave(run, "tokens"))
+    monkeypatch.setattr(stages, "prepare", lambda run: leave(run, "tokens"))
     monkeypatch.setattr(stages, "train_world_model", lambda run, resume: leave(run, "world_model"))
     monkeypatch.setattr(sweep, "draw", lambda rows, title: b"")

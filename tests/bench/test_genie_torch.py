@@ -6,13 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, ModelConfig, OptimizerConfig
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.config import ConfigError, OptimizerConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
 
 torch = pytest.importorskip("torch")
 
-TOY = ModelConfig(
-    frames=3, grid=4, code_bits=8, action_dim=0, width=24, blocks=2, heads=3, depth=False, position_std=0.5
+TOY = Architecture(
+    frames=3, grid=4, code_bits=8, action_inputs=0, width=24, blocks=2, heads=3, use_depth=False, position_std=0.5
 )
 
 
@@ -47,7 +48,7 @@ def copied(params: Any) -> Any:
 @pytest.fixture(scope="module")
 def params() -> Any:
     """Random weights, those that start at zero too."""
-    fresh = WorldModel(TOY).init_params(jax.random.key(0))
+    fresh = Transformer(TOY).init_params(jax.random.key(0))
     leaves, tree = jax.tree.flatten(fresh)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     noisy = [x + 0.1 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
@@ -57,7 +58,7 @@ def params() -> Any:
 def test_logits_are_those_of_the_rgb_branch(params: Any) -> None:
     rng = np.random.default_rng(0)
     tokens, mask = rng.integers(0, 256, (2, 3, 4, 4)), rng.random((2, 3, 4, 4)) < 0.4
-    ours, _ = WorldModel(TOY).apply({"params": params}, {"rgb": jnp.array(tokens)}, jnp.array(mask), None)
+    ours, _ = Transformer(TOY).apply({"params": params}, {"rgb": jnp.array(tokens)}, jnp.array(mask), None)
     with torch.no_grad():
         theirs = copied(params)(torch.tensor(tokens.reshape(2, 3, 16)), torch.tensor(mask.reshape(2, 3, 16)))
     np.testing.assert_allclose(ours["rgb"], theirs.numpy(), rtol=1e-4, atol=1e-4)

@@ -10,13 +10,15 @@ from rich.console import Console
 
 from rsjax.bench import feed, parts
 from rsjax.bench.run import PARTS, bench, ratios, table
-from rsjax.config import Config, ConfigError, MaskConfig, presets
+from rsjax.config import Config, ConfigError, presets
+from rsjax.config.leaves import with_values
 from rsjax.errors import UserError
 
 
 def toy(**model: Any) -> Config:
-    debug = presets.get("debug")
-    return dataclasses.replace(debug, model=dataclasses.replace(debug.model, width=16, blocks=1, depth=False, **model))
+    """A model small enough to be measured in no time, with other fields of its settings as given."""
+    settings = {"width": 16, "blocks": 1, "use_depth": False} | model
+    return with_values(presets.get("debug"), {f"model.{name}": value for name, value in settings.items()})
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def test_every_quantity_is_there_positive_and_flat(numbers: dict[str, Any]) -> N
 def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     config = toy()
     step = numbers["train_step_s"]
-    assert numbers["train_tokens_per_s"] == pytest.approx(2 * config.sim.frames * config.model.grid**2 / step)
+    assert numbers["train_tokens_per_s"] == pytest.approx(2 * config.clips.frames * config.grid**2 / step)
     assert numbers["train_flops"] == pytest.approx(numbers["train_step_flops"] / step)
     assert numbers["matmul_ceiling_flops"] == max(numbers["matmul_flops_64x16x32"], numbers["matmul_flops_128x64x64"])
     assert numbers["sample_s_per_frame_cached"] == numbers["sample_s_per_frame_cached_4"]
@@ -90,9 +92,9 @@ def test_steps_wait_for_a_slow_loader_and_not_for_a_quick_one(
         time.sleep(step_s)
         return state, {}
 
-    placement = SimpleNamespace(compile=lambda *_: step, put_batch=lambda batch: time.sleep(batch_s))
-    monkeypatch.setattr(feed.Placement, "create", lambda loop: placement)
-    monkeypatch.setattr(feed, "create_state", lambda objective, loop: 0)
+    sharding = SimpleNamespace(compile=lambda *_: step, put_batch=lambda batch: time.sleep(batch_s))
+    monkeypatch.setattr(feed.Sharding, "create", lambda loop: sharding)
+    monkeypatch.setattr(feed, "create_state", lambda model, loop: 0)
     measured = bench(toy(), only=["feed"], budget=0.0)
     assert low < measured["data_wait_share"] < high
     assert (measured["feed_steps"], measured["feed_batch"]) == (feed.LEAST, toy().train.batch_size)
@@ -100,17 +102,17 @@ def test_steps_wait_for_a_slow_loader_and_not_for_a_quick_one(
 
 def test_rollouts_begin_with_one_frame_whatever_the_preset_trains_with(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a rollout of two frames one is left to decode, with the cache and without."""
-    given: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
+    seen: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
 
     def rollout(_: Any, __: Any, ___: Any, prompt: Any, actions: Any, key: Any, cached: bool) -> None:
-        given[cached].append((prompt["rgb"].shape[1], actions.shape[1]))
+        seen[cached].append((prompt["rgb"].shape[1], actions.shape[1]))
 
     monkeypatch.setattr(parts, "rollout", rollout)
-    monkeypatch.setattr(parts.inputs, "world_model_params", lambda model: None)
+    monkeypatch.setattr(parts.RoboScape, "init", lambda model, key: {})
     monkeypatch.setattr(parts, "median_seconds", lambda call, budget: call() or 6.0)
-    config = dataclasses.replace(toy(), mask=MaskConfig(prompt_frames=3))
+    config = dataclasses.replace(toy(), prompt_frames=3)
     numbers = parts.sample(config, 1, 0.0, (2, 4, 7))
-    assert given == {True: [(1, 2), (1, 4), (1, 7)], False: [(1, 2), (2, 4), (5, 7)]}
+    assert seen == {True: [(1, 2), (1, 4), (1, 7)], False: [(1, 2), (2, 4), (5, 7)]}
     assert numbers["sample_prompt_frames"] == 1
     assert [numbers[f"sample_uncached_frames_measured_{frames}"] for frames in (2, 4, 7)] == [1, 2, 2]
     assert [numbers[f"sample_s_per_frame_cached_{frames}"] for frames in (2, 4, 7)] == [6.0, 2.0, 1.0]

@@ -10,28 +10,26 @@ from hypothesis import strategies as st
 
 from rsjax import config as c
 from rsjax.config import presets
+from rsjax.config.leaves import with_values
+from rsjax.models.roboscape.architecture import Architecture
 
 # Its own, so that tuning the presets does not touch these tests.
 BASE = c.Config(
     name="base",
     sim=c.SimConfig(episodes=8, test_episodes=2, frames=6, tracks=64),
-    tokenizer=c.TokenizerConfig(
-        image_size=64, patch_size=4, channels=16, channel_multipliers=(1, 2), norm_groups=8, code_bits=8
-    ),
-    model=c.ModelConfig(frames=6, grid=8, code_bits=8, width=32, blocks=2, heads=2),
+    tokenizer=c.TokenizerConfig(patch_size=4, channels=16, channel_multipliers=(1, 2), norm_groups=8, code_bits=8),
+    model=c.RoboScapeConfig(width=32, blocks=2, heads=2),
 )
 
 
-def leaves(part: Any, prefix: str = "") -> list[tuple[str, bool]]:
-    """(dotted path, whether it is a runtime field) of every plain field within ``part``."""
-    found: list[tuple[str, bool]] = []
+def leaves(part: Any, prefix: str = "", in_key: bool = True) -> list[tuple[str, bool]]:
+    """(dotted path, whether the content key covers it) of every plain field within ``part``."""
+    paths: list[tuple[str, bool]] = []
     for field in dataclasses.fields(part):
         value, path = getattr(part, field.name), prefix + field.name
-        if dataclasses.is_dataclass(value):
-            found += leaves(value, f"{path}.")
-        else:
-            found.append((path, bool(field.metadata.get("runtime"))))
-    return found
+        covered = in_key and not field.metadata.keys() & {"runtime", "sampling"}
+        paths += leaves(value, f"{path}.", covered) if dataclasses.is_dataclass(value) else [(path, covered)]
+    return paths
 
 
 def other(value: Any) -> Any:
@@ -55,11 +53,23 @@ def altered(part: Any, path: str) -> Any:
     return copy
 
 
-@pytest.mark.parametrize(("path", "runtime"), leaves(BASE))
-def test_the_key_changes_exactly_with_fields_that_change_results(path: str, runtime: bool) -> None:
+def settings_key(config: c.Config) -> str:
+    """The part of the evaluation's key that covers how the model is sampled."""
+    return c.content_key(*c.sampling_settings(config.model))
+
+
+@pytest.mark.parametrize(("path", "in_key"), leaves(BASE))
+def test_the_key_changes_exactly_with_fields_that_change_results(path: str, in_key: bool) -> None:
+    """Fields of sampling change what is generated, not what is trained: they have a key of their own."""
     changed = altered(BASE, path)
     assert changed != BASE
-    assert (c.content_key(changed) == c.content_key(BASE)) == runtime
+    assert (c.content_key(changed) != c.content_key(BASE)) == in_key
+    assert (settings_key(changed) != settings_key(BASE)) == path.startswith("model.sample.")
+
+
+def test_the_key_covers_the_family() -> None:
+    keys = {c.content_key(config) for config in (c.TokenModelConfig(), c.RoboScapeConfig(), c.GenieConfig())}
+    assert len(keys) == 3
 
 
 def test_the_key_tells_parts_and_their_order_apart() -> None:
@@ -88,57 +98,69 @@ def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
     del plain["train"]["seed"]
     assert c.from_dict(c.Config, plain) == BASE
     for damaged in ([], [["width", 3]], 3):
-        with pytest.raises(c.ConfigError, match="ModelConfig is to be fields by name"):
+        with pytest.raises(c.ConfigError, match="ModelConfig must be fields by name"):
             c.from_dict(c.Config, plain | {"model": damaged})
 
 
 @pytest.mark.parametrize(
-    ("section", "changes", "names"),
+    ("path", "changes", "names"),
     [
+        ("", {"prompt_frames": 0}, "prompt_frames is 0 of 6 frames"),
+        ("", {"prompt_frames": 6}, "prompt_frames is 6 of 6 frames"),
         ("sim", {"frames": 1}, "sim.frames is 1"),
         ("sim", {"test_episodes": 8}, "sim.test_episodes is 8"),
         ("sim", {"test_episodes": 0}, "sim.test_episodes is 0"),
         ("sim", {"control_steps": 0}, "sim.control_steps is 0"),
-        ("sim", {"frames": 7}, "model.frames holds positions for 6"),
-        ("sim", {"image_size": 128}, "sim.image_size is 128 but tokenizer.image_size is 64"),
-        ("sim", {"control_steps": 2}, "is 14 but model.action_dim is 28"),
-        ("tokenizer", {"image_size": 65}, "not divisible by the downsampling 8"),
+        ("sim", {"image_size": 65}, "images have 65 pixels a side, which the downsampling 8"),
+        ("tokenizer", {"patch_size": 48}, "images have 64 pixels a side, which the downsampling 96"),
         ("tokenizer", {"code_bits": 9}, "tokenizer.code_bits 9 does not divide into 2"),
         ("tokenizer", {"norm_groups": 5}, "tokenizer.norm_groups 5"),
-        ("tokenizer", {"image_size": 8, "adaptive_norm": True}, "needs a grid of more than one cell"),
-        ("tokenizer_train", {"adversarial": -0.1}, "tokenizer_train.adversarial is -0.1"),
-        ("tokenizer", {"patch_size": 8}, "tokenizer grid is 4 but model.grid is 8"),
-        ("tokenizer", {"code_bits": 10}, "tokenizer.code_bits is 10 but model.code_bits is 8"),
+        ("tokenizer", {"patch_size": 32, "adaptive_norm": True}, "needs a grid of more than one cell"),
+        ("tokenizer_train", {"adversarial_weight": -0.1}, "tokenizer_train.adversarial_weight is -0.1"),
+        ("model", {"max_frames": 5}, "clips have 6 frames but model.max_frames is 5"),
         ("model", {"heads": 3}, "model.width 32 is not divisible by model.heads 3"),
-        ("model", {"action_dim": -1}, "model.action_dim is -1"),
-        ("model", {"action_dim": 0, "integrate_actions": True}, "model.action_dim is 0"),
-        ("model", {"action_dim": 0, "action_dropout": 0.1}, "model.action_dim is 0"),
+        ("model", {"heads": 32, "positions": "rotary"}, "a head has 1 (model.width / model.heads)"),
+        ("model", {"action_encoder": "none", "integrate_actions": True}, "model.action_encoder is none"),
+        ("model", {"action_encoder": "none", "action_dropout": 0.1}, "model.action_encoder is none"),
         ("model", {"action_dropout": 1.0}, "model.action_dropout is 1.0"),
-        ("model", {"vocabularies": 1}, "tokenizer.vocabularies is 2 but model.vocabularies is 1"),
-        ("mask", {"prompt_frames": 0}, "mask.prompt_frames is 0"),
-        ("mask", {"prompt_frames": 6}, "mask.prompt_frames is 6 of 6 frames"),
-        ("loss", {"num_keypoints": 65}, "loss.num_keypoints is 65"),
+        ("model.loss", {"num_keypoints": 0}, "model.loss.num_keypoints is 0"),
+        ("model.sample", {"steps": 0}, "model.sample.steps is 0"),
+        ("model.sample", {"temperature": -0.5}, "model.sample.temperature is -0.5"),
+        ("model.sample", {"guidance": 2.0}, "model.sample.guidance is 2.0"),
+        ("model.sample", {"window_stride": 6}, "model.sample.window_stride is 6 of 6 positions"),
         ("eval", {"clips": 1}, "eval.clips is 1 of sim.test_episodes 2"),
         ("eval", {"batch_size": 0}, "eval.batch_size is 0"),
-        ("sample", {"steps": 0}, "sample.steps is 0"),
-        ("sample", {"temperature": -0.5}, "sample.temperature is -0.5"),
     ],
 )
-def test_what_cannot_run_is_refused_by_name(section: str, changes: dict[str, Any], names: str) -> None:
+def test_what_cannot_run_is_refused_by_name(path: str, changes: dict[str, Any], names: str) -> None:
     with pytest.raises(c.ConfigError) as caught:
-        dataclasses.replace(BASE, **{section: dataclasses.replace(getattr(BASE, section), **changes)})
+        with_values(BASE, {f"{path}.{field}".lstrip("."): value for field, value in changes.items()})
     assert names in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
+def test_the_network_fits_clips_and_tokenizer_by_itself() -> None:
+    """Positions, grid, codes and the actions' width are derived, so no setting can contradict them."""
+    changes = {"sim.frames": 9, "sim.image_size": 128, "sim.control_steps": 2, "tokenizer.code_bits": 10}
+    config = with_values(BASE, changes | {"tokenizer.vocabularies": 5, "model.integrate_actions": True})
+    network = Architecture.create(config)
+    assert (network.frames, network.grid, network.action_inputs) == (9, config.grid, 2 * 14)
+    assert config.grid == config.tokenizer.grid(128) == 16
+    assert (network.code_bits, network.vocabularies, network.vocabulary_size) == (10, 5, 4)
+    assert Architecture.create(with_values(config, {"model.max_frames": 12})).frames == 12
+
+
 def test_a_model_without_actions_fits_any_data() -> None:
-    model = dataclasses.replace(BASE.model, action_dim=0)
-    assert dataclasses.replace(BASE, model=model).model.action_dim == 0
+    for steps in (2, 4):
+        config = with_values(BASE, {"model.action_encoder": "none", "sim.control_steps": steps})
+        assert Architecture.create(config).action_inputs == 0
 
 
-def test_more_keypoints_than_tracks_are_fine_when_keypoints_are_off() -> None:
-    loss = dataclasses.replace(BASE.loss, num_keypoints=10_000, keypoints=False)
-    assert dataclasses.replace(BASE, loss=loss).loss.terms(depth_branch=True) == {"rgb": 1.0, "depth": 1.0}
+def test_more_keypoints_than_tracks_are_fine() -> None:
+    config = with_values(BASE, {"model.loss.num_keypoints": 10_000, "model.loss.use_keypoints": False})
+    assert isinstance(config.model, c.RoboScapeConfig)
+    assert config.model.loss_weights == {"rgb": 1.0, "depth": 1.0}
+    assert with_values(BASE, {"model.loss.num_keypoints": 65}).clips.tracks == 64
 
 
 def test_both_training_loops_are_set_alike_and_nothing_else_changes() -> None:
@@ -149,10 +171,19 @@ def test_both_training_loops_are_set_alike_and_nothing_else_changes() -> None:
 
 
 def test_the_paper_s_loss_weights() -> None:
-    loss = c.LossConfig()
-    assert loss.terms(depth_branch=True) == {"rgb": 1.0, "depth": 1.0, "keypoint": 0.01, "attention": 1.0}
-    assert loss.terms(depth_branch=False) == {"rgb": 1.0, "keypoint": 0.01, "attention": 1.0}
-    assert loss.gamma == 5.0
+    model = c.RoboScapeConfig()
+    assert model.loss_weights == {"rgb": 1.0, "depth": 1.0, "keypoint": 0.01, "attention": 1.0}
+    assert c.RoboScapeConfig(use_depth=False).loss_weights == {"rgb": 1.0, "keypoint": 0.01, "attention": 1.0}
+    assert model.loss.gamma == 5.0
+    assert c.GenieConfig().loss_weights == {"rgb": 1.0}
+
+
+@pytest.mark.parametrize("off", ["rgb", "depth", "keypoint", "attention"])
+def test_a_weight_of_0_switches_its_term_off(off: str) -> None:
+    without: dict[str, Any] = {f"{off}_weight": 0.0}
+    loss = c.LossConfig(**without)
+    expected = {name: weight for name, weight in c.RoboScapeConfig().loss_weights.items() if name != off}
+    assert c.RoboScapeConfig(loss=loss).loss_weights == expected
 
 
 @given(patch=st.sampled_from([1, 2, 4]), levels=st.integers(1, 4), cells=st.integers(1, 8))
@@ -160,6 +191,6 @@ def test_the_grid_is_what_halving_level_by_level_leaves(patch: int, levels: int,
     size = cells * patch
     for _ in range(levels - 1):
         size *= 2
-    tokenizer = c.TokenizerConfig(image_size=size, patch_size=patch, channel_multipliers=(1,) * levels)
-    assert tokenizer.grid == cells
-    assert tokenizer.grid * tokenizer.downsampling == size
+    tokenizer = c.TokenizerConfig(patch_size=patch, channel_multipliers=(1,) * levels)
+    assert tokenizer.grid(size) == cells
+    assert cells * tokenizer.downsampling == size

@@ -3,13 +3,15 @@
 import jax
 import pytest
 
-from rsjax.config import presets
+from rsjax.config import GenieConfig, RoboScapeConfig, presets
 from rsjax.describe import by_part, cache_bytes, count
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models import create_model
+from rsjax.models.roboscape.architecture import Architecture
 
 WORLD_MODELS = {  # (RGB branch with what it shares, all)
     "genie_35m": (35_218_688, 35_218_688),  # published
     "genie_138m": (137_545_216, 137_545_216),  # published
+    "genie_35m_actions": (35_291_904, 35_291_904),
     "roboscape_s": (35_226_112, 71_501_568),
     "roboscape_m": (137_560_064, 281_413_120),
     "roboscape_l": (543_554_560, 1_116_472_320),
@@ -18,24 +20,28 @@ WORLD_MODELS = {  # (RGB branch with what it shares, all)
 
 @pytest.mark.parametrize("name", WORLD_MODELS)
 def test_full_size_world_models_have_their_exact_counts(name: str) -> None:
-    parts = by_part(jax.eval_shape(WorldModel(presets.get(name).model).init_params, jax.random.key(0)))
+    parts = by_part(jax.eval_shape(create_model(presets.get(name)).init, jax.random.key(0)))
     alone = count(parts["rgb"]) + count(parts["shared"])
     assert (alone, count(parts)) == WORLD_MODELS[name]
 
 
 @pytest.mark.parametrize(("name", "published"), [("roboscape_s", 268), ("roboscape_m", 537), ("roboscape_l", 1074)])
 def test_the_cache_of_a_rollout_in_bf16_has_the_known_size(name: str, published: int) -> None:
-    assert round(cache_bytes(presets.get(name).model, 2) / 1e6) == published
+    assert round(cache_bytes(Architecture.create(presets.get(name)), 2) / 1e6) == published
 
 
-def test_full_size_presets_are_the_papers_setting() -> None:
-    for name in WORLD_MODELS:
-        config = presets.get(name)
-        assert (config.tokenizer.image_size, config.model.grid, config.model.code_bits) == (256, 16, 18)
-        assert (config.model.frames, config.model.blocks) == (16, 32)
-        assert config.model.depth == name.startswith("roboscape")
-        assert (config.model.action_dim > 0) == name.startswith("roboscape")
+@pytest.mark.parametrize("name", WORLD_MODELS)
+def test_full_size_presets_are_the_papers_setting(name: str) -> None:
+    config = presets.get(name)
+    network = Architecture.create(config)
+    assert (config.clips.image_size, network.grid, network.code_bits) == (256, 16, 18)
+    assert (network.frames, network.blocks) == (16, 32)
+    dual = name.startswith("roboscape")
+    assert isinstance(config.model, RoboScapeConfig if dual else GenieConfig)
+    assert network.use_depth == config.model.uses_depth == dual
+    assert (network.action_inputs > 0) == (dual or name.endswith("actions"))
 
 
 def test_the_public_genie_has_heads_of_32_and_64() -> None:
-    assert [presets.get(name).model.head_width for name in ("genie_35m", "genie_138m")] == [32, 64]
+    networks = [Architecture.create(presets.get(name)) for name in ("genie_35m", "genie_138m")]
+    assert [network.head_width for network in networks] == [32, 64]

@@ -1,6 +1,7 @@
 """The command, from files to files."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,10 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, TokenizerConfig, to_dict
 from rsjax.convert.__main__ import main
+from rsjax.convert.directory import load_tokenizer, load_world_model, save
 from rsjax.convert.files import read_tensors, write_safetensors
 from rsjax.tokenizers.lpips import load_lpips
-from rsjax.training.pretrained import load_part, save_part
 from tests.convert.public import Tensors, genie_shapes, random_tensors, tokenizer_shapes
 from tests.convert.test_lpips import backbone, heads
 
@@ -35,22 +35,25 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def assert_same(path: Path, expected: Tensors) -> None:
-    found, _ = read_tensors(path)
-    assert found.keys() == expected.keys()
+    tensors, _ = read_tensors(path)
+    assert tensors.keys() == expected.keys()
     for name, x in expected.items():
-        assert found[name].tobytes() == x.tobytes(), name
+        assert tensors[name].tobytes() == x.tobytes(), name
 
 
 @pytest.mark.parametrize("kind", ["tokenizer", "genie"])
 def test_import_and_export_are_inverse_to_the_bit(kind: str, tmp_path: Path) -> None:
-    kinds: dict[str, tuple[Tensors, Any]] = {"tokenizer": (TOKENIZER, TokenizerConfig), "genie": (GENIE, ModelConfig)}
-    tensors, part = kinds[kind]
+    kinds: dict[str, tuple[Tensors, Any]] = {
+        "tokenizer": (TOKENIZER, load_tokenizer),
+        "genie": (GENIE, load_world_model),
+    }
+    tensors, load = kinds[kind]
     write_safetensors(tmp_path / "in.safetensors", tensors, {})
     convert(kind, tmp_path / "in.safetensors", tmp_path / "own", *(["--heads", 2] if kind == "genie" else []))
     convert(kind, tmp_path / "own", tmp_path / "out" / "x.safetensors")
     assert_same(tmp_path / "out" / "x.safetensors", tensors)
     convert(kind, tmp_path / "out" / "x.safetensors", tmp_path / "again")
-    (config, params), (config_again, params_again) = (load_part(tmp_path / d, part) for d in ("own", "again"))
+    (config, params), (config_again, params_again) = (load(tmp_path / d) for d in ("own", "again"))
     assert config == config_again
     jax.tree.map(np.testing.assert_array_equal, params, params_again)
 
@@ -59,19 +62,19 @@ def test_one_directory_holds_a_tokenizer_and_a_model(tmp_path: Path) -> None:
     for kind, tensors in (("tokenizer", TOKENIZER), ("genie", GENIE)):
         write_safetensors(tmp_path / f"{kind}.safetensors", tensors, {})
         convert(kind, tmp_path / f"{kind}.safetensors", tmp_path / "both", *(["--heads", 2] if kind == "genie" else []))
-    assert load_part(tmp_path / "both", TokenizerConfig)[0].adaptive_norm
-    assert load_part(tmp_path / "both", ModelConfig)[0].heads == 2
+    assert load_tokenizer(tmp_path / "both")[0].adaptive_norm
+    assert load_world_model(tmp_path / "both")[0].heads == 2
 
 
 def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None:
     write_safetensors(tmp_path / "in.safetensors", TOKENIZER, {})
     convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
-    config, params = load_part(tmp_path / "own", TokenizerConfig)
-    other = TokenizerConfig(**to_dict(config) | {"norm_groups": 8, "image_size": 64, "channel_multipliers": (1, 2)})
-    save_part(tmp_path / "other", other, params)
+    config, params = load_tokenizer(tmp_path / "own")
+    other = replace(config, norm_groups=8, depth_scale="linear")
+    save(tmp_path / "other", other, params)
     convert("tokenizer", tmp_path / "other", tmp_path / "x.safetensors")
     convert("tokenizer", tmp_path / "x.safetensors", tmp_path / "again")
-    assert load_part(tmp_path / "again", TokenizerConfig)[0] == other
+    assert load_tokenizer(tmp_path / "again")[0] == other
 
 
 def test_the_command_prints_its_output_and_what_it_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,16 +87,16 @@ def test_the_command_prints_its_output_and_what_it_ignored(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"), [(None, True), ({"num_heads": 2}, True), ({"num_heads": 2, "use_mup": False}, False)]
+    ("settings", "expected"), [(None, True), ({"num_heads": 2}, True), ({"num_heads": 2, "use_mup": False}, False)]
 )
 def test_the_command_says_when_it_assumes_no_mup(
-    settings: dict[str, Any] | None, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    settings: dict[str, Any] | None, expected: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_safetensors(tmp_path / "in.safetensors", GENIE, {})
     if settings:
         (tmp_path / "config.json").write_text(json.dumps(settings))
     convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
-    assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == told
+    assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == expected
 
 
 def test_load_lpips_reads_what_two_files_are_converted_to(tmp_path: Path) -> None:
@@ -112,7 +115,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "--heads" in refused(capsys, "genie", tmp_path / "in.safetensors", tmp_path / "own")
     convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
     assert ".safetensors" in refused(capsys, "genie", tmp_path / "own", tmp_path / "other")
-    assert "no tokenizer" in refused(capsys, "tokenizer", tmp_path / "own", tmp_path / "x.safetensors")
+    assert "holds no tokenizer/weights" in refused(capsys, "tokenizer", tmp_path / "own", tmp_path / "x.safetensors")
     assert "settings" in refused(capsys, "genie", tmp_path / "own", tmp_path / "own" / "x.safetensors")
     run = tmp_path / "run"
     run.mkdir()

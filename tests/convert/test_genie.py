@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig
 from rsjax.convert.files import ConvertError
 from rsjax.convert.genie import from_public, infer_config, read_settings, settings_of, table
 from rsjax.convert.table import public_shapes, to_tensors
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
 from tests.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
 
 LAYERS, WIDTH, HEADS, FRAMES, CELLS, CODES = 3, 16, 2, 3, 4, 8
@@ -28,8 +28,8 @@ def source(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
 @pytest.mark.parametrize("qk_norm", [False, True])
 def test_the_published_sizes_have_the_published_names_and_shapes(width: int, published: int, qk_norm: bool) -> None:
-    config = ModelConfig(width=width, depth=False, action_dim=0, qk_norm=qk_norm)
-    shapes = public_shapes(table(config), jax.eval_shape(WorldModel(config).init_params, jax.random.key(0)))
+    config = Architecture(width=width, use_depth=False, action_inputs=0, qk_norm=qk_norm)
+    shapes = public_shapes(table(config), jax.eval_shape(Transformer(config).init_params, jax.random.key(0)))
     assert shapes == genie_shapes(32, width, 8, 16, 256, 512, qk_norm)
     if not qk_norm:
         assert sum(int(np.prod(shape)) for shape in shapes.values()) == published
@@ -39,10 +39,10 @@ def test_the_published_sizes_have_the_published_names_and_shapes(width: int, pub
 def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool, mup: bool) -> None:
     public, rng = tensors(qk_norm), np.random.default_rng(0)
     config, params = from_public(Path("file"), public, SETTINGS | {"use_mup": mup, "qk_norm": qk_norm})
-    assert (config.mup, config.qk_norm, config.action_dim, config.depth) == (mup, qk_norm, 0, False)
+    assert (config.mup, config.qk_norm, config.action_inputs, config.use_depth) == (mup, qk_norm, 0, False)
     tokens = rng.integers(0, CODES**2, (2, FRAMES, 2, 2), np.int32)
     mask = rng.random(tokens.shape) < 0.4
-    logits, _ = jax.jit(lambda *x: WorldModel(config).apply({"params": params}, *x))({"rgb": tokens}, mask, None)
+    logits, _ = jax.jit(lambda *x: Transformer(config).apply({"params": params}, *x))({"rgb": tokens}, mask, None)
     flat = (2, FRAMES, CELLS)
     expected = GenieNet(public, LAYERS, HEADS, mup).logits(tokens.reshape(flat), mask.reshape(flat))
     np.testing.assert_allclose(logits["rgb"], expected, rtol=1e-4, atol=1e-4)
@@ -85,8 +85,8 @@ def test_unsupported_settings_are_refused(field: str, value: bool) -> None:
 
 
 def test_settings_of_training_are_ignored() -> None:
-    told = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None, "qkv_bias": None}
-    assert infer_config(Path("file"), tensors(), told) == infer_config(Path("file"), tensors(), SETTINGS)
+    more = SETTINGS | {"max_corrupt_rate": 0.3, "attn_drop": 0.1, "factored_vocab_size": None, "qkv_bias": None}
+    assert infer_config(Path("file"), tensors(), more) == infer_config(Path("file"), tensors(), SETTINGS)
 
 
 def test_settings_are_read_from_beside_the_weights(tmp_path: Path) -> None:
@@ -130,10 +130,10 @@ def test_tensors_of_something_else_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"depth": True}, {"final_norm": True}, {"action_dim": 7}, {"positions": "rotary"}], ids=str
+    "fields", [{"use_depth": True}, {"final_norm": True}, {"action_inputs": 7}, {"positions": "rotary"}], ids=str
 )
 def test_a_model_without_public_names_is_not_exported(fields: dict[str, Any]) -> None:
-    config = ModelConfig(**{"width": 16, "blocks": 2, "heads": 2, "depth": False, "action_dim": 0} | fields)
-    params = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    config = Architecture(**{"width": 16, "blocks": 2, "heads": 2, "use_depth": False, "action_inputs": 0} | fields)
+    params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     with pytest.raises(ConvertError, match="no name for these parts|cannot express model.positions"):
         to_tensors(params, table(config))

@@ -128,5 +128,5 @@ def test_tensors_of_something_else_are_refused(other: dict[str, Any]) -> None:
 
 def test_a_configuration_overrides_inference() -> None:
     public = tensors("older")
-    config = replace(infer_config("file", public, "raw"), norm_groups=8, image_size=32)
+    config = replace(infer_config("file", public, "raw"), norm_groups=8, depth_scale="linear")
     assert from_public("file", public, config=config)[0] == config

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import LoopConfig, PartConfig
-from rsjax.config.stages import parse_stage
+from rsjax.config import ComponentConfig, LoopConfig
+from rsjax.config.curriculum import parse_stage
 from rsjax.data.codec import Record
 from rsjax.data.curriculum import check_stages, choose, plan
 from rsjax.data.order import Arrays
@@ -31,7 +31,7 @@ def transform(store: Store) -> Any:
 
 
 def loop(*stages: str, **fields: Any) -> LoopConfig:
-    return LoopConfig(batch_size=4, stages=tuple(map(parse_stage, stages)), **fields)
+    return LoopConfig(batch_size=4, curriculum=tuple(map(parse_stage, stages)), **fields)
 
 
 @given(st.sets(st.sampled_from(sorted(MEANT))), st.sets(st.sampled_from(toy.DIFFICULTIES)))
@@ -41,7 +41,7 @@ def test_a_filter_by_labels_is_a_filter_by_reading_every_record(
     source = own.source("train")
     meant = {task for pattern in tasks for task in MEANT[pattern]}
     expected = [i for i in range(COUNT) if source[i]["task"] in meant and source[i]["difficulty"] in difficulties]
-    part = PartConfig(tasks=tuple(tasks), difficulties=tuple(difficulties))
+    part = ComponentConfig(tasks=tuple(tasks), difficulties=tuple(difficulties))
     if expected:
         chosen = choose(part, own)
         assert chosen is not None and chosen.tolist() == expected

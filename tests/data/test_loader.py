@@ -104,16 +104,16 @@ def test_a_stage_draws_from_its_parts_alone_by_their_weights_and_evenly(
     first_part = begin = 0
     for stage in stages:
         drawn = slice(begin, begin + stage.records)
-        weights = sum(part.weight for part in stage.parts)
-        for number, part in enumerate(stage.parts, first_part):
+        weights = sum(part.weight for part in stage.components)
+        for number, part in enumerate(stage.components, first_part):
             of_part = records[drawn][parts[drawn] == number]
             share = stage.records * part.weight / weights  # dealt out part by part, each from what the last one left
-            assert abs(len(of_part) - share) < len(stage.parts) + 0.01 * stage.records
+            assert abs(len(of_part) - share) < len(stage.components) + 0.01 * stage.records
             allowed = np.arange(len(part)) if part.chosen is None else part.chosen
             times = [int(np.sum(of_part == record)) for record in allowed]
             assert sum(times) == len(of_part) and max(times) - min(times) <= 1, "some come more often than others"
-        assert ((parts[drawn] >= first_part) & (parts[drawn] < first_part + len(stage.parts))).all()
-        begin, first_part = begin + stage.records, first_part + len(stage.parts)
+        assert ((parts[drawn] >= first_part) & (parts[drawn] < first_part + len(stage.components))).all()
+        begin, first_part = begin + stage.records, first_part + len(stage.components)
 
 
 def test_one_stage_of_one_part_is_the_loader_without_stages_and_cut_as_grain_cuts() -> None:

@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsjax.config import EvalConfig
+from rsjax.clip import Video
+from rsjax.config import EvalConfig, SampleConfig
 from rsjax.data.store import Store, StoreError
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.control import other_clips
 from rsjax.evaluation.evaluate import Evaluation, evaluate
-from rsjax.pipeline.generator import Generated, Generator
+from rsjax.evaluation.metrics.delta_psnr import other_clips
+from rsjax.models.trained import TrainedModel
 from tests.pipeline import toy
 
 
@@ -19,13 +20,13 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 
 @pytest.fixture(scope="module")
-def generator(clips: Store) -> Generator:
-    return toy.generator(clips)
+def trained(clips: Store) -> TrainedModel:
+    return toy.trained(clips)
 
 
 @pytest.fixture(scope="module")
-def result(generator: Generator, clips: Store) -> Evaluation:
-    return evaluate(generator, clips)
+def result(trained: TrainedModel, clips: Store) -> Evaluation:
+    return evaluate(trained, clips)
 
 
 def held_out() -> list[dict[str, np.ndarray]]:
@@ -45,17 +46,13 @@ def abs_rel(truth: np.ndarray, depth: np.ndarray) -> float:
     return float((np.abs(truth - depth) / truth)[:, 1:].mean())
 
 
-def generated(generator: Generator, actions: np.ndarray) -> Generated:
+def generated(trained: TrainedModel, actions: np.ndarray) -> Video:
     """All clips in one batch."""
-    prompt = {
-        "rgb": generator.codec.encode_rgb(TRUTH["rgb"][:, :1]),
-        "depth": generator.codec.encode_depth(TRUTH["depth"][:, :1]),
-    }
-    return generator.generate(prompt, actions, generator.config.sample)
+    return trained.generate(TRUTH["rgb"][:, :1], actions, TRUTH["depth"][:, :1])
 
 
-def test_the_baselines_are_plain_numpys(generator: Generator, result: Evaluation) -> None:
-    codec = generator.codec
+def test_the_baselines_are_plain_numpys(clips: Store, result: Evaluation) -> None:
+    codec = toy.codec(clips)
     first = np.broadcast_to(TRUTH["rgb"][:, :1], TRUTH["rgb"].shape)
     reconstruction = codec.decode_rgb(codec.encode_rgb(TRUTH["rgb"]))
     assert result.metrics["psnr_repeat_first"] == pytest.approx(psnr(TRUTH["rgb"], first), rel=1e-4)
@@ -66,30 +63,27 @@ def test_the_baselines_are_plain_numpys(generator: Generator, result: Evaluation
     assert result.metrics["depth_absrel_tokenizer"] == pytest.approx(abs_rel(TRUTH["depth"], depth), rel=1e-4)
 
 
-def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(generator: Generator, result: Evaluation) -> None:
+def test_batches_with_a_filled_up_last_one_score_as_one_batch_does(trained: TrainedModel, result: Evaluation) -> None:
     """5 clips in batches of 2 against one batch of 5; ΔPSNR with the same key under other clips' actions."""
-    own = generated(generator, TRUTH["actions"])
+    own = generated(trained, TRUTH["actions"])
     assert own.depth is not None
     assert result.metrics["psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb), rel=1e-4)
     assert result.metrics["depth_absrel"] == pytest.approx(abs_rel(TRUTH["depth"], own.depth), rel=1e-4)
     others = other_clips(toy.TEST, draws=2, seed=0)
-    worse = [psnr(TRUTH["rgb"], generated(generator, TRUTH["actions"][order]).rgb) for order in others]
+    worse = [psnr(TRUTH["rgb"], generated(trained, TRUTH["actions"][order]).rgb) for order in others]
     assert result.metrics["delta_psnr"] == pytest.approx(psnr(TRUTH["rgb"], own.rgb) - np.mean(worse), abs=1e-4)
     assert result.metrics["delta_psnr"] != 0
 
 
-def test_own_actions_in_place_of_random_ones_make_no_difference(
-    generator: Generator, clips: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sampling key is the same: with the same actions every ΔPSNR is 0, at random draws too."""
     config = replace(
-        generator.config,
-        sample=replace(generator.config.sample, temperature=1.0, unmask="random"),
+        toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0)),
         eval=EvalConfig(clips=4, batch_size=4, action_draws=1, report_clips=1),
     )
-    monkeypatch.setattr(evaluation.control, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
-    monkeypatch.setattr(evaluation.control, "uniform_actions", lambda own, *_, seed: own[None])
-    metrics = evaluate(replace(generator, config=config), clips).metrics
+    monkeypatch.setattr(evaluation.delta_psnr, "other_clips", lambda clips, draws, seed: np.arange(clips)[None])
+    monkeypatch.setattr(evaluation.delta_psnr, "uniform_actions", lambda own, *_, seed: own[None])
+    metrics = evaluate(toy.trained(clips, config), clips).metrics
     deltas = {name: value for name, value in metrics.items() if name.startswith("delta_psnr")}
     assert len(deltas) == 14
     assert set(deltas.values()) == {0.0}

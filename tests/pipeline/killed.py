@@ -9,7 +9,7 @@ import sys
 from typing import Any
 
 from experiments.train import main
-from rsjax.pipeline import tokens
+from rsjax.tokenizers import tokenize
 from rsjax.training.checkpoint import Checkpoints
 
 
@@ -18,7 +18,7 @@ def die() -> None:
 
 
 def in_tokens() -> None:
-    record, count = tokens.token_record, 0
+    record, count = tokenize.token_record, 0
 
     def dying(*args: Any) -> Any:
         nonlocal count
@@ -27,7 +27,7 @@ def in_tokens() -> None:
             die()
         return record(*args)
 
-    tokens.token_record = dying  # type: ignore[assignment]
+    tokenize.token_record = dying  # type: ignore[assignment]
 
 
 def in_world_model() -> None:

@@ -1,6 +1,5 @@
 """Videos from a run through the command."""
 
-import dataclasses
 from pathlib import Path
 
 import av
@@ -10,8 +9,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 from rsjax.config import presets
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.base import create_model
 from rsjax.training.checkpoint import save_weights
+from tests.pipeline import toy
 from tests.pipeline.conftest import Commands
 
 PROGRAM = "experiments.generate"
@@ -83,7 +83,7 @@ def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
         (("--clips", 0, "--actions", tmp_path / "text.npy"), "text.npy: not a readable .npy file"),
         (("--clips", 0, "--fps", 0), "--fps is 0.0"),
         (("--clips", 0, "--frames", 1), "--frames is 1, of which 1 are given"),
-        (("--clips", 0, "--guidance", 2), "sample.guidance is 2.0 but the model never saw clips without actions"),
+        (("--clips", 0, "--guidance", 2), "model.sample.guidance is 2.0 but the model never saw clips without actions"),
     ):
         assert words in command.refused(PROGRAM, debug, "--out", tmp_path / "out", *arguments)
     assert "is not a run directory" in command.refused(PROGRAM, tmp_path)
@@ -91,8 +91,8 @@ def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
 
 
 def test_weights_of_another_architecture_are_refused(run: Path, command: Commands) -> None:
-    wide = dataclasses.replace(presets.debug().model, width=64)
-    save_weights(run / "world_model" / "weights", jax.jit(WorldModel(wide).init_params)(jax.random.key(0)))
+    wide = create_model(toy.with_model(presets.debug(), width=64))
+    save_weights(run / "world_model" / "weights", jax.jit(wide.init)(jax.random.key(0)))
     line = command.refused(PROGRAM, run, "--clips", 0)
     assert str(run / "world_model" / "weights") in line
     assert "does not fit this configuration" in line

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +13,22 @@ import pytest
 
 from experiments import train
 from experiments.cli import parse
-from rsjax.config import ConfigError, presets
+from rsjax.config import ConfigError, RoboScapeConfig, presets
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.depth import depth_scores
+from rsjax.evaluation.metrics.depth import depth_scores
+from rsjax.models.base import create_model
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.pipeline.own_data import on_store, relocated
 from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import tokenize
-from rsjax.pipeline.tokens import tokenize_store
-from rsjax.pipeline.transforms import token_clip
-from rsjax.pipeline.validation import token_batches
-from rsjax.training.checkpoint import save_weights
+from rsjax.pipeline.stages import prepare
+from rsjax.pipeline.validation import record_batches
+from rsjax.tokenizers.tokenize import tokenize_store
 from tests.bridge import BRIDGE, needs_bridge
 from tests.pipeline import toy
 from tests.pipeline.conftest import ROOT
-from tests.pipeline.test_feeding import damage
+from tests.pipeline.damage import damage
 
 
 @pytest.fixture
@@ -37,31 +36,33 @@ def clips(tmp_path: Path) -> Path:
     return toy.store(tmp_path / "clips").path
 
 
-def test_what_has_to_fit_the_clips_is_made_so(clips: Path) -> None:
+def test_what_has_to_fit_the_clips_follows_from_them(clips: Path) -> None:
     debug, sim = presets.debug(), toy.config().sim
     made = on_store(debug, clips)
     assert made.clips == dataclasses.replace(sim.clips, test_clips=toy.TEST)
-    assert made.model.action_dim == sim.action_dim
+    assert Architecture.create(made).action_inputs == sim.action_dim
     tiny = on_store(presets.get("tiny"), clips)
-    assert tiny.model.action_dim == 2 * sim.action_dim, "their sums come with the actions"
-    assert tiny.model.frames == presets.get("tiny").model.frames, "fewer frames leave positions over"
+    assert Architecture.create(tiny).action_inputs == 2 * sim.action_dim, "their sums come with the actions"
+    assert Architecture.create(tiny).frames == 6, "positions for the clips' frames, of which the preset's have more"
+    roomy = on_store(toy.with_model(presets.get("tiny"), max_frames=16), clips)
+    assert Architecture.create(roomy).frames == 16, "fewer frames leave positions over"
     large = on_store(presets.get("roboscape_s"), clips)
-    assert (large.tokenizer.image_size, large.model.grid) == (64, 4)
-    short = dataclasses.replace(debug.model, frames=5)
-    few = dataclasses.replace(debug, sim=dataclasses.replace(debug.sim, frames=4), model=short)
-    assert on_store(few, clips).model.frames == 6
+    assert (large.clips.image_size, large.grid) == (64, 4)
+    few = dataclasses.replace(debug, sim=dataclasses.replace(debug.sim, frames=4))
+    assert Architecture.create(on_store(few, clips)).frames == 6
 
 
 def test_fields_on_the_command_line_are_checked_against_the_store(clips: Path) -> None:
-    argv = ["debug", "--store", str(clips), "--model.frames", "7", "--loss.num-keypoints", "3"]
+    argv = ["debug", "--store", str(clips), "--model.max-frames", "7", "--model.loss.num-keypoints", "3"]
     config, _ = parse(argv, "train", "", train.Options())
-    assert (config.model.frames, config.loss.num_keypoints, config.data.key) == (7, 3, "toy")
+    assert isinstance(config.model, RoboScapeConfig)
+    assert (config.model.max_frames, config.model.loss.num_keypoints, config.data.key) == (7, 3, "toy")
     assert config.data.store == str(clips.absolute())
-    with pytest.raises(ConfigError, match="data.frames is 6 but model.frames holds positions for 5"):
-        parse(["debug", f"--store={clips}", "--model.frames", "5"], "train", "", train.Options())
+    with pytest.raises(ConfigError, match="clips have 6 frames but model.max_frames is 5"):
+        parse(["debug", f"--store={clips}", "--model.max-frames", "5"], "train", "", train.Options())
 
 
-def test_what_cannot_be_trained_on_is_told(tmp_path: Path) -> None:
+def test_a_store_that_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:
     debug = presets.debug()
     write_store(tmp_path / "few", "clips", {"train": [encode_clip(toy.clip(0))], "test": []}, {"key": "few"})
     with pytest.raises(StoreError, match="1 train and 0 test clips.*--test-share"):
@@ -75,7 +76,7 @@ def test_what_cannot_be_trained_on_is_told(tmp_path: Path) -> None:
     "changes",
     [{"action_mean": [0.0] * 3}, {"action_std": ["a"] * 28}, {"depth_range": "abc"}, {"depth_range": [2.0, 1.0]}],
 )
-def test_units_that_are_none_are_told(clips: Path, changes: dict[str, Any]) -> None:
+def test_statistics_that_are_none_are_refused(clips: Path, changes: dict[str, Any]) -> None:
     place = clips / "manifest.json"
     place.write_text(json.dumps(json.loads(place.read_text()) | changes))
     with pytest.raises(StoreError, match=r"manifest.json: no statistics of actions and depth \(.*\); make the store"):
@@ -89,29 +90,27 @@ def test_tokens_of_other_clips_do_not_count_as_this_runs(tmp_path: Path) -> None
     place.write_text(json.dumps(json.loads(place.read_text()) | {"key": "other"}))
     config = on_store(toy.config(), own.path)
     run = Run(config, tmp_path / "run", tmp_path)
-    (run.directory / "tokenizer").mkdir(parents=True)
-    params = toy.generator(own).codec.params
-    save_weights(run.output("tokenizer"), params)
+    toy.save_tokenizer(run)
     with run.stage("tokens"):
-        tokenize(run)
+        prepare(run)
     assert run.finished("tokens")
     own.path.rename(tmp_path / "moved")
     other.path.rename(own.path)
-    tokenize_store(open_store(own.path), config, params, tmp_path)
+    tokenized(open_store(own.path), tmp_path)
     there = Run(relocated(config, tmp_path / "moved"), run.directory, tmp_path)
     assert not there.finished("tokens")
     with pytest.raises(StoreError, match="holds tokens of other clips"):
-        there.open_tokens()
-    tokenize(there)
+        there.open_prepared()
+    prepare(there)
     assert there.finished("tokens")
-    assert there.open_tokens().path.parents[1] == tmp_path / "moved"
+    assert there.open_prepared().path.parents[1] == tmp_path / "moved"
 
 
 def test_a_moved_store_is_the_same_and_another_one_in_its_place_is_not(clips: Path, tmp_path: Path) -> None:
     config = on_store(presets.debug(), clips)
     keys = Run(config, tmp_path / "run", tmp_path).keys()
     clips.rename(tmp_path / "moved")
-    with pytest.raises(StoreError, match="no store is there; if it was moved, say where it lies with --store"):
+    with pytest.raises(StoreError, match="the store is missing; if it was moved, name its new path with --store"):
         Run(config, tmp_path / "run", tmp_path).open_clips()
     there = relocated(config, tmp_path / "moved")
     assert Run(there, tmp_path / "run", tmp_path).keys() == keys
@@ -141,21 +140,16 @@ def partly_blind(path: Path) -> Store:
 
 def test_depth_is_scored_where_clips_have_it_and_nothing_else_changes(tmp_path: Path) -> None:
     some, all_ = partly_blind(tmp_path / "some"), open_store(tmp_path / "whole")
-    generator = toy.generator(all_)
-    found, whole = evaluation.evaluate(generator, some), evaluation.evaluate(generator, all_)
+    trained = toy.trained(all_)
+    found, whole = evaluation.evaluate(trained, some), evaluation.evaluate(trained, all_)
     seen = [i for i in range(toy.TEST) if i not in BLIND["test"]]
     one_by_one = []
     for i in seen:
         clip = all_.source("test")[i]
-        prompt = {
-            "rgb": generator.codec.encode_rgb(clip["rgb"][None, :1]),
-            "depth": generator.codec.encode_depth(clip["depth"][None, :1]),
-        }
-        sample = generator.config.sample
-        made = generator.generate(prompt, clip["actions"][None], sample, index=np.array([i]))
+        made = trained.generate(clip["rgb"][:1], clip["actions"], clip["depth"][:1])
         assert made.depth is not None
         one_by_one.append(
-            float(depth_scores(clip["depth"][None, 1:], made.depth[:, 1:], alignment="none").abs_rel.mean())
+            float(depth_scores(clip["depth"][None, 1:], made.depth[None, 1:], alignment="none").abs_rel.mean())
         )
     assert found.metrics["depth_absrel"] == pytest.approx(np.mean(one_by_one), rel=1e-4)
     assert found.metrics["psnr_tokenizer"] == whole.metrics["psnr_tokenizer"]
@@ -173,7 +167,7 @@ def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
     meta = {name: value for name, value in whole.manifest.items() if name not in ("splits", "format", "kind")}
     write_store(tmp_path / "blind", "clips", splits, meta | {"depth_range": None})
     blind = open_store(tmp_path / "blind")
-    found = evaluation.evaluate(toy.generator(blind), blind)
+    found = evaluation.evaluate(toy.trained(blind), blind)
     assert not [name for name in found.metrics if "depth" in name]
     assert "predicted_depth" not in found.shown
     assert np.isfinite(found.metrics["psnr"])
@@ -182,23 +176,25 @@ def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
 def test_a_damaged_train_clip_does_not_keep_a_run_from_its_scores(tmp_path: Path) -> None:
     clips = toy.store(tmp_path / "clips")
     damage(clips, "train", 0)
-    generator = toy.generator(clips)
-    assert np.isfinite(evaluation.evaluate(generator, clips).metrics["delta_psnr_uniform"])
+    assert np.isfinite(evaluation.evaluate(toy.trained(clips), clips).metrics["delta_psnr_uniform"])
     assert on_store(presets.debug(), clips.path).data.key == "toy"
 
 
 def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Path) -> None:
     clips = partly_blind(tmp_path / "some")
     config = on_store(toy.config(), clips.path)
-    codec = toy.generator(clips).codec
-    tokens = open_store(tokenize_store(clips, config, codec.params, tmp_path / "run"))
+    model, normalization = create_model(config), Normalization.create(clips)
+    tokens = tokenized(clips, tmp_path / "run")
     assert tokens.path.parent == (clips.path / "tokens")
-    assert tokenize_store(clips, config, codec.params, tmp_path / "run") == tokens.path, "they are there already"
-    transform = partial(token_clip, Normalization.create(clips), config.model.integrate_actions)
+    assert tokenized(clips, tmp_path / "run").path == tokens.path, "they are there already"
     for split, blind in BLIND.items():
         source = tokens.source(split)
-        (batch,) = token_batches(source, transform, len(source))
+        (batch,) = record_batches(model, normalization, source, len(source), range(len(source)))
         assert np.flatnonzero(np.asarray(batch.has_depth) == 0).tolist() == list(blind)
+
+
+def tokenized(clips: Store, place: Path) -> Store:
+    return tokenize_store(clips, toy.codec(clips), toy.config().clips.image_size, place, 0.01)
 
 
 def commanded(folder: Path, module: str, *arguments: object) -> str:
@@ -213,7 +209,7 @@ def test_real_episodes_from_recording_to_video(tmp_path: Path) -> None:
     """The README's commands, shortened: ingest, train ``debug`` instead of ``tiny``, generate."""
     store, run = tmp_path / "bridge", tmp_path / "run"
     commanded(tmp_path, "ingest", "rlds", BRIDGE, "--out", store, "--windows.rate", 0, "--windows.frames", 8)
-    few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--sample.steps", 2]
+    few = ["--tokenizer-train.steps", 2, "--train.steps", 2, "--model.sample.steps", 2]
     few += ["--eval.clips", 2, "--eval.batch-size", 2, "--eval.action-draws", 1]
     told = commanded(tmp_path, "train", "debug", "--store", store, "--run-dir", run, *few)
     assert "no clip has depth, so the depth branch trains with its loss masked" in told

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import pytest
 
-from rsjax.config import Config, PartConfig, StageConfig, from_dict, presets
+from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, from_dict, presets
 from rsjax.data.store import write_store
 from rsjax.files import FileError
 from rsjax.pipeline import provenance
@@ -69,8 +69,8 @@ def store(path: Path, count: int = 2, key: str = "k") -> None:
 
 def test_data_are_known_by_key_counts_and_bytes_and_every_change_of_them_shows(run: Run) -> None:
     elsewhere = run.data_directory / "other"
-    stages = (StageConfig((PartConfig(), PartConfig(store=str(elsewhere)))),)
-    run = replace(run, config=replace(DEBUG, train=replace(DEBUG.train, stages=stages)))
+    stages = (CurriculumStageConfig((ComponentConfig(), ComponentConfig(store=str(elsewhere)))),)
+    run = replace(run, config=replace(DEBUG, train=replace(DEBUG.train, curriculum=stages)))
     assert data_fingerprints(run) == {}
     for path in (run.clips, run.output("tokens"), elsewhere):
         store(path)

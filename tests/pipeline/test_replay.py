@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
@@ -11,8 +10,6 @@ from rsjax.errors import UserError
 from rsjax.pipeline import stages
 from rsjax.pipeline.replay import replay, skipped_steps
 from rsjax.pipeline.run import Run
-from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.training.checkpoint import save_weights
 from rsjax.training.skipped import read_skipped
 from tests.pipeline import toy
 
@@ -23,10 +20,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Run:
     cfg = toy.config()
     run = Run(replace(cfg, train=replace(cfg.train, steps=4)), *(tmp_path_factory.mktemp(name) for name in "rd"))
     toy.store(run.clips)
-    (run.directory / "tokenizer").mkdir()
-    params = jax.jit(Tokenizer(cfg.tokenizer).init_params)(jax.random.key(0))
-    save_weights(run.directory / "tokenizer" / "weights", params)
-    stages.tokenize(run)
+    toy.save_tokenizer(run)
+    stages.prepare(run)
     tokens = open_store(run.output("tokens"))
     splits = {split: [tokens.source(split)[i] for i in range(len(tokens.source(split)))] for split in tokens.splits}
     splits["train"][1]["actions"] = np.full_like(splits["train"][1]["actions"], np.nan)
@@ -46,5 +41,5 @@ def test_the_clip_that_left_a_step_out_is_found(trained: Run) -> None:
 
 
 def test_a_step_that_was_not_left_out_is_refused(trained: Run) -> None:
-    with pytest.raises(UserError, match="step 99 was not left out .left out: "):
+    with pytest.raises(UserError, match="step 99 was not skipped .skipped: "):
         next(replay(trained, "world_model", 99))

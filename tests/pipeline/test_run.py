@@ -6,15 +6,22 @@ from typing import Any
 
 import pytest
 
-from rsjax.config import Config, PartConfig, StageConfig, presets
+from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, presets, to_dict
 from rsjax.pipeline import run as module
 from rsjax.pipeline.run import STAGES, TRAINED, Run, RunError
+from tests.models.toy_family import ToyConfig
 
 DEBUG = presets.debug()
 
 
-def changed(section: str, field: str, value: Any) -> Config:
-    return replace(DEBUG, **{section: replace(getattr(DEBUG, section), **{field: value})})
+def changed(path: str, value: Any) -> Config:
+    """The preset with one field set, such as ``model.loss.gamma``."""
+    return put(DEBUG, path.split("."), value)
+
+
+def put(config: Any, path: list[str], value: Any) -> Any:
+    name, *rest = path
+    return replace(config, **{name: put(getattr(config, name), rest, value) if rest else value})
 
 
 def keys(config: Config) -> dict[str, str]:
@@ -31,47 +38,53 @@ def make(run: Run, *stages: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "field", "value", "first"),
+    ("field", "value", "first"),
     [
-        ("sim", "seed", 1, "collect"),
-        ("sim", "episodes", 9, "collect"),
-        ("tokenizer", "channels", 32, "tokenizer"),
-        ("tokenizer_train", "entropy", 0.2, "tokenizer"),
-        ("model", "width", 64, "world_model"),
-        ("mask", "corruption_keep", 0.5, "world_model"),
-        ("loss", "gamma", 4.0, "world_model"),
-        ("train", "ema", 0.5, "world_model"),
-        ("train", "stages", (StageConfig(epochs=2.0),), "world_model"),
-        ("train", "restarts", (3,), "world_model"),
-        ("sample", "steps", 3, "evaluation"),
-        ("eval", "action_draws", 2, "evaluation"),
+        ("sim.seed", 1, "collect"),
+        ("sim.episodes", 9, "collect"),
+        ("tokenizer.channels", 32, "tokenizer"),
+        ("tokenizer_train.entropy_weight", 0.2, "tokenizer"),
+        ("model.width", 64, "world_model"),
+        ("model.mask.corruption_keep", 0.5, "world_model"),
+        ("model.loss.gamma", 4.0, "world_model"),
+        ("train.ema", 0.5, "world_model"),
+        ("train.curriculum", (CurriculumStageConfig(epochs=2.0),), "world_model"),
+        ("train.restarts", (3,), "world_model"),
+        ("model.sample.steps", 3, "evaluation"),
+        ("eval.action_draws", 2, "evaluation"),
     ],
 )
-def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(
-    section: str, field: str, value: Any, first: str
-) -> None:
-    before, after = keys(DEBUG), keys(changed(section, field, value))
+def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(field: str, value: Any, first: str) -> None:
+    before, after = keys(DEBUG), keys(changed(field, value))
     assert tuple(before) == STAGES
     different = [stage for stage in STAGES if before[stage] != after[stage]]
     assert different == list(STAGES[STAGES.index(first) :])
 
 
 @pytest.mark.parametrize(
-    ("section", "field", "value"),
+    ("field", "value"),
     [
-        ("sim", "workers", 3),
-        ("tokenizer_train", "checkpoint_every", 9),
-        ("train", "placement", "mesh"),
-        ("train", "accumulate", 2),
-        ("train", "eval_every", 5),
-        ("train", "keep_best", False),
-        ("train", "workers", 2),
-        ("train", "wandb", "robots"),
-        ("train", "profile", 3),
+        ("sim.workers", 3),
+        ("tokenizer_train.checkpoint_every", 9),
+        ("train.sharding", "mesh"),
+        ("train.accumulate", 2),
+        ("train.eval_every", 5),
+        ("train.keep_best", False),
+        ("train.workers", 2),
+        ("train.wandb", "robots"),
+        ("train.profile", 3),
     ],
 )
-def test_how_a_run_is_carried_out_changes_no_key(section: str, field: str, value: Any) -> None:
-    assert keys(changed(section, field, value)) == keys(DEBUG)
+def test_how_a_run_is_carried_out_changes_no_key(field: str, value: Any) -> None:
+    assert keys(changed(field, value)) == keys(DEBUG)
+
+
+def test_a_model_without_tokens_has_no_tokenizer_stage_and_does_not_depend_on_its_settings() -> None:
+    tokenless, other = (replace(config, model=ToyConfig()) for config in (DEBUG, changed("tokenizer.channels", 32)))
+    stages = tuple(stage for stage in STAGES if stage != "tokenizer")
+    assert Run(tokenless, Path("run"), Path("data")).stages == tuple(keys(tokenless)) == stages
+    assert keys(tokenless) == keys(other)
+    assert keys(tokenless)["world_model"] != keys(replace(tokenless, model=ToyConfig(start=0.5)))["world_model"]
 
 
 def test_every_stages_key_is_its_own() -> None:
@@ -87,7 +100,7 @@ def test_a_stage_is_finished_when_its_work_and_its_output_are_there(tmp_path: Pa
         run.output(stage).unlink()
         assert not run.finished(stage), "its output was deleted"
     make(run, "evaluation")
-    assert not Run(changed("sample", "steps", 3), run.directory, run.data_directory).finished("evaluation")
+    assert not Run(changed("model.sample.steps", 3), run.directory, run.data_directory).finished("evaluation")
 
 
 def test_an_interrupted_stage_is_not_finished_and_its_seconds_add_up(
@@ -112,7 +125,7 @@ def test_an_interrupted_stage_is_not_finished_and_its_seconds_add_up(
         clock[0] = 7.0
     assert run.finished("tokenizer")
     assert run.mark("tokenizer")["seconds"] == 7.0
-    with Run(changed("tokenizer", "channels", 32), tmp_path, tmp_path).stage("tokenizer"):
+    with Run(changed("tokenizer.channels", 32), tmp_path, tmp_path).stage("tokenizer"):
         clock[0] = 8.0
     assert run.mark("tokenizer")["seconds"] == 1.0, "another configuration's seconds do not count"
 
@@ -122,7 +135,7 @@ def test_another_configurations_training_is_refused_by_name_and_nothing_changes(
     run.prepare(overwrite=False)
     make(run, *STAGES)
     files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    other = Run(changed("model", "width", 64), run.directory, run.data_directory)
+    other = Run(changed("model.width", 64), run.directory, run.data_directory)
     with pytest.raises(
         RunError, match=r"a world model of another .* \(model.width is 32 there, 64 here\); .*--overwri"
     ):
@@ -131,49 +144,55 @@ def test_another_configurations_training_is_refused_by_name_and_nothing_changes(
 
 
 @pytest.mark.parametrize(
-    ("section", "field", "value", "removed"),
+    ("field", "value", "removed"),
     [
-        ("model", "width", 64, ["world_model"]),
-        ("tokenizer", "channels", 32, list(TRAINED)),
-        ("sample", "steps", 3, []),
+        ("model.width", 64, ["world_model"]),
+        ("tokenizer.channels", 32, list(TRAINED)),
+        ("model.sample.steps", 3, []),
     ],
 )
 def test_overwrite_removes_the_trained_stages_that_differ_and_no_more(
-    tmp_path: Path, section: str, field: str, value: Any, removed: list[str]
+    tmp_path: Path, field: str, value: Any, removed: list[str]
 ) -> None:
     run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
     run.prepare(overwrite=False)
     make(run, *STAGES)
-    other = Run(changed(section, field, value), run.directory, run.data_directory)
+    other = Run(changed(field, value), run.directory, run.data_directory)
     other.prepare(overwrite=True)
     assert [stage for stage in STAGES if not (run.directory / stage).exists()] == removed
-    assert json.loads((run.directory / "config.json").read_text())[section][field] == value
+    assert json.loads((run.directory / "config.json").read_text()) == to_dict(other.config)
 
 
 def test_a_run_is_resumed_though_how_it_is_carried_out_differs(tmp_path: Path) -> None:
     run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
     run.prepare(overwrite=False)
     make(run, *STAGES)
-    otherwise = replace(DEBUG.train, eval_every=5, placement="mesh", keep_last=7, wandb="robots", workers=2)
+    otherwise = replace(DEBUG.train, eval_every=5, sharding="mesh", keep_last=7, wandb="robots", workers=2)
     other = Run(replace(DEBUG, train=otherwise), run.directory, run.data_directory)
     other.prepare(overwrite=False)
     assert all(other.finished(stage) for stage in STAGES)
 
 
 def test_only_fields_that_change_the_refused_stage_are_named_down_to_those_of_a_curriculum(tmp_path: Path) -> None:
-    two = replace(DEBUG.train, stages=(StageConfig(), StageConfig((PartConfig(difficulties=("simple",)),), epochs=2.0)))
+    two = replace(
+        DEBUG.train,
+        curriculum=(
+            CurriculumStageConfig(),
+            CurriculumStageConfig((ComponentConfig(difficulties=("simple",)),), epochs=2.0),
+        ),
+    )
     run = Run(replace(DEBUG, train=two), tmp_path / "run", tmp_path / "data")
     run.prepare(overwrite=False)
     make(run, *STAGES)
-    changes = replace(two.stages[1], epochs=3.0, restart=True)
-    loop = replace(two, stages=(two.stages[0], changes), log_every=77, skip_budget=3, ema=0.3)
-    config = replace(DEBUG, train=loop, sample=replace(DEBUG.sample, steps=3))
-    with pytest.raises(RunError) as told:
+    changes = replace(two.curriculum[1], epochs=3.0, restart=True)
+    loop = replace(two, curriculum=(two.curriculum[0], changes), log_every=77, skip_budget=3, ema=0.3)
+    config = replace(changed("model.sample.steps", 3), train=loop)
+    with pytest.raises(RunError) as error:
         Run(config, run.directory, run.data_directory).prepare(overwrite=False)
-    named = re.search(r"of another configuration \((.*)\);", str(told.value))
+    named = re.search(r"of another configuration \((.*)\);", str(error.value))
     assert named and set(named[1].split("; ")) == {
-        "train.stages.1.epochs is 2.0 there, 3.0 here",
-        "train.stages.1.restart is False there, True here",
+        "train.curriculum.1.epochs is 2.0 there, 3.0 here",
+        "train.curriculum.1.restart is False there, True here",
         f"train.ema is {two.ema} there, 0.3 here",
     }
 
@@ -182,8 +201,8 @@ def test_a_field_that_one_side_does_not_have_is_named(tmp_path: Path) -> None:
     run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
     run.prepare(overwrite=False)
     make(run, *STAGES)
-    longer = Run(changed("train", "stages", (StageConfig(),)), run.directory, run.data_directory)
-    with pytest.raises(RunError, match=r"train.stages.0.epochs is not set there, 1.0 here"):
+    longer = Run(changed("train.curriculum", (CurriculumStageConfig(),)), run.directory, run.data_directory)
+    with pytest.raises(RunError, match=r"train.curriculum.0.epochs is not set there, 1.0 here"):
         longer.prepare(overwrite=False)
 
 

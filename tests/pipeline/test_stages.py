@@ -11,14 +11,15 @@ import pytest
 
 from rsjax.config import LoopConfig, TokenizerTrainConfig
 from rsjax.data.store import write_store
-from rsjax.pipeline import jobs, stages
-from rsjax.pipeline.generator import load_tokenizer
+from rsjax.models.roboscape.model import RoboScape
+from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
-from rsjax.training.objectives import TokenizerObjective
+from rsjax.pipeline.trained import load_tokenizer
+from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.training.state import TrainState, create_state
 from tests.pipeline import toy
 
-WHOLE = TokenizerTrainConfig(steps=2, perceptual=1.0, adversarial=0.1)
+WHOLE = TokenizerTrainConfig(steps=2, perceptual_weight=1.0, adversarial_weight=0.1)
 
 
 def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Run, TrainState]:
@@ -27,17 +28,17 @@ def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.Monk
     toy.store(run.clips)
     states = []
 
-    def untrained(objective: TokenizerObjective, loop: LoopConfig, *_: Any, **__: Any) -> TrainState:
-        states.append(create_state(objective, loop))
+    def untrained(model: TokenizerTraining, loop: LoopConfig, *_: Any, **__: Any) -> TrainState:
+        states.append(create_state(model, loop))
         return states[0]
 
-    monkeypatch.setattr(jobs, "fit", untrained)
+    monkeypatch.setattr(stages, "fit", untrained)
     (run.directory / "tokenizer").mkdir(parents=True)
     stages.train_tokenizer(run, resume=True)
     return run, states[0]
 
 
-def test_the_discriminator_stays_behind_and_the_missing_term_is_told_once(
+def test_the_discriminator_stays_behind_and_the_missing_term_is_noted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, state = staged(WHOLE, tmp_path, monkeypatch)
@@ -46,10 +47,10 @@ def test_the_discriminator_stays_behind_and_the_missing_term_is_told_once(
     assert capsys.readouterr().out.count("the LPIPS term is off: tokenizer_train.lpips_weights is empty") == 1
 
 
-def test_what_is_not_asked_for_is_not_missed(
+def test_a_term_that_is_off_is_not_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, state = staged(replace(WHOLE, perceptual=0.0, adversarial=0.0), tmp_path, monkeypatch)
+    run, state = staged(replace(WHOLE, perceptual_weight=0.0, adversarial_weight=0.0), tmp_path, monkeypatch)
     jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params)
     assert "LPIPS" not in capsys.readouterr().out
 
@@ -72,7 +73,8 @@ def test_weights_from_elsewhere_bring_the_reminder_of_their_tokens(
     run = Run(cfg, tmp_path / "run", tmp_path / "data")
     meta = {"key": "toy", "action_mean": [0.0], "action_std": [1.0], "depth_range": None}
     write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, meta)
-    monkeypatch.setattr(jobs, "fit", lambda *_, **__: SimpleNamespace(weights={}))
+    monkeypatch.setattr(stages, "fit", lambda *_, **__: SimpleNamespace(weights={}))
     monkeypatch.setattr(stages, "save_weights", lambda *_: None)
+    monkeypatch.setattr(RoboScape, "pretrained_shapes", lambda *_: {})
     stages.train_world_model(run, resume=True)
     assert capsys.readouterr().out.count("the tokens of this run's tokenizer") == reminded

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, TokenizerConfig
+from rsjax.convert import directory
 from rsjax.data.store import write_store
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.errors import UserError
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.stages import run_all, train_tokenizer, train_world_model
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.training.pretrained import PartError, load_part, save_part
 from tests.pipeline import toy
 
 
@@ -25,10 +26,10 @@ def random_params(init: Any) -> Any:
 def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path) -> None:
     cfg, public = toy.config(), tmp_path / "public"
     tokenizer = random_params(Tokenizer(cfg.tokenizer).init_params)
-    alone = replace(cfg.model, depth=False, action_dim=0)
-    model = random_params(WorldModel(alone).init_params)
-    save_part(public, cfg.tokenizer, tokenizer)
-    save_part(public, alone, model)
+    alone = replace(Architecture.create(cfg), use_depth=False, action_encoder="none", action_inputs=0)
+    model = random_params(Transformer(alone).init_params)
+    directory.save(public, cfg.tokenizer, tokenizer)
+    directory.save(public, alone, model)
     cfg = replace(
         cfg,
         tokenizer_train=replace(cfg.tokenizer_train, start_from=str(public), steps=0),
@@ -42,17 +43,17 @@ def test_a_run_of_no_steps_keeps_the_weights_that_it_starts_from(tmp_path: Path)
     write_store(run.output("tokens"), "tokens", {"train": iter([{"rgb": np.zeros(3, np.int32)}])}, meta)
     train_world_model(run, resume=True)
     # A run directory is laid out as the converted one.
-    jax.tree.map(np.testing.assert_array_equal, load_part(run.directory, TokenizerConfig)[1], tokenizer)
-    begun = load_part(run.directory, ModelConfig)[1]
+    jax.tree.map(np.testing.assert_array_equal, directory.load_tokenizer(run.directory)[1], tokenizer)
+    begun = directory.load_world_model(run.directory)[1]
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], model["blocks"]["rgb"])
     assert not np.any(begun["action_encoder"]["kernel"])
 
 
 @pytest.mark.parametrize("section", ["tokenizer_train", "train"])
-def test_a_path_without_weights_is_told_before_anything_is_simulated(tmp_path: Path, section: str) -> None:
+def test_a_path_without_weights_is_an_error_before_anything_is_simulated(tmp_path: Path, section: str) -> None:
     cfg = toy.config()
     loop = replace(getattr(cfg, section), start_from=str(tmp_path / "nowhere"))
     run = Run(replace(cfg, **{section: loop}), tmp_path / "run", tmp_path / "data")
-    with pytest.raises(PartError, match="nowhere"):
+    with pytest.raises(UserError, match="nowhere"):
         run_all(run)
     assert not run.clips.exists() and not run.mark("collect")

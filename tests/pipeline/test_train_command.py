@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from experiments import train
-from rsjax.config import presets
-from rsjax.pipeline.generator import load_tokenizer, load_world_model
 from rsjax.pipeline.run import STAGES
+from rsjax.pipeline.trained import load
 from rsjax.sim import gl as gl_module
 from rsjax.training.log import read_log
 from tests.pipeline.conftest import Commands
@@ -43,8 +42,9 @@ def metrics(run: Path) -> dict[str, float]:
 
 def assert_same_results(run: Path, other: Path) -> None:
     """The same weights, and the same scores but for the time."""
-    for load in (load_tokenizer, load_world_model):
-        jax.tree.map(np.testing.assert_array_equal, *(load(presets.debug(), place) for place in (run, other)))
+    trained = [load(place) for place in (run, other)]
+    jax.tree.map(np.testing.assert_array_equal, *(model.params for model in trained))
+    jax.tree.map(np.testing.assert_array_equal, *(model.assets.tokenizer for model in trained))
     one, two = metrics(run), metrics(other)
     assert one | {"seconds_total": 0} == two | {"seconds_total": 0}
 
@@ -62,7 +62,7 @@ def test_the_whole_job_leaves_a_report_and_metrics(debug: Path) -> None:
     assert scores["seconds_total"] == pytest.approx(sum(seconds), abs=0.1)
     assert not list(debug.rglob("*.tmp")) + list(debug.rglob("*.building"))
     page = (debug / "report.html").read_text()
-    assert "held-out clip" in page
+    assert "test clip" in page
     assert "data:image/webp;base64," in page
 
 
@@ -95,17 +95,21 @@ def test_killed_twice_and_run_again_it_gives_the_same_weights(debug: Path, tmp_p
 
 
 def test_another_way_to_decode_runs_only_what_depends_on_it(run: Path, command: Commands) -> None:
-    done = command.train(run, "--sample.steps", 3)
+    done = command.train(run, "--model.sample.steps", 3)
     assert done.returncode == 0, done.stderr
     assert skipped(done.stdout) == list(STAGES[:4])
-    assert json.loads((run / "config.json").read_text())["sample"]["steps"] == 3
+    assert json.loads((run / "config.json").read_text())["model"]["sample"]["steps"] == 3
 
 
 @pytest.mark.parametrize(
     ("field", "value", "line"),
     [
         ("--tokenizer.res-blocks", 2, "holds a tokenizer of another configuration (tokenizer.res_blocks is 1 there, 2"),
-        ("--loss.gamma", 4.0, "holds a world model of another configuration (loss.gamma is 5.0 there, 4.0 here)"),
+        (
+            "--model.loss.gamma",
+            4.0,
+            "holds a world model of another configuration (model.loss.gamma is 5.0 there, 4.0 here)",
+        ),
     ],
 )
 def test_another_configuration_is_refused(debug: Path, command: Commands, field: str, value: float, line: str) -> None:
@@ -119,8 +123,8 @@ def test_another_configuration_is_refused(debug: Path, command: Commands, field:
 @pytest.mark.parametrize(
     ("flag", "gone", "scores_gone"),
     [
-        ("--model.depth", {"depth"}, {"depth_absrel", "depth_delta1"}),
-        ("--loss.keypoints", {"keypoint", "attention"}, set()),
+        ("--model.use-depth", {"depth"}, {"depth_absrel", "depth_delta1"}),
+        ("--model.loss.use-keypoints", {"keypoint", "attention"}, set()),
     ],
 )
 def test_a_part_that_is_switched_off_is_gone_and_the_rest_runs(
@@ -133,7 +137,7 @@ def test_a_part_that_is_switched_off_is_gone_and_the_rest_runs(
     assert before - after == gone
     assert scores_gone == {name for name in scores_gone if name not in metrics(run)}
     assert metrics(debug).keys() - metrics(run).keys() >= scores_gone
-    assert "held-out clip" in (run / "report.html").read_text()
+    assert "test clip" in (run / "report.html").read_text()
 
 
 def test_a_truncated_store_is_named_and_deleting_it_cures(run: Path, debug: Path, command: Commands) -> None:
@@ -171,5 +175,5 @@ def test_without_opengl_one_line_says_what_to_install(
 
 def test_a_run_that_left_no_step_out_says_so(debug: Path, command: Commands) -> None:
     done = command("experiments.replay", debug)
-    assert done.returncode == 0 and "no step of world_model was left out" in done.stdout
-    assert "step 3 was not left out (left out: none)" in command.refused("experiments.replay", debug, "--step", "3")
+    assert done.returncode == 0 and "no step of world_model was skipped" in done.stdout
+    assert "step 3 was not skipped (skipped: none)" in command.refused("experiments.replay", debug, "--step", "3")

@@ -1,7 +1,9 @@
 """A run small enough to make in no time, on clips that no simulator made: coloured noise that drifts."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,9 +12,13 @@ from rsjax.clip import Clip
 from rsjax.config import Config, EvalConfig, SampleConfig, presets
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, encode_clip, open_store, write_store
-from rsjax.models.roboscape.world_model import WorldModel
-from rsjax.pipeline.generator import Codec, Generator
+from rsjax.models.base import Assets, create_model
+from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.run import Run
+from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
+from rsjax.training.checkpoint import save_weights
 
 TRAIN, TEST = 3, 5
 SUCCESS = (False, False, True, False, True)  # of the test clips, at their end
@@ -23,11 +29,15 @@ def config() -> Config:
     """``debug``, decoded in a way that does not depend on a clip's place in its batch."""
     debug = presets.debug()
     return replace(
-        debug,
+        with_model(debug, sample=SampleConfig(steps=2, unmask="greedy")),
         sim=replace(debug.sim, episodes=TRAIN + TEST, test_episodes=TEST),
-        sample=SampleConfig(steps=2, unmask="greedy"),
         eval=EvalConfig(clips=TEST, batch_size=2, action_draws=2, report_clips=3),
     )
+
+
+def with_model(config: Config, **changes: Any) -> Config:
+    """The configuration with fields of its model changed."""
+    return replace(config, model=replace(config.model, **changes))
 
 
 def clip(number: int, success: bool = False) -> Clip:
@@ -63,12 +73,36 @@ def store(path: Path) -> Store:
     return open_store(path)
 
 
-def generator(clips: Store) -> Generator:
-    """An untrained one."""
-    cfg = config()
+def trained(clips: Store, cfg: Config | None = None) -> TrainedModel:
+    """A model with random parameters; that of :func:`config` if not given."""
+    cfg = cfg or config()
+    return TrainedModel(cfg, create_model(cfg), world_model_params(cfg), assets(clips))
+
+
+def assets(clips: Store) -> Assets:
+    return Assets(Normalization.create(clips), tokenizer_params())
+
+
+def codec(clips: Store) -> Codec:
+    """That of :func:`trained`."""
+    return Codec(config().tokenizer, tokenizer_params(), Normalization.create(clips))
+
+
+@cache
+def world_model_params(config: Config) -> Params:
+    """Random parameters: fresh heads are so even that actions hardly change what is most probable."""
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(cfg.model).init_params, jax.random.key(0))
-    # Fresh heads are so even that actions hardly change what is most probable.
-    params = jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
-    tokenizer = jax.jit(Tokenizer(cfg.tokenizer).init_params)(jax.random.key(1))
-    return Generator(cfg, Codec(cfg, tokenizer, Normalization.create(clips)), params)
+    shapes = jax.eval_shape(create_model(config).init, jax.random.key(0))
+    return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
+
+
+@cache
+def tokenizer_params() -> Params:
+    """Those of an untrained tokenizer."""
+    return jax.jit(Tokenizer(config().tokenizer).init_params)(jax.random.key(1))
+
+
+def save_tokenizer(run: Run) -> None:
+    """Puts the untrained tokenizer where the run's own would be."""
+    run.output("tokenizer").parent.mkdir(parents=True)
+    save_weights(run.output("tokenizer"), tokenizer_params())

@@ -20,7 +20,7 @@ from rsjax.data.loader import batches
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store, write_store
 from rsjax.files import write_atomically
-from rsjax.models.roboscape.losses import Term
+from rsjax.trainable import StepContext, Term
 from rsjax.training.checkpoint import save_weights
 from tests.training import toy
 
@@ -36,17 +36,17 @@ class Heavy(toy.Regression):
     poisoned: tuple[int, ...] = ()
 
     @property
-    def weights(self) -> dict[str, float]:
-        return super().weights | {"weight": 1.0}
+    def loss_weights(self) -> dict[str, float]:
+        return super().loss_weights | {"weight": 1.0}
 
     def init(self, key: Any) -> Any:
         return super().init(key) | {"ballast": jax.random.normal(key, (200_000,))}
 
-    def terms(self, params: Any, batch: Any, key: Any, around: Any) -> dict[str, Term]:
-        numbers = jnp.isin(around.step, jnp.array(self.poisoned or (-1,)))
+    def loss_terms(self, params: Any, batch: Any, key: Any, context: StepContext) -> dict[str, Term]:
+        poisoned = jnp.isin(context.step, jnp.array(self.poisoned or (-1,)))
         ballast = jnp.sum(jnp.square(params["ballast"]))
-        weight = (jnp.where(numbers, jnp.nan, ballast), jnp.float32(params["ballast"].size))
-        return super().terms(params, batch, key, around) | {"weight": weight}
+        weight = (jnp.where(poisoned, jnp.nan, ballast), jnp.float32(params["ballast"].size))
+        return super().loss_terms(params, batch, key, context) | {"weight": weight}
 
 
 def make_store(path: Path) -> None:
@@ -74,14 +74,14 @@ def main() -> None:
         log_every=1,
         checkpoint_every=options.every,
         skip_budget=options.budget,
-        placement="jit",
+        sharding="jit",
     )
     source = open_store(options.store).source("train")
     mark(options.folder, False)
     state = toy.train(
         loop,
         options.folder,
-        objective=Heavy(poisoned=tuple(options.poisoned)),
+        model=Heavy(poisoned=tuple(options.poisoned)),
         loader=lambda data: batches(
             source, toy.jitter, loop.batch_size, seed=3, state=data, quarantine=options.folder / QUARANTINE
         ),

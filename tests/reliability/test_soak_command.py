@@ -22,5 +22,5 @@ def test_a_soak_of_the_main_job_passes_and_lists_what_was_survived(
 
 def test_a_reference_of_another_configuration_is_refused(debug: Path, tmp_path: Path, command: Commands) -> None:
     places = ("--reference", debug, "--out", tmp_path / "soak")
-    line = command.refused("tests.soak", "debug", *places, "--loss.gamma", 4.0)
+    line = command.refused("tests.soak", "debug", *places, "--model.loss.gamma", 4.0)
     assert f"{debug}: holds no finished world_model of this configuration" in line

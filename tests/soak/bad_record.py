@@ -34,7 +34,7 @@ def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
     """
     rng, place = random.Random(f"{soak.options.seed} record"), soak.out / "bad-record"
     shutil.rmtree(place, ignore_errors=True)
-    for stage in ("collect", "tokenizer", "tokens"):
+    for stage in soak.all_stages[: soak.all_stages.index("world_model")]:
         copy_tree(soak.reference / stage, place / "whole" / stage)
     record = damage_record(place / "whole" / "tokens" / "store", rng)
     copy_tree(place / "whole", place / "killed")
@@ -61,7 +61,7 @@ def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
 def _target(soak: Soak, run: Path, interval: float) -> Target:
     records = len(open_store(run / "tokens" / "store").source("train"))
     steps = math.ceil(records / soak.config.train.batch_size) + 1
-    few = () if soak.config.train.stages else ("--train.steps", str(steps))
+    few = () if soak.config.train.curriculum else ("--train.steps", str(steps))
     every = ("--train.log-every", "1", "--train.checkpoint-every", str(max(1, steps // 4)))
     command = soak.command(run, soak.options.data_dir, *few, *every)
     return Target(command, (Stage(run / "world_model"),), run.with_name(f"{run.name}.log"), interval)

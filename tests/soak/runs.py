@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from rsjax.config import Config
-from rsjax.pipeline.run import STAGES, TRAINED, Run
+from rsjax.pipeline.run import TRAINED, Run
 from rsjax.training.log import read_log
 from tests.soak.attempt import last_logged
 from tests.soak.compare import compare_stages, compare_stores
@@ -60,9 +60,14 @@ class Soak:
         return self.options.out or Path("runs") / f"soak-{self.config.name}"
 
     @property
+    def all_stages(self) -> tuple[str, ...]:
+        """The stages of a run."""
+        return Run(self.config, self.out, self.options.data_dir).stages
+
+    @property
     def stages(self) -> tuple[str, ...]:
         """The stages that are hit."""
-        return STAGES if self.options.stage == "all" else (self.options.stage,)
+        return self.all_stages if self.options.stage == "all" else (self.options.stage,)
 
     @property
     def trained(self) -> tuple[str, ...]:
@@ -87,10 +92,10 @@ def make_reference(soak: Soak, show: Callable[[str], None]) -> None:
     Raises:
         SoakError: ``--reference`` is of another configuration or not finished, or making the run failed.
     """
-    folder, last = soak.reference, STAGES.index(soak.stages[-1])
+    folder, last = soak.reference, soak.all_stages.index(soak.stages[-1])
     if soak.options.reference is not None:
         run = Run(soak.config, folder, soak.options.data_dir)
-        if missing := [stage for stage in STAGES[: last + 1] if not run.finished(stage)]:
+        if missing := [stage for stage in soak.all_stages[: last + 1] if not run.finished(stage)]:
             raise SoakError(
                 f"{folder}: holds no finished {missing[0]} of this configuration; finish it, or leave --reference out, "
                 f"so that one is made"
@@ -104,14 +109,14 @@ def make_reference(soak: Soak, show: Callable[[str], None]) -> None:
     every_step = [word for stage in soak.trained for word in (f"--{SECTIONS[stage]}.log-every", "1")]
     command = soak.command(folder, soak.options.data_dir, "--no-resume", *every_step)
     stages = tuple(Stage(folder / stage) for stage in soak.stages)
-    run_without_faults(Target(command, stages, soak.out / "reference.log", to_the_end=soak.stages == STAGES))
+    run_without_faults(Target(command, stages, soak.out / "reference.log", to_the_end=soak.stages == soak.all_stages))
     (folder / NEVER_STOPPED).touch()
 
 
 def prepare(soak: Soak, place: Path) -> Target:
     """Prepares a run for faults: a directory that is empty except for the stages that the reference provides."""
-    run, whole = place / "run", soak.stages == STAGES
-    for stage in STAGES[: STAGES.index(soak.stages[0])]:
+    run, whole = place / "run", soak.stages == soak.all_stages
+    for stage in soak.all_stages[: soak.all_stages.index(soak.stages[0])]:
         copy_tree(soak.reference / stage, run / stage)
     place.mkdir(parents=True, exist_ok=True)
     saved = json.loads((soak.reference / "config.json").read_text())
@@ -141,7 +146,7 @@ def compare_with_reference(soak: Soak, place: Path) -> list[str]:
     """Returns the differences between a run with faults and the reference; none if they are bit-identical."""
     run, reference = place / "run", soak.reference
     lines = [f"{stage}: {line}" for stage in soak.trained for line in compare_stages(run / stage, reference / stage)]
-    if soak.stages == STAGES:
+    if soak.stages == soak.all_stages:
         pairs = ((run, place / "data"), (reference, soak.options.data_dir))
         lines += compare_stores(*(Run(soak.config, *pair).clips for pair in pairs))
         lines += compare_stores(run / "tokens" / "store", reference / "tokens" / "store")

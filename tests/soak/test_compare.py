@@ -74,7 +74,7 @@ def test_a_runs_own_path_does_not_count_in_its_lists(tmp_path: Path) -> None:
 
 
 def test_stages_differ_where_their_last_checkpoint_does(tmp_path: Path) -> None:
-    loop = LoopConfig(steps=4, batch_size=2, log_every=100, checkpoint_every=2, placement="jit")
+    loop = LoopConfig(steps=4, batch_size=2, log_every=100, checkpoint_every=2, sharding="jit")
     for name in ("one", "same"):
         save_weights(tmp_path / name / "weights", train(loop, tmp_path / name).weights)
     assert compare_stages(tmp_path / "one", tmp_path / "same") == []

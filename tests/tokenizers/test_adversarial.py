@@ -9,7 +9,7 @@ from rsjax.config import TokenizerTrainConfig
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages, updated_averages
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 
-TRAIN = TokenizerTrainConfig(adversarial=0.1, lecam_decay=0.9)
+TRAIN = TokenizerTrainConfig(adversarial_weight=0.1, lecam_decay=0.9)
 AVERAGES = {"real": jnp.float32(0.7), "fake": jnp.float32(-0.4)}
 
 

@@ -21,9 +21,7 @@ from rsjax.tokenizers.magvit2 import (
     to_unit,
 )
 
-SMALL = TokenizerConfig(
-    image_size=16, patch_size=2, channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6
-)
+SMALL = TokenizerConfig(patch_size=2, channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6)
 
 
 def random_params(init: Callable[[Any], Any]) -> Any:
@@ -89,13 +87,16 @@ def test_both_generations_have_the_published_encoder_and_decoder(
     assert counted == published
 
 
-@pytest.mark.parametrize("config", [p.tokenizer for p in PRESETS.values()] + [TokenizerConfig()], ids=repr)
-def test_tokens_and_images_have_the_configured_shapes(config: TokenizerConfig) -> None:
-    model = Tokenizer(config)
+USED = {(preset.tokenizer, preset.clips.image_size): name for name, preset in PRESETS.items()}
+
+
+@pytest.mark.parametrize(("config", "size"), USED, ids=USED.values())
+def test_tokens_and_images_have_the_presets_shapes(config: TokenizerConfig, size: int) -> None:
+    model, grid = Tokenizer(config), config.grid(size)
     shapes = jax.eval_shape(model.init_params, jax.random.key(0))
-    image = jax.ShapeDtypeStruct((2, config.image_size, config.image_size, 3), jnp.uint8)
+    image = jax.ShapeDtypeStruct((2, size, size, 3), jnp.uint8)
     tokens = jax.eval_shape(lambda p, x: model.apply({"params": p}, x, method="encode"), shapes, image)
-    assert (tokens.shape, tokens.dtype) == ((2, config.grid, config.grid), jnp.int32)
+    assert (tokens.shape, tokens.dtype) == ((2, grid, grid), jnp.int32)
     decoded = jax.eval_shape(lambda p, x: model.apply({"params": p}, x, method="decode"), shapes, tokens)
     assert (decoded.shape, decoded.dtype) == (image.shape, jnp.float32)
 

@@ -1,10 +1,10 @@
 """One of several processes that train together: ``python -m tests.training.hosts FOLDER [HOST:PORT PROCESSES ID]``.
 
-Without an address it joins the Slurm task that its environment describes, or trains alone on one device. Each way takes
-a few steps on the real loader's batches and saves a checkpoint in FOLDER/WAY: pmap of a small network (quickly
-compiled), fsdp of the world model. Several processes also save sharded checkpoints in FOLDER/checkpoints. Prints, as
-JSON, the losses of each way's steps with the clips' places in the batch, and what the processes exchange; the lead
-writes each way's last parameters to FOLDER/WAY-PROCESSES.npz.
+Without an address it joins the Slurm task that its environment describes, or trains alone on one device. Each sharding
+takes a few steps on the real loader's batches and saves a checkpoint in FOLDER/SHARDING: pmap of a small network
+(quickly compiled), fsdp of the world model. Several processes also save sharded checkpoints in FOLDER/checkpoints.
+Prints, as JSON, the losses of each sharding's steps with the clips' places in the batch, and what the processes
+exchange; the lead writes each sharding's last parameters to FOLDER/SHARDING-PROCESSES.npz.
 """
 
 import json
@@ -19,28 +19,29 @@ import numpy as np
 from rsjax.config import LoopConfig
 from rsjax.data.loader import Arrays, batches
 from rsjax.errors import UserError
-from rsjax.pipeline.transforms import token_batch
+from rsjax.models.roboscape.records import token_batch
+from rsjax.trainable import Trainable
 from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
-from rsjax.training.objectives import Objective
-from rsjax.training.placement import Placement
+from rsjax.training.sharding import Sharding
+from rsjax.training.step import train_step
 from tests.training.checkpoint_processes import save_together
-from tests.training.devices import LOOP, MODEL, STEPS, WITH_DEPTH, Small
+from tests.training.devices import CONFIG, LOOP, MODEL, SHARDINGS, STEPS, Small
 
-WAYS: dict[str, dict[str, Any]] = {"pmap": {"placement": "pmap"}, "fsdp": {"placement": "mesh", "fsdp": 2}}
-OBJECTIVES: dict[str, Objective] = {"pmap": Small(), "fsdp": WITH_DEPTH}
+MODELS: dict[str, Trainable[Any]] = {"pmap": Small(), "fsdp": MODEL}
 
 
 def records(count: int = 11) -> list[Arrays]:
     """Returns clips of uneven weight: every third one counts nothing, keypoints are hidden at random."""
-    rng, shape = np.random.default_rng(0), (MODEL.frames, MODEL.grid, MODEL.grid)
+    rng, clips, codes = np.random.default_rng(0), CONFIG.clips, 2**CONFIG.tokenizer.code_bits
+    shape = (clips.frames, CONFIG.grid, CONFIG.grid)
     return [
         {
-            "rgb": rng.integers(0, 2**MODEL.code_bits, shape, np.int32),
-            "depth": rng.integers(0, 2**MODEL.code_bits, shape, np.int32),
-            "actions": rng.normal(size=(MODEL.frames, MODEL.action_dim)).astype(np.float32),
-            "tracks": rng.random((7, MODEL.frames, 2)).astype(np.float32),
-            "visible": rng.random((7, MODEL.frames)) < rng.random(),
+            "rgb": rng.integers(0, codes, shape, np.int32),
+            "depth": rng.integers(0, codes, shape, np.int32),
+            "actions": rng.normal(size=(clips.frames, clips.action_dim)).astype(np.float32),
+            "tracks": rng.random((clips.tracks, clips.frames, 2)).astype(np.float32),
+            "visible": rng.random((clips.tracks, clips.frames)) < rng.random(),
             "weight": np.asarray(number % 3 > 0, np.float32),
             "has_depth": np.asarray(number % 4 > 0, np.float32),
         }
@@ -52,24 +53,24 @@ def as_is(record: Arrays, rng: np.random.Generator) -> Arrays:
     return record
 
 
-def train(objective: Objective, loop: LoopConfig, folder: Path) -> dict[str, Any]:
-    placement = Placement.create(loop)
-    state, step = placement.init(objective, loop), placement.compile(objective, loop)
+def train(model: Trainable[Any], loop: LoopConfig, folder: Path) -> dict[str, Any]:
+    sharding = Sharding.create(loop)
+    state, step = sharding.init(model, loop), sharding.compile(train_step, model, loop)
     losses = []
     with batches(records(), as_is, loop.batch_size, seed=3) as loader:
         for _ in range(STEPS):
             batch = token_batch(next(loader))
-            state, metrics = step(state, placement.put_batch(batch))
-            losses.append(placement.scalars(metrics)["loss"])
+            state, metrics = step(state, sharding.put_batch(batch))
+            losses.append(sharding.scalars(metrics)["loss"])
         checkpoints = Checkpoints(folder)
-        checkpoints.save(STEPS, placement.portable(state), loader.state())
+        checkpoints.save(STEPS, sharding.portable(state), loader.state())
         checkpoints.close()
     # A resumed run does this: the state has to fit the compiled step.
     checkpoints = Checkpoints(folder)
-    restored, _ = checkpoints.restore(placement.template(objective, loop))
+    restored, _ = checkpoints.restore(sharding.template(model, loop))
     checkpoints.close()
-    whole = placement.gather(state)
-    assert all(map(np.array_equal, *map(jax.tree.leaves, (whole, placement.gather(placement.adopt(restored))))))
+    whole = sharding.gather(state)
+    assert all(map(np.array_equal, *map(jax.tree.leaves, (whole, sharding.gather(sharding.adopt(restored))))))
     if distributed.is_lead():
         np.savez(f"{folder}-{jax.process_count()}.npz", *jax.tree.leaves(whole.params))
     return {"losses": losses, "index": np.asarray(batch.index).tolist()}
@@ -105,8 +106,8 @@ def main(folder: Path, *address: str) -> dict[str, Any]:
     several = jax.process_count() > 1
     if several:
         save_together(folder / "checkpoints")
-    fields: dict[str, dict[str, Any]] = WAYS if several else {way: {"placement": "jit"} for way in WAYS}
-    trained = {way: train(OBJECTIVES[way], replace(LOOP, **fields[way]), folder / way) for way in WAYS}
+    loops = {kind: replace(LOOP, **SHARDINGS[kind if several else "jit"]) for kind in MODELS}
+    trained = {kind: train(model, loops[kind], folder / kind) for kind, model in MODELS.items()}
     return {"trained": trained, "exchanged": exchanged()}
 
 

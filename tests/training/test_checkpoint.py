@@ -16,7 +16,7 @@ from rsjax.training.checkpoint import CheckpointError, Checkpoints, load_weights
 from rsjax.training.state import create_state
 from tests.training.toy import Regression, train
 
-LOOP = LoopConfig(steps=2, batch_size=2, log_every=1, checkpoint_every=1, placement="jit")
+LOOP = LoopConfig(steps=2, batch_size=2, log_every=1, checkpoint_every=1, sharding="jit")
 
 # When one read fails, orbax leaves others running; their errors are raised when they are garbage-collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -58,11 +58,11 @@ def test_a_whole_state_is_restored(tmp_path: Path) -> None:
     assert data == {"next": [1, 2]}
 
 
-@pytest.mark.parametrize("change", [{"objective": Regression(2)}, {"ema": 0.9}], ids=["shape", "structure"])
+@pytest.mark.parametrize("change", [{"model": Regression(2)}, {"ema": 0.9}], ids=["shape", "structure"])
 def test_a_checkpoint_of_another_architecture_is_named(trained: Path, change: dict[str, Any]) -> None:
-    objective = change.pop("objective", Regression())
+    model = change.pop("model", Regression())
     with pytest.raises(CheckpointError, match=rf"{trained}/checkpoints/2: does not fit.*run directory") as raised:
-        train(replace(LOOP, **change), trained, objective=objective)
+        train(replace(LOOP, **change), trained, model=model)
     assert "\n" not in str(raised.value)
 
 

@@ -18,7 +18,7 @@ from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.distributed import HostsError
 from tests.training.checkpoint_processes import state
-from tests.training.test_placement import ROOT, virtual
+from tests.training.test_sharding import ROOT, virtual
 
 Results = dict[str, Any]
 SLURM = {
@@ -67,13 +67,13 @@ def results(folder: Path) -> list[Results]:
             process.kill()  # where one failed, the other would wait for it
 
 
-@pytest.mark.parametrize("way", ["pmap", "fsdp"])
-def test_two_processes_train_as_one(way: str, results: list[Results], folder: Path) -> None:
+@pytest.mark.parametrize("kind", ["pmap", "fsdp"])
+def test_two_processes_train_as_one(kind: str, results: list[Results], folder: Path) -> None:
     lead, other, alone = results
-    losses = [result["trained"][way]["losses"] for result in (lead, other, alone)]
+    losses = [result["trained"][kind]["losses"] for result in (lead, other, alone)]
     assert losses[0] == losses[1]
     np.testing.assert_allclose(losses[0], losses[2], rtol=1e-5)
-    ours, theirs = (np.load(folder / name) for name in (f"{way}-2.npz", f"alone/{way}-1.npz"))
+    ours, theirs = (np.load(folder / name) for name in (f"{kind}-2.npz", f"alone/{kind}-1.npz"))
     for name in theirs:
         np.testing.assert_allclose(ours[name], theirs[name], atol=1e-5)
 
@@ -156,7 +156,7 @@ def test_the_launch_files_use_options_of_the_command() -> None:
     program, *arguments = shlex.split(command.partition(" -m ")[2])
     assert program == "experiments.train"
     config, options = parse(arguments, program, "", Options())
-    assert (config.train.placement, config.train.fsdp) == ("mesh", 8)
+    assert (config.train.sharding, config.train.fsdp) == ("mesh", 8)
     assert (options.coordinator, options.processes, options.process_id) == ("rsjax-train-0.rsjax:8476", 2, 1)
     assert job["completions"] == job["parallelism"] == options.processes
     subprocess.run(["bash", "-n", ROOT / "launch/slurm.sbatch"], check=True)

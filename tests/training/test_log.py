@@ -82,10 +82,10 @@ def test_tensorboard_shows_the_same_as_the_log(
 
 def test_scalars_and_pictures_are_in_tensorboards_file_before_the_log_is_closed(tmp_path: Path) -> None:
     with ScalarLog(tmp_path, 0) as log:
-        log.write(3, {"loss": 0.5, "held_out/psnr": 21.25})
+        log.write(3, {"loss": 0.5, "validation/psnr": 21.25})
         log.image(3, "clip_000", PICTURE)
         (scalars, picture) = (values for _, values in in_tensorboard(tmp_path))
-    assert {tag: value.simple_value for tag, value in scalars.items()} == {"loss": 0.5, "held_out/psnr": 21.25}
+    assert {tag: value.simple_value for tag, value in scalars.items()} == {"loss": 0.5, "validation/psnr": 21.25}
     assert (picture["clip_000"].image.height, picture["clip_000"].image.width) == PICTURE.shape[:2]
 
 

@@ -14,10 +14,10 @@ from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.errors import Preempted
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.log import read_curve, read_log
-from rsjax.training.loop import DivergedError, Watch
+from rsjax.training.loop import DivergedError, Monitor
 from rsjax.training.skipped import read_skipped
 from rsjax.training.state import TrainState, create_state
-from rsjax.training.validation import HeldOut
+from rsjax.training.validation import Validation
 from tests.training.toy import Regression, loader, records, train
 
 LOOP = LoopConfig(
@@ -27,7 +27,7 @@ LOOP = LoopConfig(
     ema=0.9,
     log_every=1,
     checkpoint_every=4,
-    placement="jit",
+    sharding="jit",
 )
 
 
@@ -127,13 +127,13 @@ def test_one_step_too_many_that_is_not_finite_stops_the_run(tmp_path: Path) -> N
 class Steep(Regression):
     """The loss is finite, its gradient is not."""
 
-    def terms(self, params: Any, batch: Any, key: Any, around: Any) -> Any:
-        total, weight = super().terms(params, batch, key, around)["error"]
+    def loss_terms(self, params: Any, batch: Any, key: Any, context: Any) -> Any:
+        total, weight = super().loss_terms(params, batch, key, context)["error"]
         return {"error": (total + jax.numpy.sqrt(0 * params["b"]), weight)}  # 0, with a gradient of 0·∞
 
 
 def test_a_gradient_that_is_not_finite_changes_no_parameter(tmp_path: Path) -> None:
-    state = train(replace(LOOP, steps=2, ema=0.0), tmp_path, objective=Steep())
+    state = train(replace(LOOP, steps=2, ema=0.0), tmp_path, model=Steep())
     assert int(state.skipped) == 2
     jax.tree.map(np.testing.assert_array_equal, state.params, create_state(Steep(), LOOP).params)
 
@@ -143,13 +143,13 @@ def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
 ) -> None:
     looked = []
 
-    def look(step: int, weights: Any) -> HeldOut:
+    def look(step: int, weights: Any) -> Validation:
         looked.append(step)
         os.kill(os.getpid(), signal.SIGTERM)
-        return HeldOut(0.0, {})
+        return Validation(0.0, {})
 
     with pytest.raises(Preempted, match="saved after step 3; the same command resumes"):
-        train(replace(LOOP, eval_every=2), tmp_path, watch=Watch(held_out=look))
+        train(replace(LOOP, eval_every=2), tmp_path, monitor=Monitor(validate=look))
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert looked == [2] and checkpoints.latest() == 3
     checkpoints.close()
@@ -157,16 +157,18 @@ def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
     assert [row for row in read_curve(tmp_path) if "loss" in row] == whole[1]
 
 
-def test_held_out_scores_are_logged_shown_and_decide_what_is_kept(
+def test_validation_scores_are_logged_drawn_and_decide_which_checkpoints_are_kept(
     whole: tuple[TrainState, list[dict[str, Any]]], tmp_path: Path
 ) -> None:
-    def look(step: int, weights: Any) -> HeldOut:
-        return HeldOut(abs(step - 4.0), {"held_out/loss": abs(step - 4.0)}, {"seen": np.zeros((2, 2, 3), np.uint8)})
+    def look(step: int, weights: Any) -> Validation:
+        return Validation(
+            abs(step - 4.0), {"validation/loss": abs(step - 4.0)}, {"seen": np.zeros((2, 2, 3), np.uint8)}
+        )
 
     loop = replace(LOOP, eval_every=2, checkpoint_every=2, keep_last=1)
-    assert_same(train(loop, tmp_path, watch=Watch(("clips", 2), look)), whole[0])
-    rows = [row for row in read_log(tmp_path) if "held_out/loss" in row]
-    assert [(row["step"], row["held_out/loss"]) for row in rows] == [(2, 2), (4, 0), (6, 2), (8, 4), (9, 5)]
+    assert_same(train(loop, tmp_path, monitor=Monitor(("clips", 2), look)), whole[0])
+    rows = [row for row in read_log(tmp_path) if "validation/loss" in row]
+    assert [(row["step"], row["validation/loss"]) for row in rows] == [(2, 2), (4, 0), (6, 2), (8, 4), (9, 5)]
     assert len(list((tmp_path / "pictures").glob("seen-*.png"))) == 5
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert checkpoints.steps() == [4, 9]

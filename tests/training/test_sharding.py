@@ -1,112 +1,137 @@
-from dataclasses import replace
-from functools import partial
-from math import prod
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from jax.sharding import PartitionSpec as P
+from jax.sharding import Mesh
 
-from rsjax.config import ConfigError, LoopConfig, OptimizerConfig, presets
-from rsjax.training.objectives import Objective, TokenizerObjective, WorldModelObjective
-from rsjax.training.placement import Placement
-from rsjax.training.sharding import FSDP, SMALL, Row, cut_elements, shown, spec_of, table
-from rsjax.training.state import create_state
+from rsjax.config import ConfigError, LoopConfig
+from rsjax.training.sharding import AXIS, Sharding, choose
+from rsjax.training.step import train_step
+from tests.training.toy import Regression
 
-
-def rows(objective: Objective, loop: LoopConfig, parts: int) -> dict[str, Row]:
-    shapes = jax.eval_shape(partial(create_state, objective, loop))
-    found = table(shapes, parts)
-    print(shown(found))
-    return {row.path: row for row in found}
+ROOT = Path(__file__).parents[2]
 
 
-def world_model(preset: str, kind: Any = "adamw", parts: int = 8) -> dict[str, Row]:
-    config = presets.get(preset)
-    loop = replace(config.train, ema=0.99, optimizer=OptimizerConfig(kind=kind))
-    return rows(WorldModelObjective.create(config), loop, parts)
+def virtual(devices: int) -> dict[str, str]:
+    """The environment of a process with so many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
-def test_the_full_size_model_is_cut_as_the_rules_say() -> None:
-    found = world_model("roboscape_s")
-    assert {path: found[f"params/{path}"].spec for path in WANTED} == WANTED
+@pytest.fixture(scope="module")
+def apart() -> dict[str, Any]:
+    """Results of tests/training/devices.py. The devices must exist before jax starts, hence a process of its own."""
+    command = [sys.executable, "-m", "tests.training.devices"]
+    done = subprocess.run(command, cwd=ROOT, env=virtual(4), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-WANTED = {
-    "action_encoder/kernel": P(),  # 28 × 256: small
-    "blocks/depth_to_rgb/kernel": P(None, None, FSDP),
-    "blocks/rgb/fc1/bias": P(None, FSDP),
-    "blocks/rgb/fc1/kernel": P(None, None, FSDP),
-    "blocks/rgb/fc2/kernel": P(None, None, FSDP),
-    "blocks/rgb/norm1/scale": P(),
-    "blocks/rgb/spatial_attn/qkv/kernel": P(None, None, FSDP),
-    "blocks/depth/temporal_attn/proj/kernel": P(None, None, FSDP),
-    "pos_embed": P(None, None, FSDP),
-    "rgb_embed/factored_embed_0/embedding": P(None, FSDP),
-    "rgb_embed/mask_token_embed": P(),
-    "rgb_head/kernel": P(None, FSDP),
-}
+@pytest.mark.parametrize("kind", ["pmap", "mesh", "fsdp", "muon"])
+def test_every_sharding_gives_the_same_parameters_on_uneven_batches(kind: str, apart: dict[str, Any]) -> None:
+    assert apart[kind]["largest"] < 1e-4, apart
+    assert apart[kind]["share"] < 1e-4, apart
+    assert apart["mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
 
 
-@pytest.mark.parametrize("preset", ["roboscape_s", "tiny"])
-@pytest.mark.parametrize("kind", ["adamw", "muon"])
-def test_moments_and_averages_lie_as_their_parameter(preset: str, kind: str) -> None:
-    found = world_model(preset, kind)
-    params = {path.removeprefix("params/"): row for path, row in found.items() if path.startswith("params/")}
-    followers = 0
-    for path, row in found.items():
-        for name, parameter in params.items():
-            if path.endswith(f"/{name}") and path.startswith(("ema/", "opt_state/")):
-                assert (row.shape, row.spec) == (parameter.shape, parameter.spec), path
-                followers += 1
-    moments = sum(2 - (kind == "muon" and "blocks/" in name and name.endswith("kernel")) for name in params)
-    assert followers == len(params) + moments, "an average, and two moments each, of which Muon keeps one of a matrix"
+@pytest.mark.parametrize("kind", ["pmap", "mesh", "fsdp"])
+def test_clips_without_depth_count_alike_on_every_device(kind: str, apart: dict[str, Any]) -> None:
+    assert apart[f"gradient {kind}"] < 1e-5, apart
+    assert apart["depth mean of ratios"] > 0.01, "the batches are too even to tell the right loss from the wrong one"
 
 
-@pytest.mark.parametrize("preset", ["roboscape_s", "tiny"])
-def test_nearly_all_of_a_state_is_cut(preset: str) -> None:
-    found = list(world_model(preset).values())
-    assert cut_elements(found) / sum(prod(row.shape) for row in found) > 0.97
+def test_the_tokenizers_gradients_and_averages_are_those_of_the_whole_batch(apart: dict[str, Any]) -> None:
+    for kind in ("pmap", "fsdp"):
+        assert apart[f"tokenizer {kind}"].keys() == {"generator", "discriminator", "averages"}
+        assert max(apart[f"tokenizer {kind}"].values()) < 1e-5, apart
+    assert apart["tokenizer apart"] > 0.01, "the images are too even to tell the shardings apart"
 
 
-def test_the_full_size_tokenizer_is_cut_but_for_what_is_small_or_has_no_axis_that_divides() -> None:
-    config = presets.get("roboscape_s")
-    loop = config.tokenizer_train
-    found = rows(TokenizerObjective(config.tokenizer, loop), loop, 8)
-    whole = {row.path.removeprefix("params/") for row in found.values() if row.spec == P() and prod(row.shape) >= SMALL}
-    assert not whole
+def test_a_checkpoint_resumes_under_any_other_sharding(apart: dict[str, Any]) -> None:
+    assert len(apart["checkpoint"]) == 4
+    for distance in apart["checkpoint"]:
+        assert distance["share"] < 1e-4, apart
 
 
-@given(
-    path=st.sampled_from(["params/blocks/a/kernel", "params/blocks/b", "params/head/kernel", "params/new", "extra/x"]),
-    shape=st.lists(st.sampled_from([1, 3, 8, 12, 64, 250]), max_size=4).map(tuple),
-    parts=st.sampled_from([1, 2, 3, 8]),
+def test_a_state_that_is_made_in_parts_is_the_same_to_the_bit(apart: dict[str, Any]) -> None:
+    assert apart["start"]
+
+
+def test_two_devices_that_share_a_state_hold_about_half_of_it_each(apart: dict[str, Any]) -> None:
+    assert 0.5 < apart["cut"] < 0.6
+
+
+@pytest.mark.parametrize(
+    ("fields", "local", "processes", "chosen"),
+    [
+        ({"sharding": "jit"}, 4, 1, ("jit", 1)),
+        ({"sharding": "pmap"}, 4, 1, ("pmap", 4)),
+        ({"sharding": "pmap"}, 1, 1, ("pmap", 1)),
+        ({"sharding": "pmap"}, 2, 4, ("pmap", 8)),
+        ({"sharding": "mesh", "fsdp": 2}, 4, 2, ("mesh", 8)),
+        ({}, 4, 1, ("pmap", 4)),
+        ({"batch_size": 6}, 4, 1, ("pmap", 3)),
+        ({"batch_size": 5}, 4, 1, ("jit", 1)),
+        ({}, 1, 1, ("jit", 1)),
+        ({"accumulate": 4}, 4, 1, ("pmap", 2)),
+        ({}, 4, 2, ("mesh", 8)),
+    ],
 )
-def test_what_is_cut_is_large_and_divides(path: str, shape: tuple[int, ...], parts: int) -> None:
-    spec = spec_of(path, shape, parts)
-    if spec != P():
-        assert spec == P(*[None] * (len(spec) - 1), FSDP)
-        assert shape[len(spec) - 1] % parts == 0
-        assert prod(shape) >= SMALL
-        assert not path.startswith("extra")
-    elif path == "params/new" and parts > 1 and prod(shape) >= SMALL:
-        assert all(size % parts for size in shape), "an array that no rule names is cut along any axis that divides"
+def test_auto_takes_as_many_devices_as_divide_the_batch(
+    fields: dict[str, Any], local: int, processes: int, chosen: tuple[str, int]
+) -> None:
+    assert choose(LoopConfig(**({"batch_size": 8} | fields)), local, processes) == chosen
 
 
-def test_the_table_names_what_is_cut() -> None:
-    text = shown(table({"params": {"head": {"kernel": np.zeros((256, 64))}, "bias": np.zeros(64)}}, 8))
-    assert "params/head/kernel" in text
-    assert "(256, [64])" in text
-    assert text.endswith("16,448 elements, 99.6% of them cut")
+@pytest.mark.parametrize(
+    ("fields", "local", "processes", "message"),
+    [
+        (
+            {"sharding": "pmap"},
+            4,
+            1,
+            "batch_size 6 does not divide over 4 devices; make it a multiple, or set sharding to auto",
+        ),
+        ({"sharding": "mesh"}, 4, 1, "batch_size 6 does not divide over 4 devices"),
+        ({}, 2, 2, "batch_size 6 does not divide over 4 devices; make it a multiple$"),
+        ({"sharding": "mesh", "accumulate": 2}, 2, 1, "over 2 devices in accumulate = 2 parts"),
+        ({"sharding": "mesh", "fsdp": 2}, 3, 1, "fsdp 2 does not divide 3 devices"),
+        ({"sharding": "jit"}, 1, 2, "sharding is jit, for one device, but 2 processes train"),
+    ],
+)
+def test_what_does_not_divide_is_refused(fields: dict[str, Any], local: int, processes: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        choose(LoopConfig(**({"batch_size": 6} | fields)), local, processes)
 
 
-def test_a_model_that_cannot_be_cut_as_asked_is_refused() -> None:
-    config = presets.get("tiny")
-    loop = LoopConfig(batch_size=5, placement="mesh", fsdp=5)
-    mesh: Any = jax.sharding.AbstractMesh((1, 5), ("data", FSDP))  # five devices that nothing is put on
-    placement = Placement("mesh", mesh)
-    with pytest.raises(ConfigError, match="fsdp 5 divides no axis of this model's arrays"):
-        placement.template(WorldModelObjective.create(config), loop)
+def test_each_device_takes_its_own_consecutive_clips() -> None:
+    sharding = Sharding("pmap", Mesh(np.array(jax.devices()[:1]), (AXIS,)))
+    batch = {"x": np.arange(12).reshape(6, 2), "weight": np.ones(6)}
+    cut = sharding.put_batch(batch)
+    np.testing.assert_array_equal(cut["x"], batch["x"].reshape(1, 6, 2))
+    assert cut["weight"].shape == (1, 6)
+
+
+def test_a_gathered_copy_outlives_the_step_that_takes_its_state() -> None:
+    loop = LoopConfig(batch_size=2, ema=0.5, sharding="jit")
+    sharding = Sharding.create(loop)
+    state = sharding.init(Regression(), loop)
+    copy = sharding.gather(state.weights)
+    before = jax.device_get(copy)
+    batch = sharding.put_batch({"x": np.ones((2, 3), np.float32), "y": np.zeros(2, np.float32)})
+    state, _ = sharding.compile(train_step, Regression(), loop)(state, batch)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(copy), before)
+
+
+def test_training_begins_with_what_start_gives() -> None:
+    loop = LoopConfig(ema=0.5, sharding="jit")
+    state = Sharding.create(loop).init(Regression(), loop, lambda fresh: jax.tree.map(lambda x: x + 1, fresh))
+    fresh = Regression().init(jax.random.key(loop.seed))
+    for params in (state.params, state.ema):
+        jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y + 1), params, fresh)

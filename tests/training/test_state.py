@@ -11,7 +11,7 @@ from rsjax.config import ConfigError, LoopConfig, OptimizerConfig
 from rsjax.training.state import create_state, learning_rate, make_optimizer
 from rsjax.training.step import train_step
 from tests.training import devices
-from tests.training.toy import Regression, records
+from tests.training.toy import QUICK, Regression, records
 
 OPTIMIZER = OptimizerConfig(learning_rate=0.1, warmup_steps=4, final_share=0.2, weight_decay=0.03, grad_clip=0.5)
 LOOP = LoopConfig(steps=20, optimizer=OPTIMIZER)
@@ -76,9 +76,9 @@ def test_a_run_shorter_than_its_warm_up_has_a_schedule(steps: int) -> None:
 
 def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
     """Three steps once more in numpy, after Loshchilov & Hutter's algorithm 2, with the clipping before it."""
-    loop, objective = replace(LOOP, ema=0.15), Regression()
-    state = create_state(objective, loop)
-    step = jax.jit(partial(train_step, objective, loop))
+    loop, model = replace(LOOP, ema=0.15), Regression()
+    state = create_state(model, loop)
+    step = jax.jit(partial(train_step, model, loop))
     opt, theta = OPTIMIZER, np.concatenate([state.params["w"], state.params["b"][None]]).astype(np.float64)
     average, m, v = theta.copy(), np.zeros(4), np.zeros(4)
     for t in range(1, 4):
@@ -160,10 +160,10 @@ def test_muon_orthogonalises_the_blocks_matrices_and_leaves_the_rest_to_adamw() 
 def test_a_batch_in_parts_takes_the_same_step() -> None:
     """Clips of unequal weight and masks of unequal size: the parts' own means would differ."""
     batch, taken = devices.batch(0), []
-    state = jax.jit(partial(create_state, devices.OBJECTIVE, devices.LOOP))()
+    state = jax.jit(partial(create_state, devices.MODEL, devices.LOOP))()
     for parts in (1, 4):
         loop = replace(devices.LOOP, accumulate=parts)
-        taken.append(jax.jit(partial(train_step, devices.OBJECTIVE, loop))(state, batch))
+        taken.append(jax.jit(partial(train_step, devices.MODEL, loop), compiler_options=QUICK)(state, batch))
     (one, of_one), (many, of_many) = taken
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), of_one, of_many)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), one.opt_state, many.opt_state)
@@ -171,9 +171,9 @@ def test_a_batch_in_parts_takes_the_same_step() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_step_that_is_not_finite_is_left_out_and_counted(bad: float) -> None:
-    loop, objective = replace(LOOP, ema=0.5), Regression()
-    step = jax.jit(partial(train_step, objective, loop))
-    before, _ = step(create_state(objective, loop), BATCH)
+    loop, model = replace(LOOP, ema=0.5), Regression()
+    step = jax.jit(partial(train_step, model, loop))
+    before, _ = step(create_state(model, loop), BATCH)
     after, metrics = step(before, BATCH | {"y": np.full_like(BATCH["y"], bad)})
     assert int(after.step) == 2 and int(after.skipped) == 1 and float(metrics["skipped"]) == 1
     for name in ("params", "ema"):
@@ -190,10 +190,10 @@ def test_a_step_that_is_not_finite_is_left_out_and_counted(bad: float) -> None:
 @pytest.mark.parametrize("kind", ["adamw", "muon"])
 def test_a_step_that_is_left_out_counts_in_the_schedule(kind: Any) -> None:
     loop = replace(devices.LOOP, optimizer=replace(devices.LOOP.optimizer, kind=kind))
-    state = jax.jit(partial(create_state, devices.OBJECTIVE, loop))()
-    batch = devices.batch(0)
+    model, batch = devices.Small(), devices.batch(0)
+    state = jax.jit(partial(create_state, model, loop))()
     bad = batch.replace(actions=np.full_like(batch.actions, np.nan))  # type: ignore[attr-defined]
-    step = jax.jit(partial(train_step, devices.OBJECTIVE, loop))
+    step = jax.jit(partial(train_step, model, loop))
     state, _ = step(step(state, batch)[0], bad)
     counts = [
         int(x)

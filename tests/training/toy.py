@@ -11,26 +11,27 @@ from jaxtyping import Array
 
 from rsjax.config import LoopConfig
 from rsjax.data.loader import Loader, batches
-from rsjax.models.roboscape.losses import Term
+from rsjax.trainable import StepContext, Term, Trainable
 from rsjax.training.loop import fit
-from rsjax.training.objectives import Objective, Surroundings
 from rsjax.training.state import TrainState
+
+QUICK = {"xla_backend_optimization_level": 0}  # options of the compiler, for programs that run once
 
 
 @dataclass(frozen=True)
-class Regression(Objective):
+class Regression(Trainable[Any]):
     """Predicts y from x, both noisy."""
 
     inputs: int = 3
 
     @property
-    def weights(self) -> dict[str, float]:
+    def loss_weights(self) -> dict[str, float]:
         return {"error": 2.0}
 
     def init(self, key: Array) -> Any:
         return {"w": jax.random.normal(key, (self.inputs,)), "b": jnp.zeros(())}
 
-    def terms(self, params: Any, batch: Any, key: Array, around: Surroundings) -> dict[str, Term]:
+    def loss_terms(self, params: Any, batch: Any, key: Array, context: StepContext) -> dict[str, Term]:
         noise = 0.1 * jax.random.normal(key)
         error = batch["x"][:, : self.inputs] @ params["w"] + params["b"] + noise - batch["y"]
         return {"error": (jnp.sum(jnp.square(error)), jnp.float32(error.size))}
@@ -53,7 +54,7 @@ def loader(state: dict[str, Any] | None, source: list[dict[str, np.ndarray]] | N
 def train(loop: LoopConfig, directory: Path, **options: Any) -> TrainState:
     """:func:`rsjax.training.loop.fit` of the regression; ``options`` replace its arguments."""
     usual: dict[str, Any] = {
-        "objective": Regression(),
+        "model": Regression(),
         "loader": loader,
         "name": "toy",
         "to_batch": lambda arrays: arrays,

@@ -1,1 +1,1 @@
-"""The world model: spatial-temporal blocks in two branches, joined depth → RGB (paper §2.3)."""
+"""RoboScape: spatial-temporal blocks in two branches, with projections from depth to RGB (paper §2.3)."""

@@ -14,22 +14,22 @@ from flax import struct
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.config import ModelConfig
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.frame_attention import attend_in_frames
 from rsjax.models.roboscape.matmul import matmul_bf16
 
-# torch's default for linear layers, U(±1/√fan_in), which the public weights were trained from.
+# torch's default for linear layers, U(±1/√fan_in), as in the public code.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
-FEW = 2  # frames that a pass of a rollout is over
-LARGE_FRAME = 128  # cells per frame from which bf16 products in attention gain more than their transposes cost
+FEW = 2  # frames per pass of a rollout
+LARGE_FRAME = 128  # cells per frame from which bf16 products in attention save more than their transposes cost
 
 
 @struct.dataclass
 class KeyValues:
-    """Temporal keys and values of one branch; with a leading axis over blocks where all blocks' are held.
+    """Temporal keys and values of one branch, of one block or stacked over blocks (axis L).
 
-    A head's frames lie together, as its products read them: otherwise every pass would move the whole cache.
+    Frames come after heads, as the products read them; otherwise every pass would transpose the whole cache.
     """
 
     k: Float[Array, "*L B S h T e"]
@@ -37,7 +37,7 @@ class KeyValues:
 
 
 class Dense(nn.Module):
-    """A linear layer with float32 parameters; ``bf16`` multiplies in bf16 and accumulates in float32."""
+    """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32."""
 
     features: int
     bf16: bool = False
@@ -56,7 +56,7 @@ class Dense(nn.Module):
 
 
 def layer_norm(name: str | None) -> nn.LayerNorm:
-    """LayerNorm with torch's epsilon, in float32."""
+    """Returns a float32 LayerNorm with torch's epsilon."""
     return nn.LayerNorm(epsilon=1e-5, name=name)
 
 
@@ -66,7 +66,7 @@ def attend(
     v: Float[Array, "*N k h e"],
     mask: Bool[Array, "q k"] | None,
 ) -> Float[Array, "*N q h e"]:
-    """softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax in float32."""
+    """Returns softmax(q·kᵀ/√e)·v over the keys that ``mask`` allows; the softmax is float32."""
     scores = jnp.einsum("...qhe,...khe->...hqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
     if mask is not None:
         scores = jnp.where(mask, scores, jnp.finfo(jnp.float32).min)
@@ -76,16 +76,16 @@ def attend(
 def attend_parts(
     q: Float[Array, "*N q e"], parts: Sequence[tuple[KeyValues, Bool[Array, "q k"]]]
 ) -> Float[Array, "*N q e"]:
-    """:func:`attend` over keys and values that lie in several places, each with its mask, as if they were one."""
+    """Returns :func:`attend` over the concatenation of several keys and values, each with its mask."""
     scores = []
-    for held, mask in parts:
-        product = jnp.einsum("...qe,...ke->...qk", q, held.k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+    for part, mask in parts:
+        product = jnp.einsum("...qe,...ke->...qk", q, part.k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
         scores.append(jnp.where(mask, product, jnp.finfo(jnp.float32).min))
     weights = jax.nn.softmax(jnp.concatenate(scores, axis=-1), axis=-1)
     shares = jnp.split(weights, np.cumsum([x.shape[-1] for x in scores])[:-1], axis=-1)
     outs = [
-        jnp.einsum("...qk,...ke->...qe", share.astype(held.v.dtype), held.v)
-        for share, (held, _) in zip(shares, parts, strict=True)
+        jnp.einsum("...qk,...ke->...qe", share.astype(part.v.dtype), part.v)
+        for share, (part, _) in zip(shares, parts, strict=True)
     ]
     return sum(outs[1:], start=outs[0])
 
@@ -93,7 +93,7 @@ def attend_parts(
 def attend_cells(
     q: Float[Array, "B T S h e"], k: Float[Array, "B T S h e"], v: Float[Array, "B T S h e"], bf16: bool
 ) -> Float[Array, "B T S h e"]:
-    """:func:`attend` within each frame, in the form that is fastest on this platform."""
+    """Returns :func:`attend` within each frame, by the fastest implementation on this platform."""
     frames = [x.reshape(-1, *x.shape[2:]) for x in (q, k, v)]
     if bf16 and jax.default_backend() != "cpu":
         out = jax.nn.dot_product_attention(*(x.astype(jnp.bfloat16) for x in frames)).astype(q.dtype)
@@ -105,9 +105,9 @@ def attend_cells(
 
 
 def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[Array, "B T S h e"]:
-    """Rotary position embedding: channels i and i + e/2 of a head turn by position · 10000^(-2i/e), in float32.
+    """Applies rotary position embedding: rotates channels i and i + e/2 by position · 10000^(-2i/e), in float32.
 
-    The product of a query and a key so turned depends on their positions' difference alone.
+    The product of a rotated query and key depends only on the difference of their positions.
     """
     half = x.shape[-1] // 2
     angles = positions[:, None] * 10_000.0 ** (-jnp.arange(half) / half)
@@ -117,33 +117,33 @@ def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[A
 
 
 def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
-    """The frame in each slot of a cache after frame ``last`` is written; negative where none is yet."""
+    """Returns the frame in each slot of a cache after frame ``last`` is written; negative for empty slots."""
     return last - (last - jnp.arange(slots)) % slots
 
 
 def put_frames(cache: KeyValues, new: KeyValues, start: Any, ring: bool) -> KeyValues:
-    """A cache with the frames from ``start`` on written in; both with a leading axis over blocks.
+    """Returns a cache into which new frames from ``start`` on are written; both have a leading axis over blocks.
 
     Args:
-        ring: slots are taken over where positions pass their number.
+        ring: whether positions beyond the number of slots wrap around.
     """
 
-    def put(held: Float[Array, "L B S h N e"], fresh: Float[Array, "L B S h T e"]) -> Float[Array, "L B S h N e"]:
-        fresh = fresh.astype(held.dtype)
+    def put(old: Float[Array, "L B S h N e"], fresh: Float[Array, "L B S h T e"]) -> Float[Array, "L B S h N e"]:
+        fresh = fresh.astype(old.dtype)
         if not ring:
-            return jax.lax.dynamic_update_slice_in_dim(held, fresh, start, axis=-2)
-        for i in range(fresh.shape[-2]):  # frame by frame, for the slots may go around the end
-            slot = (start + i) % held.shape[-2]
-            held = jax.lax.dynamic_update_slice_in_dim(held, fresh[..., i : i + 1, :], slot, axis=-2)
-        return held
+            return jax.lax.dynamic_update_slice_in_dim(old, fresh, start, axis=-2)
+        for i in range(fresh.shape[-2]):  # frame by frame, since the slots may wrap around
+            slot = (start + i) % old.shape[-2]
+            old = jax.lax.dynamic_update_slice_in_dim(old, fresh[..., i : i + 1, :], slot, axis=-2)
+        return old
 
     return jax.tree.map(put, cache, new)
 
 
 class Attention(nn.Module):
-    """Projections around :func:`attend`. Rows of the qkv projection: (3, heads, head width)."""
+    """Multi-head attention with its projections. Rows of the qkv projection are (3, heads, head width)."""
 
-    config: ModelConfig
+    config: Architecture
 
     def setup(self) -> None:
         cfg = self.config
@@ -154,25 +154,25 @@ class Attention(nn.Module):
             self.norm = layer_norm(None)
 
     def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
-        """Every cell attends to every cell of its own frame."""
+        """Lets every cell attend to all cells of its frame."""
         q, k, v = (self._heads(y) for y in self._project(x))
         return self.proj(attend_cells(q, k, v, self.config.compute_dtype == "bfloat16").reshape(x.shape))
 
     def temporal(
         self, x: Float[Array, "B T S C"], start: Any = 0, cache: KeyValues | None = None
     ) -> tuple[Float[Array, "B T S C"], KeyValues | None]:
-        """Every cell attends to the same cell in its own frame and the ``config.frames - 1`` before it.
+        """Lets every cell attend to the same cell in its own frame and the ``config.frames - 1`` frames before it.
 
         Args:
             x: frames start … start + T - 1.
             start: position of x's first frame (may be traced).
-            cache: keys and values of frames before ``start``, frame f in slot f mod N of N; what it holds from
-                ``start`` on is not read. Where positions pass N, slots are taken over, and a frame must still find
-                all that it attends to: N ≥ config.frames + T - 1.
+            cache: keys and values of frames before ``start``, frame f in slot f mod N of N; later frames in it are not
+                read. If positions exceed N, slots are reused, which needs N ≥ config.frames + T - 1 so that a frame's
+                whole window stays in the cache.
 
         Returns:
-            The output, and x's own keys and values, for :func:`put_frames` (None where no cache was given). Writing
-            them here would copy the cache in every block of every pass.
+            The output, and x's own keys and values for :func:`put_frames` (None without a cache). Writing them here
+            would copy the cache in every block of every pass.
 
         Raises:
             ValueError: x has more frames than the cache.
@@ -191,7 +191,7 @@ class Attention(nn.Module):
             raise ValueError(f"{frames} frames do not fit a cache of {slots}")
         q, new = self._head_major(q), KeyValues(self._head_major(k), self._head_major(v))
         sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
-        # XLA's CPU backend is three times as fast at products of one row with each matrix as of two.
+        # XLA's CPU backend multiplies one row by each matrix three times as fast as two rows.
         at_once = 1 if frames <= FEW else frames
         outs = [
             attend_parts(
@@ -205,17 +205,17 @@ class Attention(nn.Module):
     def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:
         return self._heads(x).transpose(0, 2, 3, 1, 4)
 
-    def _sees(self, positions: Int[Array, " q"], held: Int[Array, " k"]) -> Bool[Array, "q k"]:
-        age = positions[:, None] - held[None, :]
-        return (age >= 0) & (age < self.config.frames) & (held >= 0)
+    def _sees(self, queries: Int[Array, " q"], keys: Int[Array, " k"]) -> Bool[Array, "q k"]:
+        age = queries[:, None] - keys[None, :]
+        return (age >= 0) & (age < self.config.frames) & (keys >= 0)
 
     def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
         q, k, v = jnp.split(self.qkv(x), 3, axis=-1)
         if self.config.qk_norm:
             q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
         if self.config.mup:
-            # 8/e in all: attend divides by √e. The public code's plain attention scales before the norm, which undoes
-            # it; its default, fused one after, as here.
+            # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code's default, fused
+            # attention. (Its plain attention scales before the norm, which undoes the scaling.)
             q = q * (8 * self.config.head_width**-0.5)
         return q, k, v
 

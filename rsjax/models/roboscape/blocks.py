@@ -1,4 +1,4 @@
-"""Spatial-temporal blocks, one per branch, and the pair of them with the depth → RGB projection (paper Eq. 3).
+"""Spatial-temporal blocks, and their pair with the depth → RGB projection (paper Eq. 3).
 
 Axes: B clips, T frames, S cells, C width.
 """
@@ -8,7 +8,7 @@ from typing import Any
 import flax.linen as nn
 from jaxtyping import Array, Float
 
-from rsjax.config import ModelConfig
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import Attention, Dense, KeyValues, layer_norm
 
 Features = Float[Array, "B T S C"]
@@ -17,11 +17,11 @@ Features = Float[Array, "B T S C"]
 class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
 
-    There is no norm before temporal attention unless ``config.temporal_norm``, and neither norm1 nor norm2 with
-    ``config.qk_norm``; GELU is the exact one.
+    ``config.temporal_norm`` adds a norm before temporal attention; ``config.qk_norm`` removes norm1 and norm2. GELU is
+    exact.
     """
 
-    config: ModelConfig
+    config: Architecture
 
     @nn.compact
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
@@ -37,12 +37,12 @@ class STBlock(nn.Module):
 
 
 class DualBlock(nn.Module):
-    """One block of each branch, then h_RGB += W(h_depth) (Eq. 3). Without depth: the RGB block alone.
+    """One block of each branch, then h_RGB += W(h_depth) (Eq. 3). Without depth, only the RGB block.
 
-    Inputs and outputs are dicts by branch, so that an absent branch is an absent key. Shaped for ``nn.scan``.
+    Inputs and outputs are dicts by branch; the signature is that of ``nn.scan``.
     """
 
-    config: ModelConfig
+    config: Architecture
 
     @nn.compact
     def __call__(
@@ -50,13 +50,13 @@ class DualBlock(nn.Module):
     ) -> tuple[dict[str, Features], dict[str, KeyValues] | None]:
         cfg = self.config
         out: dict[str, Features] = {}
-        kept: dict[str, Any] = {}
+        new: dict[str, Any] = {}
         for branch, features in x.items():
-            held = None if cache is None else cache[branch]
-            out[branch], kept[branch] = STBlock(cfg, name=branch)(features, start, held)
+            branch_cache = None if cache is None else cache[branch]
+            out[branch], new[branch] = STBlock(cfg, name=branch)(features, start, branch_cache)
         if "depth" in out:
-            # Zero at the start: the RGB branch begins as if alone, and pre-trained RGB weights keep their logits.
+            # Zero at first, so that pre-trained RGB weights keep their logits.
             bf16 = cfg.compute_dtype == "bfloat16"
             project = Dense(cfg.width, bf16, kernel_init=nn.initializers.zeros, name="depth_to_rgb")
             out["rgb"] = out["rgb"] + project(out["depth"])
-        return out, None if cache is None else kept
+        return out, None if cache is None else new

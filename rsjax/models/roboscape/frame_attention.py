@@ -1,9 +1,9 @@
-"""Attention among the cells of a frame with bf16 products, and its gradient written by hand: fast on CPUs.
+"""Attention among the cells of a frame with bf16 products and a hand-written gradient, fast on CPUs.
 
-A frame's scores are the largest arrays of a training step. They are not kept: the gradient computes them again from
-queries, keys and the row's log-sum, a few frames at a time, so that they stay in the processor's cache. Every product
-contracts the last axis of its first operand: XLA's CPU backend has fast bf16 kernels for no other form, so the small
-operands of the gradients of keys and values are transposed in memory, never the scores.
+A frame's scores are the largest arrays of a training step. They are not kept: the gradient recomputes them from
+queries, keys and each row's log-sum, a few frames at a time, so that they stay in the processor's cache. Every product
+contracts the last axis of its first operand, the only form for which XLA's CPU backend has fast bf16 kernels. So the
+gradients of keys and values transpose their small operands in memory, never the scores.
 
 Axes: N frames, S cells (q of the queries, k of the keys), h heads, e head width.
 """
@@ -14,14 +14,14 @@ from jaxtyping import Array, Float
 
 from rsjax.models.roboscape.matmul import transposed_in_memory
 
-SCORES_AT_ONCE = 2**19  # 2 MB: what a core's cache holds
+SCORES_AT_ONCE = 2**19  # 2 MB, which fits a core's cache
 
 
 @jax.custom_vjp
 def attend_in_frames(
     q: Float[Array, "N S h e"], k: Float[Array, "N S h e"], v: Float[Array, "N S h e"]
 ) -> Float[Array, "N S h e"]:
-    """softmax(q·kᵀ/√e)·v with operands rounded to bf16, float32 accumulation and softmax; float32 in and out."""
+    """Returns softmax(q·kᵀ/√e)·v: operands rounded to bf16, accumulation and softmax float32; float32 in and out."""
     return _forward(q, k, v)[0]
 
 
@@ -56,7 +56,7 @@ def _backward(saved: tuple[Array, ...], cotangent: Array) -> tuple[Array, Array,
 def _frame_gradient(
     q: Array, k: Array, v: Array, g: Array, q_t: Array, g_t: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
-    """One frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
+    """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
     weights = jnp.exp(_product("hqe,hke->hqk", q, k) - log_total)
     of_weights = _product("hqe,hke->hqk", g, v)
     of_scores = (weights * (of_weights - along)).astype(jnp.bfloat16)
@@ -68,7 +68,7 @@ def _frame_gradient(
 
 
 def _head_major(x: Array) -> Array:
-    """(N, S, h, e) to (N, h, S, e), or back."""
+    """Swaps (N, S, h, e) to (N, h, S, e), or back."""
     return x.swapaxes(1, 2)
 
 

@@ -1,6 +1,6 @@
-"""The model in a rollout, guided by its actions where that is asked for (classifier-free guidance).
+"""Applies the network in a rollout, with classifier-free guidance by actions if it is on.
 
-Guided, every pass is one over twice the clips: with their actions, then without; so is the cache.
+With guidance, every pass and the cache cover twice the clips: first with their actions, then without.
 
 Axes: B clips, T frames, S cells, A action dimensions, n vocabularies of V codes.
 """
@@ -12,14 +12,16 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from rsjax.clip import Array
-from rsjax.config import ModelConfig, SampleConfig
-from rsjax.models.roboscape.world_model import Cache, WorldModel, empty_cache
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Cache, Transformer, empty_cache
+from rsjax.trainable import Params
 
 
 def apply_guided(
-    model: ModelConfig,
+    arch: Architecture,
     sample: SampleConfig,
-    params: Any,
+    params: Params,
     tokens: dict[str, Int[Array, "B T S"]],
     mask: Bool[Array, "B T S"],
     actions: Float[Array, "B T A"],
@@ -27,30 +29,31 @@ def apply_guided(
     cache: Cache | None,
     no_depth: Bool[Array, " B"] | None = None,
 ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
-    """Logits without + g·(with - without the actions), g = ``sample.guidance``; and the cache.
+    """Returns logits without + g·(with - without the actions), g = ``sample.guidance``, and the cache.
 
     Args:
-        start: position of the first given frame (may be traced).
+        start: position of the first of these frames (may be traced).
         cache: from :func:`guided_cache` or an earlier call.
-        no_depth: True for clips whose depth is hidden, as in :class:`rsjax.models.roboscape.world_model.WorldModel`.
+        no_depth: True for clips whose depth is hidden, as in :class:`rsjax.models.roboscape.transformer.Transformer`.
     """
-    if sample.guidance == 1:
-        return _apply(model, params, tokens, mask, actions, start, cache, None, no_depth)
-    b = len(mask)
-    twice = lambda x: jnp.concatenate([x, x])  # noqa: E731
-    drop = jnp.arange(2 * b) >= b
-    tokens, mask, actions, no_depth = jax.tree.map(twice, (tokens, mask, actions, no_depth))
-    logits, cache = _apply(model, params, tokens, mask, actions, start, cache, drop, no_depth)
-    return {name: x[b:] + sample.guidance * (x[:b] - x[b:]) for name, x in logits.items()}, cache
+    b, drop = len(mask), None
+    if sample.guidance != 1:
+        inputs = (tokens, mask, actions, no_depth)
+        tokens, mask, actions, no_depth = jax.tree.map(lambda x: jnp.concatenate([x, x]), inputs)
+        drop = jnp.arange(2 * b) >= b
+    logits, cache = _apply(arch, params, tokens, mask, actions, start, cache, drop, no_depth)
+    if drop is not None:
+        logits = {name: x[b:] + sample.guidance * (x[:b] - x[b:]) for name, x in logits.items()}
+    return logits, cache
 
 
-def guided_cache(model: ModelConfig, sample: SampleConfig, batch: int, slots: int) -> Cache:
-    """An empty cache for :func:`apply_guided`."""
-    return empty_cache(model, _copies(sample) * batch, slots, jnp.dtype(sample.cache_dtype))
+def guided_cache(arch: Architecture, sample: SampleConfig, batch: int, slots: int) -> Cache:
+    """Returns an empty cache for :func:`apply_guided`."""
+    return empty_cache(arch, _copies(sample) * batch, slots, jnp.dtype(sample.cache_dtype))
 
 
 def repeat_cache(sample: SampleConfig, cache: Cache, clips: int) -> Cache:
-    """The cache of one clip as that of ``clips`` clips that all begin with it."""
+    """Returns the cache of one clip repeated for ``clips`` clips."""
 
     def repeat(x: Float[Array, "L c S h N e"]) -> Float[Array, "L cB S h N e"]:
         shape = (len(x), _copies(sample), clips, *x.shape[2:])
@@ -64,8 +67,8 @@ def _copies(sample: SampleConfig) -> int:
 
 
 def _apply(
-    model: ModelConfig,
-    params: Any,
+    arch: Architecture,
+    params: Params,
     tokens: Any,
     mask: Any,
     actions: Any,
@@ -74,7 +77,7 @@ def _apply(
     drop: Any,
     no_depth: Any,
 ) -> Any:
-    shape = (*mask.shape[:2], model.grid, model.grid)
+    shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
     inputs = (grids, mask.reshape(shape), actions, start, cache)
-    return WorldModel(model).apply({"params": params}, *inputs, drop, no_depth)
+    return Transformer(arch).apply({"params": params}, *inputs, drop, no_depth)

@@ -1,6 +1,6 @@
-"""MaskGIT decoding of one frame: all cells masked, then a cosine schedule of which stay so.
+"""MaskGIT decoding of one frame: all cells begin masked, and a cosine schedule unmasks them.
 
-A clip's draws depend on its own key alone, not on the clips beside it.
+A clip's draws depend only on its own key, not on other clips of the batch.
 
 Axes: B clips, S cells, n vocabularies of V codes.
 """
@@ -19,15 +19,15 @@ from rsjax.tokenizers import lfq
 
 @struct.dataclass
 class Frame:
-    """One frame under decoding, by branch: tokens, and the cells still masked."""
+    """A partly decoded frame: tokens by branch, and the cells that are still masked."""
 
     tokens: dict[str, Int[Array, "*B S"]]
     mask: Bool[Array, "*B S"]
 
 
 def masked_after(step: Array | int, steps: int, cells: int) -> Array:
-    """Cells that stay masked after step ``step`` of ``steps``: ceil(cos((step + 1)/steps · π/2) · S); 0 at the end."""
-    # float32's cos(π/2) is not quite 0, and its ceil would leave a cell masked for ever.
+    """Returns how many cells stay masked after a step: ceil(cos((step + 1)/steps · π/2) · S); 0 after the last."""
+    # In float32 cos(π/2) is slightly above 0, and ceil would leave a cell masked.
     share = jnp.where(jnp.asarray(step) + 1 >= steps, 0.0, jnp.cos((step + 1) / steps * jnp.pi / 2))
     return jnp.ceil(share * cells).astype(jnp.int32)
 
@@ -35,12 +35,15 @@ def masked_after(step: Array | int, steps: int, cells: int) -> Array:
 def sample_tokens(
     key: Key[Array, ""], logits: Float[Array, "*B S n V"], temperature: float, code_bits: int, top_k: int = 0
 ) -> tuple[Int[Array, "*B S"], Float[Array, "*B S"]]:
-    """A token per cell and its log-probability (the sum over vocabularies, in nats, at temperature 1, among all codes).
+    """Draws a token per cell.
 
     Args:
         temperature: logits are divided by it; 0 takes each vocabulary's most probable code.
-        top_k: draw among each vocabulary's ``top_k`` most probable codes (and those as probable as the last of them);
-            0: among all.
+        top_k: draw from the ``top_k`` most probable codes of each vocabulary (and ties with the last of them); 0: from
+            all.
+
+    Returns:
+        Tokens, and their log-probabilities: the sum over vocabularies, in nats, at temperature 1, without ``top_k``.
     """
     log_p = jax.nn.log_softmax(logits, axis=-1)
     if temperature == 0:
@@ -52,7 +55,7 @@ def sample_tokens(
 
 
 def keep_top(logits: Float[Array, "*N V"], top_k: int) -> Float[Array, "*N V"]:
-    """Logits with -inf in place of all that lie below the ``top_k``-th; all of them where ``top_k`` is 0."""
+    """Replaces all logits below the ``top_k``-th by -inf; none if ``top_k`` is 0."""
     if not 0 < top_k < logits.shape[-1]:
         return logits
     least = jax.lax.top_k(logits, top_k)[0][..., -1:]
@@ -68,15 +71,15 @@ def unmask_step(
     logits: dict[str, Float[Array, "B S n V"]],
     no_depth: Bool[Array, " B"] | None = None,
 ) -> Frame:
-    """One decoding step: fill the masked cells, then mask again those that the schedule leaves open.
+    """Does one decoding step: fills the masked cells, then masks some of them again as the schedule says.
 
-    Both branches share their mask. Which cells stay open is drawn at random, or, for "greedy", it is those in which the
-    branches together are least sure; in a clip without depth, those in which RGB is.
+    Both branches share their mask. The cells that are masked again are random or, for "greedy", those of lowest
+    confidence, the sum of both branches' log-probabilities; RGB's only for a clip without depth.
 
     Args:
         keys: one per clip.
         logits: of this frame, by branch.
-        no_depth: True for clips without depth; what is drawn for them there means nothing.
+        no_depth: True for clips without depth, whose depth tokens are meaningless.
     """
     return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth)
 
@@ -98,6 +101,6 @@ def _unmask_clip(
         confidence += log_p if branch == "rgb" or no_depth is None else jnp.where(no_depth, 0.0, log_p)
     if config.unmask == "random":
         confidence = jax.random.uniform(order_key, frame.mask.shape)
-    # Cells that are already decided stay so: they rank as surest.
+    # Cells that are already decided stay decided: they get the highest rank.
     rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
     return Frame(tokens, rank < masked_after(step, config.steps, frame.mask.shape[-1]))

@@ -1,12 +1,12 @@
-"""Masked training with corruption (reference: the public Genie, 1xgpt).
+"""Masks and corrupts training tokens (reference: the public Genie, 1xgpt).
 
 1. Every sub-token of every frame, the first too, becomes a random code with probability rate·u, u ~ U(0, 1).
 2. With ``corruption_probability``: f ~ U{P, …, T-1} and r ~ U(keep, 1); in each frame ≥ f, r shrinks by U(decay, 1) and
    sub-tokens become random with probability 1 - r. Otherwise f = 1. (P: prompt frames.)
 3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame.
 
-u, f and r are the batch's; all else is drawn per clip from its place in the global batch, so that the device a clip
-lands on changes nothing.
+u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that it does
+not depend on the clip's device.
 
 Axes: B clips, T frames, H×W cells, n vocabularies.
 """
@@ -24,25 +24,32 @@ Tokens = dict[str, Int[Array, "B T H W"]]
 
 @struct.dataclass
 class Masked:
-    """Model inputs: corrupted tokens by branch, and the cells that are hidden (the same in both branches)."""
+    """Inputs of the model: corrupted tokens by branch, and the masked cells (the same in both branches)."""
 
     tokens: Tokens
     mask: Bool[Array, "B T H W"]
 
 
 def corrupt(
-    config: MaskConfig, code_bits: int, vocabularies: int, key: Array, tokens: Tokens, index: Int[Array, " B"]
+    config: MaskConfig,
+    prompt_frames: int,
+    code_bits: int,
+    vocabularies: int,
+    key: Array,
+    tokens: Tokens,
+    index: Int[Array, " B"],
 ) -> Masked:
     """Corrupts and masks a batch.
 
     Args:
+        prompt_frames: P, the first frames, which step 2 leaves alone.
         key: the step's key, the same on all devices.
         tokens: clean tokens by branch.
         index: each clip's place in the global batch.
     """
     frames = next(iter(tokens.values())).shape[1]
     batch_key, clip_key = jax.random.split(key)
-    replace, first_masked = _batch_plan(config, batch_key, frames)
+    replace, first_masked = _batch_plan(config, prompt_frames, batch_key, frames)
 
     def one_clip(place: Int[Array, ""], clip: dict[str, Int[Array, "T H W"]]) -> Masked:
         mask_key, *branch_keys = jax.random.split(jax.random.fold_in(clip_key, place), 1 + len(clip))
@@ -56,22 +63,22 @@ def corrupt(
 
 
 def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Array, " B"]:
-    """Which clips are shown the null action instead of their own: each with probability ``rate``.
+    """Draws the clips that see the null action instead of their own, each with probability ``rate``.
 
     Args:
         key: the step's key, as for :func:`corrupt`.
         index: each clip's place in the global batch.
     """
-    key = jax.random.fold_in(key, 2)  # 0 and 1 are the halves that corrupt splits it into
+    key = jax.random.fold_in(key, 2)  # independent of the two keys that corrupt splits it into
     return jax.vmap(lambda place: jax.random.bernoulli(jax.random.fold_in(key, place), rate))(index)
 
 
-def _batch_plan(config: MaskConfig, key: Array, frames: int) -> tuple[Array, Array]:
-    """Per-frame probability that a sub-token is replaced (T,), and f."""
+def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int) -> tuple[Array, Array]:
+    """Draws the probability per frame that a sub-token is replaced, (T,), and f."""
     u_key, happens_key, f_key, keep_key, decay_key = jax.random.split(key, 5)
     everywhere = config.random_token_rate * jax.random.uniform(u_key)
     happens = jax.random.bernoulli(happens_key, config.corruption_probability)
-    drawn = jax.random.randint(f_key, (), config.prompt_frames, frames)
+    drawn = jax.random.randint(f_key, (), prompt_frames, frames)
     keep = jax.random.uniform(keep_key, minval=config.corruption_keep)
     decay = jax.random.uniform(decay_key, (frames,), minval=config.corruption_decay)
     late = jnp.arange(frames) >= drawn

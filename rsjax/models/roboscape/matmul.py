@@ -1,8 +1,8 @@
-"""The matrix product of linear layers, with bf16 operands and float32 accumulation where that is asked for.
+"""The matrix product of linear layers with bf16 operands and float32 accumulation.
 
-CPUs use their bf16 units only for bf16 × bf16 → float32, and the default gradient of such a product gives that up: its
+CPUs use their bf16 units only for bf16 × bf16 → float32. The default gradient of such a product does not: its
 cotangents are float32, and its weight gradient contracts the first axes of both operands, for which XLA has no fast
-kernel. So the gradient is written by hand: cotangents are cast too, and the activations are transposed in memory.
+kernel. So the gradient is hand-written: it casts cotangents too, and transposes the activations in memory.
 """
 
 import jax
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 @jax.custom_vjp
 def matmul_bf16(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
-    """x·w with operands rounded to bf16 and float32 accumulation, forwards and backwards; float32 in and out."""
+    """Returns x·w: operands rounded to bf16, float32 accumulation, in both passes; float32 in and out."""
     return _product(x.astype(jnp.bfloat16), w.astype(jnp.bfloat16), 0)
 
 
@@ -26,9 +26,9 @@ def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Arra
     cotangent = cotangent.astype(jnp.bfloat16)
     if jax.default_backend() != "cpu":
         return _product(cotangent, w, 1), _product(x.T, cotangent, 0)
-    if x.shape[1] <= cotangent.shape[1]:  # the narrower operand is less to move
+    if x.shape[1] <= cotangent.shape[1]:  # transpose the narrower operand
         return _product(cotangent, w, 1), _product(transposed_in_memory(x), cotangent, 0)
-    # Behind a barrier, or XLA turns the product around again to a form that it has no bf16 kernel for.
+    # Without the barrier, XLA swaps the operands back to a form for which it has no bf16 kernel.
     return _product(cotangent, w, 1), jax.lax.optimization_barrier(_product(transposed_in_memory(cotangent), x, 0)).T
 
 
@@ -38,7 +38,7 @@ def _product(x: Array, w: Array, contract: int) -> Array:
 
 
 def transposed_in_memory(x: Float[Array, "*N K M"]) -> Float[Array, "*N M K"]:
-    """The last two axes swapped, and moved: a plain transpose is only another layout of the same memory."""
+    """Swaps the last two axes and moves the data; a plain transpose only changes the layout of the same memory."""
     y = x.swapaxes(-1, -2)
     return jax.lax.optimization_barrier(y.reshape(-1)).reshape(y.shape)
 

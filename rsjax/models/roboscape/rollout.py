@@ -1,14 +1,14 @@
-"""Rollouts: from prompt frames and actions to the tokens of every frame, frame by frame (paper Eq. 1).
+"""Rollouts: generate tokens frame by frame from prompt frames and actions (paper Eq. 1).
 
-With the temporal cache a frame costs ``steps`` frame passes and its commit one: the commit of frame t-1 (a pass with
-its final tokens) is fused with the first step of frame t, and the last commit is skipped. What a pass with masked cells
-writes into the cache is overwritten before anything reads it, so cached and uncached rollouts agree.
+With the temporal cache a frame costs ``steps`` frame passes, and one to commit it with its final tokens. The commit of
+frame t-1 is fused with the first step of frame t; the last commit is skipped. What a pass with masked cells writes into
+the cache is overwritten before it is read, so cached and uncached rollouts agree.
 
-A rollout may be longer than ``model.frames``; ``window.py`` says what a frame then remembers. For a number
-of clips and of prompt frames, one program serves all lengths up to ``model.frames``, and another one those up to each
-further multiple of it: one compilation per multiple. Their arrays grow with the multiple, the programs do not.
+A rollout may be longer than ``arch.frames``; ``window.py`` describes the memory of its frames. There is one compilation
+for each number of clips and prompt frames and each multiple of ``arch.frames`` that the length is rounded up to. Arrays
+grow with that multiple, programs do not.
 
-Axes: B clips, T frames (P of them given), H×W = S cells, A action dimensions.
+Axes: B clips, T frames (the first P are the prompt), H×W = S cells, A action dimensions.
 """
 
 from dataclasses import replace
@@ -22,31 +22,33 @@ from flax import struct
 from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.decode import Decoder
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache, repeat_cache
+from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import cache_slots, room, stride, window_actions, window_start
-from rsjax.models.roboscape.world_model import Cache, branches
+from rsjax.trainable import Params
 
 Tokens = dict[str, Int[Array, "B T H W"]]
 
 
 @struct.dataclass
 class Prompt:
-    """Given frames, encoded once, from which any number of rollouts may start. From :func:`encode_prompt`."""
+    """Prompt frames encoded by :func:`encode_prompt`, from which any number of rollouts may start."""
 
     tokens: Tokens
     actions: Float[Array, "B P A"]
     cache: Cache  # of all frames but the last, whose commit is fused with the next frame's first step
-    no_depth: Bool[Array, " B"] | None  # as of :func:`rollout`; it holds for all that follows too
-    # What the cache was made with, as SampleConfig has it; the stride resolved. Rollouts from here must agree.
+    no_depth: Bool[Array, " B"] | None  # as for :func:`rollout`
+    # Settings that the cache depends on and a rollout must share; the stride is resolved.
     guided: bool = struct.field(pytree_node=False)
     window_stride: int = struct.field(pytree_node=False)
     cache_dtype: str = struct.field(pytree_node=False)
 
-    def check(self, model: ModelConfig, sample: SampleConfig) -> None:
-        """Raises :class:`ValueError` where a rollout with ``sample`` could not go on from this cache."""
-        for name, wanted in _made_with(model, sample).items():
+    def check(self, arch: Architecture, sample: SampleConfig) -> None:
+        """Raises :class:`ValueError` if a rollout with ``sample`` cannot use this cache."""
+        for name, wanted in _made_with(arch, sample).items():
             if (made := getattr(self, name)) != wanted:
                 raise ValueError(
                     f"the prompt was encoded with {name} = {made!r}, the rollout has {wanted!r}; encode anew"
@@ -54,9 +56,9 @@ class Prompt:
 
 
 def rollout(
-    model: ModelConfig,
+    arch: Architecture,
     sample: SampleConfig,
-    params: Any,
+    params: Params,
     prompt: Tokens,
     actions: Float[Array, "B T A"],
     key: Key[Array, ""],
@@ -67,62 +69,61 @@ def rollout(
     """Generates the frames after the prompt.
 
     Args:
-        prompt: the given frames' tokens by branch, P of them. Without "depth", for a model that has that branch: no
-            clip has depth.
-        actions: of all T frames, normalised; row t led into frame t, row 0 is not read by anything that matters.
-        key: of the draws; the same key with other actions draws alike.
+        prompt: the tokens of P frames by branch. If "depth" is missing for a model with that branch, no clip has depth.
+        actions: of all T frames, normalised; row t led into frame t, row 0 has no effect on the generated frames.
+        key: of the random draws; the draws do not depend on actions.
         cached: False recomputes all frames of the window at every step, for comparison.
-        index: each clip's number, which with ``key`` decides its draws; 0, 1, … if not given.
-        no_depth: True for clips without depth, None where all have it. Their depth stays hidden from the first frame to
-            the last, as in training, and is nothing but zeros in what is returned.
+        index: each clip's number, which decides its draws together with ``key``; 0, 1, … by default.
+        no_depth: True for clips without depth; None: all have depth. Such clips' depth is masked in every frame, as in
+            training, and zeros in the result.
 
     Returns:
-        Tokens of all T frames by branch; the first P are the prompt's.
+        Tokens of all T frames by branch; the first P are the prompt.
 
     Raises:
-        ConfigError: the model cannot be sampled like this.
-        ValueError: T leaves nothing to generate; prompt, actions and ``no_depth`` are of different numbers of clips; or
-            the prompt lacks the depth of clips that have it.
+        ConfigError: the model does not support these settings.
+        ValueError: T leaves nothing to generate; prompt, actions and ``no_depth`` differ in their number of clips; or
+            the prompt lacks depth tokens of clips with depth.
     """
-    sample.check(model)
-    clips, given = prompt["rgb"].shape[:2]
-    _check_lengths(given, actions.shape[1])
+    arch.check_sampling(sample)
+    clips, past = prompt["rgb"].shape[:2]
+    _check_lengths(past, actions.shape[1])
     if clips != len(actions):
         raise ValueError(f"{clips} prompts and {len(actions)} action sequences; encode_prompt shares one among many")
-    start, no_depth = _start(model, prompt, no_depth)
-    arguments = _arguments(model, sample, actions, key, index)
-    tokens = _rollout(model, replace(sample, seed=0), cached, params, start, no_depth, *arguments)
+    start, no_depth = _start(arch, prompt, no_depth)
+    arguments = _arguments(arch, sample, actions, key, index)
+    tokens = _rollout(arch, replace(sample, seed=0), cached, params, start, no_depth, *arguments)
     return {name: grid[:, : actions.shape[1]] for name, grid in tokens.items()}
 
 
 def encode_prompt(
-    model: ModelConfig,
+    arch: Architecture,
     sample: SampleConfig,
-    params: Any,
+    params: Params,
     prompt: Tokens,
     actions: Float[Array, "B P A"],
     no_depth: Bool[Array, " B"] | None = None,
 ) -> Prompt:
-    """Runs the prompt once, for :func:`rollout_from`.
+    """Encodes a prompt for :func:`rollout_from`.
 
     Args:
-        prompt: the given frames' tokens by branch, as for :func:`rollout`.
-        actions: that led into them, normalised.
+        prompt: tokens by branch, as for :func:`rollout`.
+        actions: those that led into the prompt's frames, normalised.
         no_depth: as for :func:`rollout`.
 
     Raises:
-        ConfigError: the model cannot be sampled like this.
-        ValueError: ``no_depth`` is of another number of clips, or the prompt lacks the depth of clips that have it.
+        ConfigError: the model does not support these settings.
+        ValueError: ``no_depth`` has another number of clips, or the prompt lacks depth tokens of clips with depth.
     """
-    sample.check(model)
-    start, no_depth = _start(model, prompt, no_depth)
-    return _encode_jit(model, replace(sample, seed=0), params, start, no_depth, actions)
+    arch.check_sampling(sample)
+    start, no_depth = _start(arch, prompt, no_depth)
+    return _encode_jit(arch, replace(sample, seed=0), params, start, no_depth, actions)
 
 
 def rollout_from(
-    model: ModelConfig,
+    arch: Architecture,
     sample: SampleConfig,
-    params: Any,
+    params: Params,
     prompt: Prompt,
     actions: Float[Array, "N F A"],
     key: Key[Array, ""],
@@ -131,142 +132,142 @@ def rollout_from(
     """Generates the F frames after an encoded prompt, under N action sequences.
 
     Args:
-        prompt: of N clips, or of one that all start from.
-        actions: that lead into the F frames, normalised.
+        prompt: of N clips, or of one clip that all start from.
+        actions: those that lead into the F frames, normalised.
         key: as for :func:`rollout`.
-        index: as for :func:`rollout`; equal numbers draw alike, so that candidates differ in their actions alone.
+        index: as for :func:`rollout`; clips with the same number have the same draws.
 
     Returns:
-        Tokens of all P + F frames by branch, as :func:`rollout` gives with each prompt repeated.
+        Tokens of all P + F frames by branch, the same as from :func:`rollout` with the prompt repeated.
 
     Raises:
-        ConfigError: the model cannot be sampled like this.
-        ValueError: F is 0, the prompt is neither of one clip nor of N, or it was encoded with guidance where there is
-            none now (or the other way about), with another window stride or another type of cache.
+        ConfigError: the model does not support these settings.
+        ValueError: F is 0; the prompt has neither one clip nor N; or it was encoded with other settings of guidance
+            (on or off), window stride or cache type.
     """
-    sample.check(model)
-    prompt.check(model, sample)
-    (clips, given), n = prompt.actions.shape[:2], len(actions)
-    _check_lengths(given, given + actions.shape[1])
+    arch.check_sampling(sample)
+    prompt.check(arch, sample)
+    (clips, past), n = prompt.actions.shape[:2], len(actions)
+    _check_lengths(past, past + actions.shape[1])
     if clips not in (1, n):
         raise ValueError(f"a prompt of {clips} clips and {n} action sequences; give one prompt, or as many")
     before = jnp.broadcast_to(prompt.actions, (n, *prompt.actions.shape[1:]))
-    arguments = _arguments(model, sample, jnp.concatenate([before, actions], axis=1), key, index)
-    tokens = _resume(model, replace(sample, seed=0), params, prompt, *arguments)
-    return {name: grid[:, : given + actions.shape[1]] for name, grid in tokens.items()}
+    arguments = _arguments(arch, sample, jnp.concatenate([before, actions], axis=1), key, index)
+    tokens = _resume(arch, replace(sample, seed=0), params, prompt, *arguments)
+    return {name: grid[:, : past + actions.shape[1]] for name, grid in tokens.items()}
 
 
-def _made_with(model: ModelConfig, sample: SampleConfig) -> dict[str, Any]:
-    """What decides the shape, the type and the frames of a prompt's cache."""
+def _made_with(arch: Architecture, sample: SampleConfig) -> dict[str, Any]:
+    """Returns the settings that a prompt's cache depends on."""
     return {
         "guided": sample.guidance != 1,
-        "window_stride": stride(model, sample),
+        "window_stride": stride(arch, sample),
         "cache_dtype": sample.cache_dtype,
     }
 
 
-def _start(model: ModelConfig, prompt: Tokens, no_depth: Any) -> tuple[Tokens, Array | None]:
-    """The prompt's tokens of the branches that the model has, and ``no_depth`` where the model reads it."""
-    if not model.depth:
+def _start(arch: Architecture, prompt: Tokens, no_depth: Any) -> tuple[Tokens, Array | None]:
+    """Checks and returns the prompt's tokens of the model's branches, and ``no_depth`` if the model needs it."""
+    if not arch.use_depth:
         return {"rgb": prompt["rgb"]}, None
     clips = len(prompt["rgb"])
     if no_depth is not None and np.shape(no_depth) != (clips,):
         raise ValueError(f"no_depth has shape {np.shape(no_depth)}; the prompt has {clips} clips, each needs one value")
     if "depth" in prompt:
-        if isinstance(no_depth, np.ndarray) and not no_depth.any():  # the program without it is the smaller one
+        if isinstance(no_depth, np.ndarray) and not no_depth.any():  # the program without it is smaller
             no_depth = None
-        return {name: prompt[name] for name in branches(model)}, no_depth
+        return {name: prompt[name] for name in arch.branches}, no_depth
     if no_depth is not None and not np.all(no_depth):
         raise ValueError('no_depth says that clips have depth, but the prompt has no tokens "depth"')
     return {"rgb": prompt["rgb"], "depth": jnp.zeros_like(prompt["rgb"])}, jnp.ones(clips, bool)
 
 
-def _check_lengths(given: int, frames: int) -> None:
-    if not 0 < given < frames:
-        raise ValueError(f"{frames} frames asked for with {given} given; at least one must be given and one left")
+def _check_lengths(past: int, frames: int) -> None:
+    if not 0 < past < frames:
+        raise ValueError(f"{frames} frames with a prompt of {past}; a rollout needs a prompt and a frame to generate")
 
 
-def _arguments(model: ModelConfig, sample: SampleConfig, actions: Array, key: Array, index: Array | None) -> tuple:
-    """Actions with room to spare, the number of frames as a value instead of a shape, and a key per clip."""
+def _arguments(arch: Architecture, sample: SampleConfig, actions: Array, key: Array, index: Array | None) -> tuple:
+    """Returns actions padded to the size of the arrays, the number of frames as an array, and a key per clip."""
     b, frames, _ = actions.shape
     index = jnp.arange(b) if index is None else jnp.asarray(index)
-    spare = room(model, sample, frames) - frames
+    spare = room(arch, sample, frames) - frames
     keys = jax.vmap(partial(jax.random.fold_in, key))(index)
     return jnp.pad(actions, ((0, 0), (0, spare), (0, 0))), jnp.asarray(frames), keys
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _rollout(
-    model: ModelConfig,
+    arch: Architecture,
     sample: SampleConfig,
     cached: bool,
-    params: Any,
+    params: Params,
     prompt: Tokens,
     no_depth: Array | None,
     actions: Array,
     frames: Array,
     keys: Array,
 ) -> Tokens:
-    given = prompt["rgb"].shape[1]
-    apply = partial(apply_guided, model, sample, params, no_depth=no_depth)
-    decoder = Decoder(model, sample, apply, actions, keys, no_depth)
+    past = prompt["rgb"].shape[1]
+    apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
+    decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     tokens = _tokens(prompt, actions)
     if cached:
-        start = _encode(model, sample, params, prompt, no_depth, actions[:, :given])
-        return _grids(model, _decode_cached(decoder, tokens, start.cache, given, frames), no_depth)
-    tokens = jax.lax.fori_loop(given, frames, decoder.uncached, tokens)
-    return _grids(model, tokens, no_depth)
+        start = _encode(arch, sample, params, prompt, no_depth, actions[:, :past])
+        return _grids(arch, _decode_cached(decoder, tokens, start.cache, past, frames), no_depth)
+    tokens = jax.lax.fori_loop(past, frames, decoder.uncached, tokens)
+    return _grids(arch, tokens, no_depth)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _resume(
-    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Prompt, actions: Array, frames: Array, keys: Array
+    arch: Architecture, sample: SampleConfig, params: Params, prompt: Prompt, actions: Array, frames: Array, keys: Array
 ) -> Tokens:
-    (clips, given), n = prompt.actions.shape[:2], len(actions)
+    (clips, past), n = prompt.actions.shape[:2], len(actions)
     no_depth = None if prompt.no_depth is None else jnp.broadcast_to(prompt.no_depth, n)
-    apply = partial(apply_guided, model, sample, params, no_depth=no_depth)
-    decoder = Decoder(model, sample, apply, actions, keys, no_depth)
+    apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
+    decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
-    return _grids(model, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, given, frames), no_depth)
+    return _grids(arch, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, past, frames), no_depth)
 
 
 def _encode(
-    model: ModelConfig, sample: SampleConfig, params: Any, prompt: Tokens, no_depth: Array | None, actions: Array
+    arch: Architecture, sample: SampleConfig, params: Params, prompt: Tokens, no_depth: Array | None, actions: Array
 ) -> Prompt:
-    b, given = prompt["rgb"].shape[:2]
-    cache: Any = guided_cache(model, sample, b, cache_slots(model, given))
-    base = int(window_start(model, sample, given))
-    if (known := given - 1 - base) > 0:
-        tokens = {name: grid[:, base : given - 1].reshape(b, known, -1) for name, grid in prompt.items()}
-        seen = window_actions(model, actions, base, base, known)
-        mask = jnp.zeros((b, known, model.grid**2), bool)
-        _, cache = apply_guided(model, sample, params, tokens, mask, seen, 0, cache, no_depth)
-    return Prompt(prompt, actions, cache, no_depth, **_made_with(model, sample))
+    b, past = prompt["rgb"].shape[:2]
+    cache: Any = guided_cache(arch, sample, b, cache_slots(arch, past))
+    base = int(window_start(arch, sample, past))
+    if (known := past - 1 - base) > 0:
+        tokens = {name: grid[:, base : past - 1].reshape(b, known, -1) for name, grid in prompt.items()}
+        seen = window_actions(arch, actions, base, base, known)
+        mask = jnp.zeros((b, known, arch.grid**2), bool)
+        _, cache = apply_guided(arch, sample, params, tokens, mask, seen, 0, cache, no_depth)
+    return Prompt(prompt, actions, cache, no_depth, **_made_with(arch, sample))
 
 
 _encode_jit = jax.jit(_encode, static_argnums=(0, 1))
 
 
-def _decode_cached(decoder: Decoder, tokens: dict, cache: Cache, given: int, frames: Array) -> dict:
-    """Frames ``given`` to ``frames`` - 1, window by window; the cache is that of the first of these windows."""
-    model, sample, length = decoder.model, decoder.sample, decoder.actions.shape[1]
-    if model.positions == "rotary" or length <= model.frames:
-        return jax.lax.fori_loop(given, frames, partial(decoder.cached, 0), (tokens, cache))[0]
-    by, first = stride(model, sample), window_start(model, sample, given)
+def _decode_cached(decoder: Decoder, tokens: dict, cache: Cache, past: int, frames: Array) -> dict:
+    """Decodes frames ``past`` to ``frames`` - 1, window by window, with the cache of the first of these windows."""
+    arch, sample, length = decoder.arch, decoder.sample, decoder.actions.shape[1]
+    if arch.positions == "rotary" or length <= arch.frames:
+        return jax.lax.fori_loop(past, frames, partial(decoder.cached, 0), (tokens, cache))[0]
+    by, first = stride(arch, sample), window_start(arch, sample, past)
 
     def window(number: Array, carry: tuple[dict, Cache]) -> tuple[dict, Cache]:
         base, later = number * by, number * by > first
         carry = jax.lax.cond(later, partial(decoder.encode_anew, base), lambda kept: kept, carry)
-        begin = jnp.where(later, base + model.frames - by, given)
-        end = jnp.minimum(base + model.frames, frames)
+        begin = jnp.where(later, base + arch.frames - by, past)
+        end = jnp.minimum(base + arch.frames, frames)
         return jax.lax.fori_loop(begin, end, partial(decoder.cached, base), carry)
 
-    last = window_start(model, sample, frames - 1)
+    last = window_start(arch, sample, frames - 1)
     return jax.lax.fori_loop(first // by, last // by + 1, window, (tokens, cache))[0]
 
 
 def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
-    """The prompt's tokens for every sequence of actions, and zeros for what is to come."""
+    """Returns the prompt's tokens for every action sequence, padded with zeros for the frames to generate."""
     (b, length), out = actions.shape[:2], {}
     for name, grid in prompt.items():
         cells = grid.astype(jnp.int32).reshape(*grid.shape[:2], -1)
@@ -275,7 +276,7 @@ def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
     return out
 
 
-def _grids(model: ModelConfig, tokens: dict[str, Int[Array, "B T S"]], no_depth: Array | None) -> Tokens:
+def _grids(arch: Architecture, tokens: dict[str, Int[Array, "B T S"]], no_depth: Array | None) -> Tokens:
     if no_depth is not None:
         tokens = tokens | {"depth": jnp.where(no_depth[:, None, None], 0, tokens["depth"])}
-    return {name: cells.reshape(*cells.shape[:2], model.grid, model.grid) for name, cells in tokens.items()}
+    return {name: cells.reshape(*cells.shape[:2], arch.grid, arch.grid) for name, cells in tokens.items()}

@@ -1,8 +1,8 @@
-"""Which frames a frame is decoded from.
+"""The window of frames that a frame is decoded from.
 
-With rotary positions it is the ``model.frames - 1`` before it, and the window moves on with every frame. Learned
-positions are numbered from the window's first frame, so what was computed of a frame holds only while the window stays:
-it jumps by a stride, and the frames that it keeps are encoded anew.
+With rotary positions it contains the ``arch.frames - 1`` frames before, and moves with every frame. Learned positions
+count from the window's first frame, so the cache is valid only while the window stays. The window therefore moves by a
+stride, and the frames that stay in it are encoded again.
 
 Axes: B clips, T frames, A action dimensions.
 """
@@ -12,54 +12,55 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from rsjax.clip import Array
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
 
 
-def stride(model: ModelConfig, sample: SampleConfig) -> int:
-    """Frames by which a full window moves on (learned positions)."""
-    return sample.window_stride or model.frames // 2
+def stride(arch: Architecture, sample: SampleConfig) -> int:
+    """Returns the number of frames by which a full window moves (learned positions)."""
+    return sample.window_stride or arch.frames // 2
 
 
-def window_start(model: ModelConfig, sample: SampleConfig, frame: Int[Array, ""] | int) -> Int[Array, ""] | int:
-    """The first frame of the window that ``frame`` is decoded in: 0, until ``model.frames`` frames are full."""
-    if model.positions == "rotary":
+def window_start(arch: Architecture, sample: SampleConfig, frame: Int[Array, ""] | int) -> Int[Array, ""] | int:
+    """Returns the first frame of the window that ``frame`` is decoded in: 0 for the first ``arch.frames`` frames."""
+    if arch.positions == "rotary":
         return 0
-    by, excess = stride(model, sample), frame + 1 - model.frames
+    by, excess = stride(arch, sample), frame + 1 - arch.frames
     return (excess + by - 1) // by * by * (excess > 0)
 
 
-def room(model: ModelConfig, sample: SampleConfig, frames: int) -> int:
-    """Frames that the arrays of a rollout of ``frames`` frames hold: few sizes, and every window within.
+def room(arch: Architecture, sample: SampleConfig, frames: int) -> int:
+    """Returns the length of the arrays of a rollout of ``frames`` frames, which every window fits into.
 
-    A multiple of ``model.frames``, so that up to there all lengths share one compiled program.
+    It is rounded up to a multiple of ``arch.frames`` (plus a stride), so that few programs are compiled.
     """
-    whole = -(-frames // model.frames) * model.frames
-    return whole + stride(model, sample) if model.positions == "learned" and whole > model.frames else whole
+    whole = -(-frames // arch.frames) * arch.frames
+    return whole + stride(arch, sample) if arch.positions == "learned" and whole > arch.frames else whole
 
 
-def cache_slots(model: ModelConfig, given: int) -> int:
-    """Slots of the temporal cache of a rollout with ``given`` prompt frames.
+def cache_slots(arch: Architecture, past: int) -> int:
+    """Returns the number of slots of the temporal cache of a rollout with ``past`` prompt frames.
 
-    The pass over frames (t-1, t) is what needs most: frame t-1 still attends to t - ``model.frames``, so a rolling
-    cache has one slot more than the window. A longer prompt is encoded in one pass, which must find room.
+    In the pass over frames (t-1, t), frame t-1 still attends to t - ``arch.frames``, so a rolling cache has one slot
+    more than the window. A longer prompt is encoded in one pass and must fit.
     """
-    return model.frames if model.positions == "learned" else max(model.frames + 1, given - 1)
+    return arch.frames if arch.positions == "learned" else max(arch.frames + 1, past - 1)
 
 
 def window_actions(
-    model: ModelConfig,
+    arch: Architecture,
     actions: Float[Array, "B T A"],
     base: Int[Array, ""] | int,
     start: Int[Array, ""] | int,
     length: int,
 ) -> Float[Array, "B length A"]:
-    """The actions into frames start … start + length - 1, as they would be in a clip that begins with frame ``base``.
+    """Returns the actions into frames start … start + length - 1, as in a clip that begins with frame ``base``.
 
-    A clip's first frame has no action, and the sums of ``model.integrate_actions`` begin with it.
+    The first frame of a clip has no action, and the sums of ``model.integrate_actions`` start there.
     """
     rows = jax.lax.dynamic_slice_in_dim(actions, start, length, axis=1)
     moved = rows
-    if model.integrate_actions:
+    if arch.integrate_actions:
         before = jax.lax.dynamic_slice_in_dim(actions, base, 1, axis=1)
         is_sum = jnp.arange(actions.shape[-1]) >= actions.shape[-1] // 2
         moved = rows - jnp.where(is_sum, before, 0.0)

@@ -7,24 +7,24 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rsjax.config import ModelConfig
-from rsjax.models.roboscape.flops import forward_flops, train_flops
-from rsjax.models.roboscape.world_model import WorldModel, branches
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.transformer import Transformer
 from tests.tracing import products
 
-DUAL = ModelConfig(frames=5, grid=3, code_bits=8, action_dim=3, width=32, blocks=3, heads=2)
+DUAL = Architecture(frames=5, grid=3, code_bits=8, action_inputs=3, width=32, blocks=3, heads=2)
 
 
-def world_model(config: ModelConfig) -> tuple[Any, Any, Any]:
-    params = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+def world_model(config: Architecture) -> tuple[Any, Any, Any]:
+    params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     grid = jax.ShapeDtypeStruct((1, config.frames, config.grid, config.grid), jnp.int32)
-    actions = jax.ShapeDtypeStruct((1, config.frames, config.action_dim), jnp.float32)
+    actions = jax.ShapeDtypeStruct((1, config.frames, config.action_inputs), jnp.float32)
 
     def logits(params: Any, tokens: Any, actions: Any) -> Any:
         mask = tokens["rgb"] == 0
-        return WorldModel(config).apply({"params": params}, tokens, mask, actions)[0]
+        return Transformer(config).apply({"params": params}, tokens, mask, actions)[0]
 
-    return logits, params, (dict.fromkeys(branches(config), grid), actions)
+    return logits, params, (dict.fromkeys(config.branches, grid), actions)
 
 
 def xla_flops(function: Any, *inputs: Any) -> float:
@@ -34,17 +34,17 @@ def xla_flops(function: Any, *inputs: Any) -> float:
 
 @pytest.mark.parametrize(
     "config",
-    [DUAL, replace(DUAL, depth=False, action_dim=0), replace(DUAL, mlp_ratio=2, vocabularies=1)],
+    [DUAL, replace(DUAL, use_depth=False, action_inputs=0), replace(DUAL, mlp_ratio=2, vocabularies=1)],
     ids=["dual", "genie", "other shapes"],
 )
-def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: ModelConfig) -> None:
+def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:
     logits, params, inputs = world_model(config)
     assert products(jax.make_jaxpr(logits)(params, *inputs).jaxpr) == forward_flops(config, config.frames)
 
 
 def test_xla_counts_little_more_for_a_block_of_usual_width() -> None:
     # One block: XLA counts what is inside a scan once. The rest is norms, softmaxes, GELUs and one-hot reads.
-    config = ModelConfig(frames=4, grid=4, width=128, blocks=1, heads=4)
+    config = Architecture(frames=4, grid=4, width=128, blocks=1, heads=4)
     logits, params, inputs = world_model(config)
     counted = xla_flops(logits, params, *inputs)
     assert 1 <= counted / forward_flops(config, config.frames) < 1.05
@@ -53,4 +53,4 @@ def test_xla_counts_little_more_for_a_block_of_usual_width() -> None:
         return sum(jnp.sum(jnp.square(x)) for x in logits(params, *inputs).values())
 
     counted = xla_flops(jax.grad(loss), params, *inputs)
-    assert counted == pytest.approx(train_flops(config, config.frames, 1), rel=0.05)
+    assert counted == pytest.approx(3 * forward_flops(config, config.frames), rel=0.05)

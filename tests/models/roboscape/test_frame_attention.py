@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig
 from rsjax.models.roboscape import attention, frame_attention
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import attend
 from rsjax.models.roboscape.frame_attention import attend_in_frames
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.roboscape.transformer import Transformer
 
 
 def test_output_and_gradients_are_plain_attention_s_to_bf16_rounding() -> None:
@@ -42,15 +42,23 @@ def test_taking_few_frames_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyP
 def test_a_model_of_large_frames_learns_as_with_plain_attention(
     monkeypatch: pytest.MonkeyPatch, remat: Literal["none", "blocks"]
 ) -> None:
-    cfg = ModelConfig(
-        frames=2, grid=3, code_bits=4, action_dim=3, width=16, blocks=2, heads=2, compute_dtype="bfloat16", remat=remat
+    cfg = Architecture(
+        frames=2,
+        grid=3,
+        code_bits=4,
+        action_inputs=3,
+        width=16,
+        blocks=2,
+        heads=2,
+        compute_dtype="bfloat16",
+        remat=remat,
     )
     tokens = {name: jax.random.randint(jax.random.key(3), (1, 2, 3, 3), 0, 16) for name in ("rgb", "depth")}
     mask, actions = jnp.zeros((1, 2, 3, 3), bool), jnp.ones((1, 2, 3))
-    params = WorldModel(cfg).init_params(jax.random.key(4))
+    params = Transformer(cfg).init_params(jax.random.key(4))
 
     def loss(params: Any) -> jax.Array:
-        logits, _ = WorldModel(cfg).apply({"params": params}, tokens, mask, actions)  # type: ignore[misc]
+        logits, _ = Transformer(cfg).apply({"params": params}, tokens, mask, actions)  # type: ignore[misc]
         return sum((jnp.mean(jnp.sin(x)) for x in logits.values()), start=jnp.float32(0))
 
     plain = jax.grad(loss)(params)

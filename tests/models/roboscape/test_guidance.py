@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from rsjax.config import ConfigError, SampleConfig, presets
+from rsjax.config.leaves import with_values
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.rollout import encode_prompt, rollout
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.roboscape.transformer import Transformer
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
 
 GUIDED = replace(DUAL, action_dropout=0.2)
@@ -24,7 +25,7 @@ def flat(tokens: dict[str, Any]) -> dict[str, Any]:
 def test_guided_logits_lie_on_the_line_through_those_without_and_with_actions(guidance: float) -> None:
     """In two pieces through the cache, against two whole passes without."""
     params, (tokens, actions) = random_params(GUIDED), given(GUIDED, 4, 4)
-    apply, mask = jax.jit(WorldModel(GUIDED).apply), np.zeros((BATCH, 4, 3, 3), bool)
+    apply, mask = jax.jit(Transformer(GUIDED).apply), np.zeros((BATCH, 4, 3, 3), bool)
     with_, without = (
         apply({"params": params}, tokens, mask, actions, drop_actions=jnp.full(BATCH, drop))[0]
         for drop in (False, True)
@@ -68,13 +69,13 @@ def test_guided_rollouts_are_the_same_without_the_cache() -> None:
 
 def test_guidance_of_a_model_that_never_dropped_actions_is_refused() -> None:
     tokens, actions = given(DUAL, 1)
-    with pytest.raises(ConfigError, match=r"sample.guidance is 2.0 .* model.action_dropout above 0"):
+    with pytest.raises(ConfigError, match=r"model.sample.guidance is 2.0 .* model.action_dropout above 0"):
         rollout(DUAL, SampleConfig(guidance=2.0), random_params(DUAL), tokens, actions, KEY)
     debug = presets.debug()
-    with pytest.raises(ConfigError, match=r"sample.guidance is 2.0"):
-        replace(debug, sample=SampleConfig(guidance=2.0))
-    with pytest.raises(ConfigError, match=r"sample.window_stride is 6 of model.frames = 6"):
-        replace(debug, sample=SampleConfig(window_stride=6))
+    with pytest.raises(ConfigError, match=r"model.sample.guidance is 2.0"):
+        with_values(debug, {"model.sample.guidance": 2.0})
+    with pytest.raises(ConfigError, match=r"model.sample.window_stride is 6 of 6 positions"):
+        with_values(debug, {"model.sample.window_stride": 6})
 
 
 def test_a_bfloat16_cache_is_half_as_large_and_nearly_as_good() -> None:

@@ -1,15 +1,23 @@
 """Each term against a loop written from its equation; s_t is one-hot, so s·log p is the log-probability of its code."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import LossConfig
-from rsjax.models.roboscape import losses
+from rsjax.config import LossConfig, RoboScapeConfig
+from rsjax.models.roboscape import model as losses
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map
+from rsjax.models.roboscape.model import Predictions
+from rsjax.trainable import Term, combine
+from tests.models.roboscape.toy import roboscape
 
 B, T, GRID, BITS, VOCABULARIES = 3, 4, 3, 6, 2
+ARCHITECTURE = Architecture(frames=T, grid=GRID, code_bits=BITS, vocabularies=VOCABULARIES, action_inputs=1)
 SIZE = 2 ** (BITS // VOCABULARIES)
 RNG = np.random.default_rng(0)
 LOGITS = RNG.normal(scale=3, size=(B, T, GRID**2, VOCABULARIES, SIZE)).astype(np.float32)
@@ -41,7 +49,17 @@ def cross_entropy() -> jax.Array:
     return losses.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
 
 
-def assert_term(term: losses.Term, expected: tuple[float, float]) -> None:
+def predictions(keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, gamma: float = 5.0) -> Predictions:
+    """Both branches with the same logits and tokens, and these keypoints instead of selected ones."""
+    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(gamma=gamma)))
+    batch: Any = SimpleNamespace(weight=jnp.asarray(weight), has_depth=None)
+    logits, tokens = (dict.fromkeys(("rgb", "depth"), jnp.array(x)) for x in (LOGITS, TOKENS))
+    of = Predictions(model, logits, tokens, jnp.array(MASK), batch)
+    of.__dict__["keypoints"] = keypoints
+    return of
+
+
+def assert_term(term: Term, expected: tuple[float, float]) -> None:
     np.testing.assert_allclose(term[0], expected[0], rtol=1e-5)
     assert float(term[1]) == expected[1] > 0
 
@@ -55,20 +73,19 @@ def test_cross_entropy_of_a_token_is_that_of_the_whole_vocabulary() -> None:
 
 
 @pytest.mark.parametrize("term", [losses.rgb_term, losses.depth_term])
-def test_rgb_and_depth_are_equation_4(term) -> None:
+def test_rgb_and_depth_are_equation_4(term: Any) -> None:
     expected = plain_cross_entropy(np.ones((B, T, GRID, GRID)))
-    assert_term(term(cross_entropy(), jnp.array(MASK), jnp.array(CLIP_WEIGHT)), expected)
+    assert_term(term(predictions()), expected)
 
 
 def test_attention_is_equation_7() -> None:
     attention = np.asarray(attention_map(KEYPOINTS, GRID, 5.0))
-    found = losses.attention_term(cross_entropy(), jnp.array(MASK), jnp.array(CLIP_WEIGHT), jnp.array(attention))
-    assert_term(found, plain_cross_entropy(attention))
+    assert_term(losses.attention_term(predictions()), plain_cross_entropy(attention))
 
 
 def test_a_flat_attention_map_gives_the_rgb_term() -> None:
-    arguments = cross_entropy(), jnp.array(MASK), jnp.array(CLIP_WEIGHT)
-    assert losses.attention_term(*arguments, jnp.ones((B, T, GRID, GRID))) == losses.rgb_term(*arguments)
+    flat = predictions(gamma=1.0)
+    assert losses.attention_term(flat) == losses.rgb_term(flat)
 
 
 def plain_expected_codes() -> np.ndarray:
@@ -97,44 +114,42 @@ def test_keypoints_are_equation_5() -> None:
                 if KEYPOINTS.visible[clip, i, t]:
                     total += np.sum((s_hat[clip, t, int(KEYPOINTS.cells[clip, i, t])] - first) ** 2)
                     weight += 1
-    predicted = losses.expected_codes(jnp.array(LOGITS), BITS)
-    assert_term(losses.keypoint_term(predicted, KEYPOINTS, jnp.array(CLIP_WEIGHT)), (total, weight))
+    assert_term(losses.keypoint_term(predictions()), (total, weight))
 
 
 def test_all_visible_points_weigh_what_equation_5_divides_by() -> None:
     seen = Keypoints(KEYPOINTS.cells, jnp.ones((B, 5, T), bool))
-    _, weight = losses.keypoint_term(jnp.zeros((B, T, GRID**2, BITS)), seen, jnp.ones(B))
+    _, weight = losses.keypoint_term(predictions(seen, np.ones(B)))
     assert float(weight) == B * (T - 1) * 5
 
 
 def test_a_hidden_point_counts_nowhere() -> None:
-    predicted = losses.expected_codes(jnp.array(LOGITS), BITS)
     later = jnp.arange(T) > 0  # the first frame's cell is the anchor, visible by definition
     moved = Keypoints(jnp.where(KEYPOINTS.visible | ~later, KEYPOINTS.cells, 0), KEYPOINTS.visible)
-    weight = jnp.ones(B)
-    assert losses.keypoint_term(predicted, KEYPOINTS, weight) == losses.keypoint_term(predicted, moved, weight)
+    before, after = (losses.keypoint_term(predictions(points, np.ones(B))) for points in (KEYPOINTS, moved))
+    assert before == after
     np.testing.assert_array_equal(attention_map(KEYPOINTS, GRID, 5.0)[:, 1:], attention_map(moved, GRID, 5.0)[:, 1:])
 
 
 def test_the_objective_is_equation_8() -> None:
-    weights = LossConfig().terms(depth_branch=True)
+    weights = RoboScapeConfig().loss_weights
     assert weights == {"rgb": 1, "depth": 1, "keypoint": 0.01, "attention": 1}  # the paper's λ
     terms = {"rgb": (6.0, 2.0), "depth": (5.0, 5.0), "keypoint": (300.0, 3.0), "attention": (8.0, 2.0)}
-    loss, shares = losses.combine({k: (jnp.float32(a), jnp.float32(b)) for k, (a, b) in terms.items()}, weights)
+    loss, shares = combine({k: (jnp.float32(a), jnp.float32(b)) for k, (a, b) in terms.items()}, weights)
     np.testing.assert_allclose(loss, 3 + 1 * 1 + 0.01 * 100 + 1 * 4, rtol=1e-6)
     assert {name: float(x) for name, x in shares.items()} == {"rgb": 3, "depth": 1, "keypoint": 100, "attention": 4}
 
 
 def test_shares_of_parts_add_up_to_the_whole_where_mean_of_ratios_would_not() -> None:
     parts = [(jnp.float32(90), jnp.float32(9)), (jnp.float32(1), jnp.float32(1))]
-    whole, _ = losses.combine({"rgb": (jnp.float32(91), jnp.float32(10))}, {"rgb": 2.0})
-    shares = [losses.combine({"rgb": part}, {"rgb": 2.0}, lambda _: jnp.float32(10))[0] for part in parts]
+    whole, _ = combine({"rgb": (jnp.float32(91), jnp.float32(10))}, {"rgb": 2.0})
+    shares = [combine({"rgb": part}, {"rgb": 2.0}, lambda _: jnp.float32(10))[0] for part in parts]
     np.testing.assert_allclose(sum(shares), whole, rtol=1e-6)
     np.testing.assert_allclose(whole, 2 * 9.1, rtol=1e-6)
 
 
 def test_a_term_without_weight_is_nothing_rather_than_no_number() -> None:
-    term = lambda x: losses.combine({"rgb": (x * 0, jnp.float32(0))}, {"rgb": 1.0})[0]  # noqa: E731
+    term = lambda x: combine({"rgb": (x * 0, jnp.float32(0))}, {"rgb": 1.0})[0]  # noqa: E731
     value, gradient = jax.value_and_grad(term)(jnp.float32(3))
     assert (value, gradient) == (0, 0)
 
@@ -142,4 +157,4 @@ def test_a_term_without_weight_is_nothing_rather_than_no_number() -> None:
 @pytest.mark.parametrize("terms", [{"rgb"}, {"rgb", "depht"}, {"rgb", "depth", "keypoint"}], ids=sorted)
 def test_terms_and_weights_must_have_the_same_names(terms: set[str]) -> None:
     with pytest.raises(KeyError, match="rgb"):
-        losses.combine({name: (jnp.float32(1), jnp.float32(1)) for name in terms}, {"rgb": 1.0, "depth": 1.0})
+        combine({name: (jnp.float32(1), jnp.float32(1)) for name in terms}, {"rgb": 1.0, "depth": 1.0})

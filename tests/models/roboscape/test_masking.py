@@ -14,12 +14,13 @@ from rsjax.models.roboscape.masking import Masked, corrupt, dropped_actions
 T, GRID, BITS, VOCABULARIES = 10, 8, 18, 2
 BATCHES, CLIPS = 64, 16
 STEP_1 = MaskConfig(corruption_probability=0.0)
-STEP_2 = MaskConfig(random_token_rate=0.0, prompt_frames=4)
+STEP_2 = MaskConfig(random_token_rate=0.0)
+PROMPT = {STEP_1: 1, STEP_2: 4}  # frames given at generation
 
 
 @partial(jax.jit, static_argnums=0)
 def corrupt_one(config: MaskConfig, key: jax.Array, tokens: Any, index: Any) -> Masked:
-    return corrupt(config, BITS, VOCABULARIES, key, tokens, index)
+    return corrupt(config, PROMPT[config], BITS, VOCABULARIES, key, tokens, index)
 
 
 dropped = jax.jit(dropped_actions, static_argnums=0)
@@ -83,7 +84,7 @@ def test_corruption_spares_the_prompt_and_grows_from_a_frame_drawn_after_it() ->
         assert np.all((ratio > 0.8) & (ratio < 1.1))  # it shrinks by U(0.9, 1), and noise
         assert ratio.size == 0 or np.mean(ratio) < 1.03
         firsts.append(first)
-    assert set(firsts) == set(range(STEP_2.prompt_frames, T))
+    assert set(firsts) == set(range(PROMPT[STEP_2], T))
 
 
 def test_sub_tokens_are_replaced_each_for_itself_by_codes_of_the_whole_vocabulary() -> None:

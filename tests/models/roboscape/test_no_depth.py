@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
 from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy import blind
 from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, given, random_params
@@ -35,7 +36,7 @@ def same(one: Any, other: Any, rows: Any = slice(None)) -> None:
 
 @WAYS
 def test_cached_is_uncached_and_a_clip_is_as_it_is_among_its_like(
-    model: ModelConfig, sample: SampleConfig, prompt: int, frames: int
+    model: Architecture, sample: SampleConfig, prompt: int, frames: int
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt, frames, CLIPS)
 
@@ -62,7 +63,7 @@ def test_a_clip_without_depth_is_that_of_a_model_which_is_blind_to_depth_tokens(
 
 @WAYS
 def test_depth_tokens_of_clips_without_depth_are_not_read_and_need_not_be_given(
-    model: ModelConfig, sample: SampleConfig, prompt: int, frames: int
+    model: Architecture, sample: SampleConfig, prompt: int, frames: int
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt, frames, CLIPS)
     make = lambda tokens, no_depth: rollout(model, sample, params, tokens, actions, KEY, no_depth=no_depth)  # noqa: E731
@@ -76,7 +77,7 @@ def test_depth_tokens_of_clips_without_depth_are_not_read_and_need_not_be_given(
 
 @WAYS
 def test_from_an_encoded_prompt_is_a_rollout(
-    model: ModelConfig, sample: SampleConfig, prompt: int, frames: int
+    model: Architecture, sample: SampleConfig, prompt: int, frames: int
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt, frames, CLIPS)
     encoded = encode_prompt(model, sample, params, tokens, actions[:, :prompt], SOME)

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, count_model, given, random_params
 
@@ -21,7 +22,7 @@ CANDIDATES, PROMPT, FRAMES = 3, 3, 8
     ],
     ids=["dual", "rotary-guided"],
 )
-def test_sharing_a_prompt_is_repeating_it(model: ModelConfig, sample: SampleConfig) -> None:
+def test_sharing_a_prompt_is_repeating_it(model: Architecture, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, PROMPT, FRAMES, CANDIDATES)
     one = {name: grid[:1] for name, grid in tokens.items()}
     actions[:, :PROMPT] = actions[:1, :PROMPT]
@@ -88,5 +89,5 @@ def test_a_prompt_of_neither_one_clip_nor_as_many_is_refused() -> None:
     prompt = encode_prompt(RGB, SampleConfig(), params, tokens, actions[:, :1])
     with pytest.raises(ValueError, match="a prompt of 2 clips and 3 action sequences"):
         rollout_from(RGB, SampleConfig(), params, prompt, np.zeros((3, 2, 3)), KEY)
-    with pytest.raises(ValueError, match="1 frames asked for with 1 given"):
+    with pytest.raises(ValueError, match="1 frames with a prompt of 1"):
         rollout_from(RGB, SampleConfig(), params, prompt, np.zeros((2, 0, 3)), KEY)

@@ -5,10 +5,11 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
 from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
-from rsjax.models.roboscape.world_model import WorldModel
+from rsjax.models.roboscape.transformer import Transformer
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
 
 
@@ -23,7 +24,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model
     ],
     ids=["dual-2-random", "dual-3-prompt-4-greedy", "dual-3-prompt-1", "rgb-3-greedy", "rgb-3-prompt-2-warm"],
 )
-def test_cached_is_uncached(model: ModelConfig, prompt: int, sample: SampleConfig) -> None:
+def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)
     cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
     assert cached.keys() == tokens.keys()
@@ -38,7 +39,7 @@ def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
     """One decoding step from the definition: mask frame t, keep the frames before, take the argmax."""
     model, params, (tokens, actions) = DUAL, random_params(DUAL), given(DUAL, 1)
     out = rollout(model, SampleConfig(steps=1), params, tokens, actions, KEY)
-    apply = jax.jit(WorldModel(model).apply)
+    apply = jax.jit(Transformer(model).apply)
     for t in range(1, 6):
         mask = np.zeros((BATCH, 6, 3, 3), bool)  # a new one: jax may still be reading the one before
         mask[:, t:] = True
@@ -69,7 +70,7 @@ def test_the_key_decides_the_draws_and_actions_the_video() -> None:
 @pytest.mark.parametrize(("prompt", "frames"), [(3, 3), (4, 3)])
 def test_a_rollout_without_a_frame_to_make_is_refused(prompt: int, frames: int) -> None:
     tokens, actions = given(RGB, prompt, frames)
-    with pytest.raises(ValueError, match=f"{frames} frames asked for with {prompt} given"):
+    with pytest.raises(ValueError, match=f"{frames} frames with a prompt of {prompt}"):
         rollout(RGB, SampleConfig(), random_params(RGB), tokens, actions, KEY)
     with pytest.raises(ValueError, match="2 prompts and 3 action sequences; encode_prompt"):
         rollout(RGB, SampleConfig(), random_params(RGB), tokens, np.zeros((3, 6, 3)), KEY)

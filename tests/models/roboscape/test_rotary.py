@@ -8,32 +8,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, ModelConfig
+from rsjax.config import ConfigError
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import frames_held, rotate
-from rsjax.models.roboscape.world_model import WorldModel, branches, empty_cache
+from rsjax.models.roboscape.transformer import Transformer, empty_cache
 
-ROTARY = ModelConfig(
-    frames=4, grid=2, code_bits=4, action_dim=3, width=8, blocks=2, heads=2, positions="rotary", qk_norm=True
+ROTARY = Architecture(
+    frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2, positions="rotary", qk_norm=True
 )
 LENGTH = 11  # frames, more than twice the window
 
 
-def random_params(config: ModelConfig) -> Any:
+def random_params(config: Architecture) -> Any:
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
 
 
-def random_inputs(config: ModelConfig) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def random_inputs(config: Architecture) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     shape = (2, LENGTH, config.grid, config.grid)
-    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in branches(config)}
-    return tokens, rng.random(shape) < 0.4, rng.normal(size=(2, LENGTH, config.action_dim)).astype(np.float32)
+    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in config.branches}
+    return tokens, rng.random(shape) < 0.4, rng.normal(size=(2, LENGTH, config.action_inputs)).astype(np.float32)
 
 
 @jax.jit
 def rotary(params: Any, tokens: Any, mask: Any, actions: Any, start: Any = 0, cache: Any = None) -> Any:
-    return WorldModel(ROTARY).apply({"params": params}, tokens, mask, actions, start, cache)
+    return Transformer(ROTARY).apply({"params": params}, tokens, mask, actions, start, cache)
 
 
 def test_rotation_is_that_of_complex_numbers_and_products_depend_on_the_distance() -> None:
@@ -95,5 +96,5 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 def test_positions_within_a_frame_stay_learned() -> None:
-    shapes = jax.eval_shape(WorldModel(ROTARY).init_params, jax.random.key(0))
+    shapes = jax.eval_shape(Transformer(ROTARY).init_params, jax.random.key(0))
     assert shapes["pos_embed"].shape == (1, 4, 8)

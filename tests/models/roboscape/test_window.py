@@ -9,21 +9,22 @@ import pytest
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
-from rsjax.config import ModelConfig, SampleConfig
+from rsjax.config import SampleConfig
 from rsjax.data.normalization import Normalization
 from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.window import room, window_actions, window_start
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
 
 Positions = Literal["learned", "rotary"]
 ROTARY = replace(RGB, positions="rotary")
-SUMS = replace(RGB, action_dim=4, integrate_actions=True)
+SUMS = replace(RGB, action_inputs=4, integrate_actions=True)
 
 
 @drawn(window=st.integers(2, 20), by=st.integers(0, 19), frames=st.integers(2, 90))
 def test_a_full_window_jumps_by_its_stride_and_all_windows_find_room(window: int, by: int, frames: int) -> None:
-    model, sample = ModelConfig(frames=window), SampleConfig(window_stride=by % window)
+    model, sample = Architecture(frames=window), SampleConfig(window_stride=by % window)
     base, by = 0, by % window or window // 2
     for t in range(frames):
         if t - base == window:
@@ -51,7 +52,7 @@ def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, inte
     [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0)],
     ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt"],
 )
-def test_cached_is_uncached_beyond_the_window(model: ModelConfig, prompt: int, stride: int) -> None:
+def test_cached_is_uncached_beyond_the_window(model: Architecture, prompt: int, stride: int) -> None:
     sample = SampleConfig(steps=2, temperature=1.0, window_stride=stride)
     params, (tokens, actions) = random_params(model), given(model, prompt, 16)
     cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))

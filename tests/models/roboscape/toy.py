@@ -7,26 +7,35 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import ModelConfig
-from rsjax.models.roboscape.world_model import WorldModel, branches
+from rsjax.config import ClipShape, RoboScapeConfig, TokenizerConfig, TokenModelConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.transformer import Transformer
 
-DUAL = ModelConfig(frames=5, grid=2, code_bits=4, action_dim=3, width=8, blocks=2, heads=2)
-RGB = replace(DUAL, depth=False)
+DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
+RGB = replace(DUAL, use_depth=False)
 NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
 QK_NORM = replace(DUAL, qk_norm=True, mup=True)
-GENIE = replace(RGB, action_dim=0)
+GENIE = replace(RGB, action_encoder="none", action_inputs=0)
 GUIDED = replace(DUAL, action_dropout=0.5)
 BATCH = 2
 
 
-def forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
+def roboscape(architecture: Architecture, config: TokenModelConfig | None = None, prompt_frames: int = 1) -> RoboScape:
+    """A model of this architecture, whatever clips and tokenizer that would follow from."""
+    config = config or RoboScapeConfig(use_depth=architecture.use_depth, action_dropout=architecture.action_dropout)
+    clips = ClipShape(architecture.frames, 64, 7, architecture.action_inputs, 2)
+    return RoboScape(config, architecture, prompt_frames, TokenizerConfig(), clips)
+
+
+def forward(config: Architecture, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
     logits, cache = apply(config, params, *inputs)
     assert cache is None
     return jax.tree.map(np.asarray, logits)
 
 
 def apply_plain(
-    config: ModelConfig,
+    config: Architecture,
     params: Any,
     tokens: Any,
     mask: Any,
@@ -36,27 +45,27 @@ def apply_plain(
     drop_actions: Any = None,
     no_depth: Any = None,
 ) -> Any:
-    return WorldModel(config).apply({"params": params}, tokens, mask, actions, start, cache, drop_actions, no_depth)
+    return Transformer(config).apply({"params": params}, tokens, mask, actions, start, cache, drop_actions, no_depth)
 
 
 apply = jax.jit(apply_plain, static_argnums=0)
 
 
-def random_params(config: ModelConfig) -> Any:
+def random_params(config: Architecture) -> Any:
     """Parameters without a zero among them, so that nothing hides behind an initial value."""
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(config).init_params, jax.random.key(0))
+    shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
 
 
-def random_inputs(config: ModelConfig, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def random_inputs(config: Architecture, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     shape = (BATCH, config.frames, config.grid, config.grid)
-    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in branches(config)}
+    tokens = {name: rng.integers(0, 2**config.code_bits, shape, np.int32) for name in config.branches}
     return (
         tokens,
         rng.random(shape) < 0.4,
-        rng.normal(size=(BATCH, config.frames, config.action_dim)).astype(np.float32),
+        rng.normal(size=(BATCH, config.frames, config.action_inputs)).astype(np.float32),
     )
 
 
@@ -85,7 +94,7 @@ def layer_norm(x: np.ndarray, p: dict) -> np.ndarray:
     return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * p["scale"] + p["bias"]
 
 
-def sequence_attention(x: np.ndarray, p: dict, config: ModelConfig, causal: bool) -> np.ndarray:
+def sequence_attention(x: np.ndarray, p: dict, config: Architecture, causal: bool) -> np.ndarray:
     """Attention over one sequence (L, C)."""
     length, width = x.shape
     heads = config.heads
@@ -102,7 +111,7 @@ def sequence_attention(x: np.ndarray, p: dict, config: ModelConfig, causal: bool
     return out.reshape(length, width) @ p["proj"]["kernel"] + p["proj"]["bias"]
 
 
-def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
+def st_block(x: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
     x = x.copy()
     b, t, s, _ = x.shape
     normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
@@ -116,7 +125,7 @@ def st_block(x: np.ndarray, p: dict, config: ModelConfig) -> np.ndarray:
     return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
 
 
-def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
+def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
     tokens, mask, actions = inputs
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
     b, t = mask.shape[:2]
@@ -130,12 +139,12 @@ def plain_forward(config: ModelConfig, params: Any, inputs: tuple) -> dict[str, 
         )
         x[mask.reshape(b, t, -1)] = embed["mask_token_embed"]
         h[name] = x + p["pos_embed"][:t]
-        if config.action_dim:
+        if config.action_inputs:
             h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
     for block in range(config.blocks):
         own = jax.tree.map(lambda x, block=block: x[block], p["blocks"])
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
-        if config.depth:
+        if config.use_depth:
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
     if config.final_norm:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}

@@ -9,27 +9,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ModelConfig
 from rsjax.models.roboscape import decode, guidance
-from rsjax.models.roboscape.world_model import WorldModel, branches
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
 
-DUAL = ModelConfig(frames=6, grid=3, code_bits=6, action_dim=3, width=16, blocks=2, heads=2)
-RGB = replace(DUAL, depth=False)
+DUAL = Architecture(frames=6, grid=3, code_bits=6, action_inputs=3, width=16, blocks=2, heads=2)
+RGB = replace(DUAL, use_depth=False)
 BATCH, KEY = 2, jax.random.key(5)
 
 
-def random_params(model: ModelConfig) -> Any:
+def random_params(model: Architecture) -> Any:
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(WorldModel(model).init_params, KEY)
+    shapes = jax.eval_shape(Transformer(model).init_params, KEY)
     return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
 
 
-def given(model: ModelConfig, prompt: int, frames: int = 6, batch: int = BATCH) -> tuple[dict[str, Any], np.ndarray]:
+def given(model: Architecture, prompt: int, frames: int = 6, batch: int = BATCH) -> tuple[dict[str, Any], np.ndarray]:
     """Prompt tokens and actions."""
     rng = np.random.default_rng(1)
     shape = (batch, prompt, model.grid, model.grid)
-    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in branches(model)}
-    actions = rng.normal(size=(batch, frames, model.action_dim)).astype(np.float32)
+    tokens = {name: rng.integers(0, 2**model.code_bits, shape, np.int32) for name in model.branches}
+    actions = rng.normal(size=(batch, frames, model.action_inputs)).astype(np.float32)
     actions[:, 0] = 0.0
     return tokens, actions
 

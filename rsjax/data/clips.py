@@ -1,0 +1,99 @@
+"""Clips of a split, stacked, for what looks at whole clips: evaluation, pictures, videos.
+
+Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from rsjax.clip import Video
+from rsjax.data.codec import Record
+from rsjax.data.store import RecordSource, Store, StoreError
+from rsjax.progress import note
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Fields of :class:`rsjax.clip.Clip` with a leading axis.
+
+    Attributes:
+        index: each one's number in the split.
+        depth: zeros for clips that have none.
+        has_depth: which have depth.
+        metric: which have depth in metres, and not relative (see :mod:`rsjax.ingest.annotators.depth`).
+    """
+
+    index: Int[np.ndarray, " B"]
+    rgb: UInt8[np.ndarray, "B T H W 3"]
+    depth: Float32[np.ndarray, "B T H W"]
+    has_depth: Bool[np.ndarray, " B"]
+    metric: Bool[np.ndarray, " B"]
+    actions: Float32[np.ndarray, "B T A"]
+    tracks: Float32[np.ndarray, "B N0 T 2"]
+    visible: Bool[np.ndarray, "B N0 T"]
+    success: Bool[np.ndarray, "B T"]
+    task: tuple[str, ...]
+
+    @classmethod
+    def stacked(cls, records: Sequence[Record], index: Sequence[int]) -> "Clips":
+        """Records of clips, all of one shape, with their numbers."""
+        fields = {
+            name: np.stack([record[name] for record in records])
+            for name in ("rgb", "actions", "tracks", "visible", "success")
+        }
+        none = np.zeros(records[0]["rgb"].shape[:3], np.float32)
+        has = np.array([record["depth"] is not None for record in records])
+        metres = [record["provenance"].get("depth_unit", "metres") == "metres" for record in records]
+        return cls(
+            index=np.array(index),
+            depth=np.stack([none if record["depth"] is None else record["depth"] for record in records]),
+            has_depth=has,
+            metric=has & np.array(metres),
+            task=tuple(record["task"] for record in records),
+            **fields,
+        )
+
+    @property
+    def video(self) -> Video:
+        """Frames and depth; NaN in clips without depth."""
+        if not self.has_depth.any():
+            return Video(self.rgb)
+        return Video(self.rgb, np.where(self.has_depth[:, None, None, None], self.depth, np.float32(np.nan)))
+
+
+def spread(source: Sized, count: int) -> list[int]:
+    """The numbers of ``count`` records spread evenly over a split: neighbours may be windows of one episode."""
+    return np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int)).tolist()
+
+
+def readable(
+    source: RecordSource, numbers: Iterable[int] | None = None, tell: Callable[[str], None] = note
+) -> Iterator[tuple[int, Record]]:
+    """The records of a split that can be read, with their numbers; the others are told. Training need not end here.
+
+    Args:
+        numbers: those that are wanted; all if None.
+    """
+    for number in range(len(source)) if numbers is None else numbers:
+        try:
+            record = source[number]
+        except StoreError as error:
+            tell(f"{error}; it is left out here")
+            continue
+        yield number, record
+
+
+def load_clips(store: Store, count: int) -> Clips:
+    """``count`` clips spread over the test split, without those of them that cannot be read.
+
+    Raises:
+        StoreError: none can be read.
+    """
+    source = store.source("test")
+    found = list(readable(source, spread(source, count)))
+    if not found:
+        raise StoreError(f"{store.path}: its test split has no readable clip; delete it and make it again")
+    return Clips.stacked([clip for _, clip in found], [number for number, _ in found])

@@ -1,0 +1,203 @@
+"""AbsRel and δ_k of predicted depth, under the alignments that published work uses.
+
+Depth is z-depth along the optical axis. A depth branch trained on metres needs no alignment. The output of a monocular
+estimator is known up to a scale, or a scale and a shift, which are fitted to the truth once per video.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rsjax.evaluation.registry import Scene, metric
+
+Alignment = Literal["none", "median", "affine_disparity", "l1_scale"]
+DepthSource = Literal["branch", "estimator"]
+
+_MIN_PREDICTION = 1e-3
+_L1_STEPS = 10
+_MIN_L1_SCALE = 1e-3
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The pixels that count, and their averaging.
+
+    Attributes:
+        min_truth: only pixels with a true depth strictly above this count.
+        max_truth: only pixels with a true depth strictly below this count, unless the caller sets another bound.
+        averaging: "frame": pixels → frame → video → data set; "video": pixels of a video → data set;
+            "pixel": all pixels of the data set have the same weight.
+    """
+
+    min_truth: float
+    max_truth: float
+    averaging: Literal["frame", "video", "pixel"]
+
+
+PROTOCOLS: dict[Alignment, Protocol] = {
+    "none": Protocol(0.0, np.inf, "video"),
+    "median": Protocol(1e-3, np.inf, "video"),  # WorldArena 2026
+    "affine_disparity": Protocol(1e-3, np.inf, "frame"),  # Video Depth Anything
+    "l1_scale": Protocol(0.0, 70.0, "pixel"),  # Aether, CUT3R
+}
+
+
+@dataclass(frozen=True)
+class DepthScores:
+    """Scores of B videos.
+
+    Attributes:
+        abs_rel: each video's mean of |d̂ - d| / d.
+        delta1: each video's share of pixels with max(d̂/d, d/d̂) < 1.25, 0–1.
+        delta2: the same with 1.25².
+        weight: each video's weight in the data set's mean: 1, or its number of pixels for averaging "pixel".
+    """
+
+    abs_rel: Float[np.ndarray, " B"]
+    delta1: Float[np.ndarray, " B"]
+    delta2: Float[np.ndarray, " B"]
+    weight: Float[np.ndarray, " B"]
+
+    def mean(self) -> dict[str, float]:
+        """Returns the data set's scores, by metric name as in :func:`result_key`."""
+        values = {"absrel": self.abs_rel, "delta1": self.delta1, "delta2": self.delta2}
+        return {name: float(np.average(value, weights=self.weight)) for name, value in values.items()}
+
+
+@metric("depth_absrel", "depth AbsRel", better="lower", decimals=4, needs=("depth",), watch=True)
+def absrel_score(scene: Scene) -> Float[np.ndarray, " B"]:
+    """Scores AbsRel of the depth branch in metres, unaligned."""
+    return _branch_scores(scene).abs_rel
+
+
+@metric("depth_delta1", "depth δ₁", better="higher", decimals=3, needs=("depth",), interval=False)
+def delta1_score(scene: Scene) -> Float[np.ndarray, " B"]:
+    """Scores δ₁ of the depth branch in metres, unaligned."""
+    return _branch_scores(scene).delta1
+
+
+@metric("depth_delta2", "depth δ₂", better="higher", decimals=3, needs=("depth",), interval=False)
+def delta2_score(scene: Scene) -> Float[np.ndarray, " B"]:
+    """Scores δ₂ of the depth branch in metres, unaligned."""
+    return _branch_scores(scene).delta2
+
+
+def _branch_scores(scene: Scene) -> DepthScores:
+    truth, predicted, first = scene.truth.depth, scene.prediction.depth, scene.prompt_frames
+    assert truth is not None and predicted is not None
+    return depth_scores(truth[:, first:], predicted[:, first:], alignment="none")
+
+
+def abs_rel(truth: Float[np.ndarray, "..."], prediction: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Returns |d̂ - d| / d of each pixel; depths > 0."""
+    return np.abs(prediction - truth) / truth
+
+
+def within(truth: Float[np.ndarray, "..."], prediction: Float[np.ndarray, "..."], k: int) -> Bool[np.ndarray, "..."]:
+    """Returns δ_k of each pixel: whether max(d̂/d, d/d̂) < 1.25^k; depths > 0."""
+    return np.maximum(prediction / truth, truth / prediction) < 1.25**k
+
+
+def align(
+    truth: Float[np.ndarray, "T H W"],
+    prediction: Float[np.ndarray, "T H W"],
+    mask: Bool[np.ndarray, "T H W"],
+    alignment: Alignment,
+) -> Float[np.ndarray, "T H W"]:
+    """Aligns the prediction with the truth by one fit over the video's masked pixels, in float64.
+
+    "none": unchanged. "median": times median(d) / median(d̂). "affine_disparity": a/d̂ + b fitted to 1/d by least
+    squares, disparities kept ≥ 1e-3. "l1_scale": times s, the minimiser of Σ|s·d̂ - d|, from 10
+    reweighted least-squares steps that start at mean(d) / mean(d̂); s ≥ 1e-3.
+    """
+    d, p = truth[mask].astype(np.float64), prediction[mask].astype(np.float64)
+    full = prediction.astype(np.float64)
+    match alignment:
+        case "none":
+            return full
+        case "median":
+            return full * (np.median(d) / np.median(p))
+        case "affine_disparity":
+            columns = np.stack([1 / np.maximum(p, _MIN_PREDICTION), np.ones_like(p)], axis=1)
+            scale, shift = np.linalg.lstsq(columns, 1 / d, rcond=None)[0]
+            disparity = scale / np.maximum(full, _MIN_PREDICTION) + shift
+            return 1 / np.maximum(disparity, 1e-3)
+        case "l1_scale":
+            return full * _l1_scale(d, p)
+
+
+def _l1_scale(d: Float[np.ndarray, " N"], p: Float[np.ndarray, " N"]) -> float:
+    scale = d.mean() / p.mean()
+    for _ in range(_L1_STEPS):
+        weight = 1 / (np.abs(scale * p - d) + 1e-8)
+        scale = (weight * p * d).sum() / (weight * p * p).sum()
+    return max(float(scale), _MIN_L1_SCALE)
+
+
+def depth_scores(
+    truth: Float[np.ndarray, "B T H W"],
+    prediction: Float[np.ndarray, "B T H W"],
+    alignment: Alignment = "median",
+    max_depth: float | None = None,
+) -> DepthScores:
+    """Scores AbsRel, δ₁ and δ₂ of each of B videos under one protocol of :data:`PROTOCOLS`.
+
+    Pass predicted frames only. Aligned predictions are clipped to 1e-3 … the upper bound of true depths.
+
+    Args:
+        truth: metres; pixels that are 0 or not finite have no depth and do not count.
+        prediction: finite; metres, or any unit if it is aligned.
+        alignment: how to align the prediction with the truth.
+        max_depth: only pixels with a true depth strictly below this count; None: the protocol's ``max_truth``.
+
+    Raises:
+        ValueError: shapes differ, the alignment is unknown, the prediction is not finite, or a video (or a frame,
+            where frames are averaged) has no valid pixel.
+    """
+    if truth.shape != prediction.shape or truth.ndim != 4:
+        raise ValueError(f"depth has shapes {truth.shape} and {prediction.shape}; both must be the same [B, T, H, W]")
+    if not np.isfinite(prediction).all():
+        raise ValueError("predicted depth has values that are not finite")
+    if alignment not in PROTOCOLS:
+        raise ValueError(f"unknown depth alignment {alignment!r}; one of {', '.join(PROTOCOLS)}")
+    protocol = PROTOCOLS[alignment]
+    upper = protocol.max_truth if max_depth is None else max_depth
+    mask = np.isfinite(truth) & (truth > protocol.min_truth) & (truth < upper)
+    counted = mask.any(axis=(2, 3) if protocol.averaging == "frame" else (1, 2, 3))
+    if not counted.all():
+        raise ValueError(
+            f"true depth of video {np.argwhere(~counted)[0][0]} has no pixel (or a frame without one) "
+            f"between {protocol.min_truth} and {upper} metres"
+        )
+    rows = [
+        _video_scores(d, np.clip(align(d, p, m, alignment), _MIN_PREDICTION, upper), m, protocol)
+        for d, p, m in zip(truth, prediction, mask, strict=True)
+    ]
+    absolute, first, second = np.array(rows).T
+    pooled = protocol.averaging == "pixel"
+    weight = mask.sum((1, 2, 3)).astype(np.float64) if pooled else np.ones(len(truth))
+    return DepthScores(absolute, first, second, weight)
+
+
+def _video_scores(
+    truth: Float[np.ndarray, "T H W"],
+    prediction: Float[np.ndarray, "T H W"],
+    mask: Bool[np.ndarray, "T H W"],
+    protocol: Protocol,
+) -> list[float]:
+    truth = np.where(mask, truth, 1.0)
+    per_pixel = [abs_rel(truth, prediction), within(truth, prediction, 1), within(truth, prediction, 2)]
+    axes = (1, 2) if protocol.averaging == "frame" else None
+    return [float(np.mean(np.mean(pixels, axis=axes, where=mask))) for pixels in per_pixel]
+
+
+def result_key(metric: str, alignment: Alignment = "none", source: DepthSource = "branch") -> str:
+    """Returns the name under which a depth score is published, which tells protocols apart.
+
+    ``depth_absrel`` is the depth branch's in metres, unaligned; all others contain alignment and source, such as
+    ``depth_absrel_median_estimator``.
+    """
+    plain = alignment == "none" and source == "branch"
+    return f"depth_{metric}" if plain else f"depth_{metric}_{alignment}_{source}"

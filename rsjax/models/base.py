@@ -1,0 +1,181 @@
+"""The interface of world models, which everything outside ``rsjax/models`` uses.
+
+A family consists of a subclass of :class:`rsjax.config.ModelConfig` (its settings) and a subclass of
+:class:`WorldModel` (its implementation), which :func:`implements` connects.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rsjax.clip import Video
+from rsjax.config import Config, ConfigError, ModelConfig
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.data.store import Store
+from rsjax.errors import UserError
+from rsjax.trainable import Params, Trainable
+
+B = TypeVar("B", contravariant=True)
+W = TypeVar("W", bound="type[WorldModel[Any]]")
+
+
+@dataclass(frozen=True)
+class Assets:
+    """Data that a world model needs beside its own parameters, fixed before its training.
+
+    Attributes:
+        normalization: of actions and depth, from the training split.
+        tokenizer: parameters of the run's tokenizer; None for a family without tokens.
+    """
+
+    normalization: Normalization
+    tokenizer: Params | None
+
+
+class WorldModel(Trainable[B], Protocol[B]):
+    """A world model: a frozen dataclass of settings, without arrays.
+
+    Subclasses must define ``init``, ``loss_terms``, ``transform`` and ``generate``; everything else has a default.
+    """
+
+    config: Any
+
+    @classmethod
+    def create(cls, config: Config) -> "WorldModel[Any]":
+        """Returns the model that ``config.model`` describes, for clips of the shape ``config.clips``.
+
+        By default, the only field of the dataclass is the whole configuration.
+        """
+        return cls(config)  # type: ignore[call-arg]
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        """The weight λ of each active loss term by name, from ``config.model``."""
+        return self.config.model.loss_weights
+
+    def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store | None:
+        """Makes the store that training reads instead of clips (tokens, latents), unless it exists.
+
+        Args:
+            clips: the store of clips, all splits.
+            folder: a directory of the run for the list of damaged clips, and for the output if the store is read-only.
+            max_damaged: the share of a split's clips that may be damaged.
+
+        Returns:
+            A store with the splits of ``clips``; None if training reads the clips themselves.
+        """
+        return None
+
+    def transform(self, normalization: Normalization) -> Transform:
+        """Returns the function that converts a record of the prepared store to arrays of fixed shapes, to be stacked.
+
+        It runs in the loader, perhaps in worker processes, so it must be picklable and use only numpy.
+        """
+        ...
+
+    def batch(self, arrays: Arrays) -> Any:
+        """Returns the batch for :meth:`loss_terms` from stacked arrays.
+
+        In validation the arrays include ``weight`` (0 for padding) and ``index`` (each clip's number, which decides its
+        masks); in training every clip has weight 1 and its row as index. By default, the batch is a dict of the arrays
+        and these two.
+        """
+        size = len(next(iter(arrays.values())))
+        return {"weight": np.ones(size, np.float32), "index": np.arange(size, dtype=np.int32)} | arrays
+
+    def example(self, rng: np.random.Generator) -> Record:
+        """Returns a random record like those of the prepared store, for benchmarks and shapes.
+
+        Raises:
+            UserError: the family does not implement it.
+        """
+        raise UserError(f"{type(self).__name__} has no example of a record, so it cannot be benchmarked or described")
+
+    def generate(
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "B T A"],
+        *,
+        index: Int[np.ndarray, " B"] | None = None,
+        depth: bool = True,
+    ) -> Video:
+        """Generates the videos that follow the prompts under these actions.
+
+        Args:
+            prompt: the first P frames of each clip, with depth if it is known.
+            actions: in the recording's units; row t leads into frame t, row 0 is ignored.
+            index: each clip's number, which decides its random draws; 0, 1, … by default.
+            depth: False if the caller does not need depth, which a family may then leave out.
+
+        Returns:
+            T frames of each clip; the first P are the prompt as the model sees it.
+        """
+        ...
+
+    def plan(
+        self, params: Params, assets: Assets, prompt: Video, actions: Float[np.ndarray, "N T A"], depth: bool = True
+    ) -> Video:
+        """Generates the videos that follow one prompt under N action sequences, with the same random draws.
+
+        Args:
+            prompt: one clip's first P frames.
+            actions: as for :meth:`generate`.
+        """
+        repeated = prompt[np.zeros(len(actions), int)]
+        return self.generate(params, assets, repeated, actions, index=np.zeros(len(actions), int), depth=depth)
+
+    def reconstruct(self, assets: Assets, video: Video) -> Video | None:
+        """Returns a video's reconstruction from the model's tokens or latents, the upper bound of its quality.
+
+        None for a family that predicts pixels.
+        """
+        return None
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        """Returns the shapes of the world model's weights in a directory that training may start from.
+
+        Raises:
+            UserError: this family cannot start from other weights, or the directory's are of another network.
+        """
+        raise UserError(f"{directory}: train.start_from is set, but this family of models starts from no other weights")
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
+        return saved
+
+    def flops(self, frames: int) -> dict[str, int]:
+        """Returns floating-point operations per clip, "forward" and "train"; empty if the family has no counts."""
+        return {}
+
+
+MODELS: dict[type[ModelConfig], type[WorldModel[Any]]] = {}
+
+
+def implements(settings: type[ModelConfig]) -> Callable[[W], W]:
+    """Registers a subclass of :class:`WorldModel` as the implementation of a family's settings."""
+
+    def register(kind: W) -> W:
+        MODELS[settings] = kind
+        return kind
+
+    return register
+
+
+def create_model(config: Config) -> WorldModel[Any]:
+    """Returns the world model that a configuration describes.
+
+    Raises:
+        ConfigError: its family has no registered implementation.
+    """
+    kind = MODELS.get(type(config.model))
+    if kind is None:
+        raise ConfigError(f"model family {config.model.family!r} has settings but no implementation; import its module")
+    return kind.create(config)

@@ -1,0 +1,62 @@
+"""The architecture of a transformer: its settings, and sizes that follow from the clips and the tokenizer."""
+
+from dataclasses import dataclass, fields
+
+from rsjax.config import (
+    Config,
+    RoboScapeConfig,
+    SampleConfig,
+    TokenModelConfig,
+    TransformerConfig,
+)
+from rsjax.config.model import check_sampling
+
+
+@dataclass(frozen=True)
+class Architecture(TransformerConfig):
+    """All settings of the network.
+
+    Attributes:
+        frames: positions in time, and the number of frames that temporal attention covers.
+        grid: token cells along each side of a frame.
+        code_bits: bits of a token, in ``vocabularies`` equal parts.
+        action_inputs: numbers per frame that the action encoder reads; 0: no encoder.
+        use_depth: whether the network has a depth branch.
+    """
+
+    frames: int = 16
+    grid: int = 16
+    code_bits: int = 18
+    vocabularies: int = 2
+    action_inputs: int = 28
+    use_depth: bool = True
+
+    @classmethod
+    def create(cls, config: Config) -> "Architecture":
+        """Returns the architecture of a configuration whose model is RoboScape or Genie."""
+        model, clips, tokenizer = config.model, config.clips, config.tokenizer
+        assert isinstance(model, TokenModelConfig)
+        action_inputs = clips.action_dim * (2 if model.integrate_actions else 1)
+        return cls(
+            **{field.name: getattr(model, field.name) for field in fields(TransformerConfig)},
+            frames=model.frames(clips),
+            grid=config.grid,
+            code_bits=tokenizer.code_bits,
+            vocabularies=tokenizer.vocabularies,
+            action_inputs=0 if model.action_encoder == "none" else action_inputs,
+            use_depth=isinstance(model, RoboScapeConfig) and model.use_depth,
+        )
+
+    @property
+    def vocabulary_size(self) -> int:
+        """Codes per factorised vocabulary: 2^(D/n)."""
+        return 2 ** (self.code_bits // self.vocabularies)
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """Names of the network's branches."""
+        return ("rgb", "depth") if self.use_depth else ("rgb",)
+
+    def check_sampling(self, sample: SampleConfig) -> None:
+        """Raises :class:`rsjax.config.ConfigError` if the network does not support these settings."""
+        check_sampling(sample, self.frames, self.action_dropout)

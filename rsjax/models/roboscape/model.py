@@ -1,0 +1,238 @@
+"""RoboScape: the physics-informed objective on the dual-branch transformer (paper Eq. 4–8).
+
+A loss term is one function here, registered by :func:`loss_term`, and one weight in :class:`rsjax.config.LossConfig`.
+
+Axes: B clips, T frames, H×W = S cells, n vocabularies of V codes, D code bits, K keypoints, A action dimensions.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from rsjax.clip import Video
+from rsjax.config import ClipShape, Config, LossConfig, RoboScapeConfig, TokenizerConfig, TokenModelConfig
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.data.store import Store
+from rsjax.models.base import Assets, WorldModel, implements
+from rsjax.models.roboscape import masking, pretrained, records
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.generate import generate, plan
+from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
+from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tokenizers import lfq
+from rsjax.tokenizers.codec import Codec
+from rsjax.tokenizers.tokenize import tokenize_store
+from rsjax.trainable import Params, StepContext, Term
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Inputs of the loss terms.
+
+    Attributes:
+        model: the model, for its settings.
+        logits: (B, T, S, n, V) by branch.
+        clean: the target tokens, (B, T, H, W) by branch.
+        mask: the masked cells.
+        batch: the clips.
+    """
+
+    model: "RoboScape"
+    logits: dict[str, Float[Array, "B T S n V"]]
+    clean: dict[str, Int[Array, "B T H W"]]
+    mask: Bool[Array, "B T H W"]
+    batch: Batch
+
+    @cached_property
+    def cross_entropy(self) -> dict[str, Float[Array, "B T H W"]]:
+        """-log p of each cell's target by branch, in nats."""
+        bits = self.model.architecture.code_bits
+        return {branch: token_cross_entropy(self.logits[branch], self.clean[branch], bits) for branch in self.clean}
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """The K tracks that move most, on the token grid."""
+        loss, tracks = self.model.loss, self.batch.tracks
+        count = min(loss.num_keypoints, tracks.shape[1])
+        return select(tracks, self.batch.visible, count, self.model.architecture.grid)
+
+
+TERMS: dict[str, Callable[[Predictions], Term]] = {}
+
+
+def loss_term(name: str) -> Callable[[Callable[[Predictions], Term]], Callable[[Predictions], Term]]:
+    """Registers a function as the loss term that ``LossConfig.NAME_weight`` weighs."""
+
+    def register(function: Callable[[Predictions], Term]) -> Callable[[Predictions], Term]:
+        TERMS[name] = function
+        return function
+
+    return register
+
+
+@loss_term("rgb")
+def rgb_term(of: Predictions) -> Term:
+    """Returns L_RGB of Eq. 4: cross-entropy of the RGB tokens over the masked cells."""
+    weight = of.mask * of.batch.weight[:, None, None, None]
+    return jnp.sum(of.cross_entropy["rgb"] * weight), jnp.sum(weight)
+
+
+@loss_term("depth")
+def depth_term(of: Predictions) -> Term:
+    """Returns L_Depth of Eq. 4: likewise for the depth tokens of clips with depth; (0, 0) if none has depth."""
+    has_depth = of.batch.has_depth
+    clips = of.batch.weight if has_depth is None else of.batch.weight * has_depth
+    weight = of.mask * clips[:, None, None, None]
+    return jnp.sum(of.cross_entropy["depth"] * weight), jnp.sum(weight)
+
+
+@loss_term("attention")
+def attention_term(of: Predictions) -> Term:
+    """Returns L_Attention of Eq. 7: cross-entropy of the RGB tokens, weighted by the map of Eq. 6.
+
+    The sum is divided by the number of masked cells, not by the sum of the map.
+    """
+    attention = attention_map(of.keypoints, of.model.architecture.grid, of.model.loss.gamma)
+    weight = of.mask * of.batch.weight[:, None, None, None]
+    return jnp.sum(of.cross_entropy["rgb"] * attention * weight), jnp.sum(weight)
+
+
+@loss_term("keypoint")
+def keypoint_term(of: Predictions) -> Term:
+    """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over frames t ≥ 2 in which keypoint i is visible."""
+    predicted = expected_codes(of.logits["rgb"], of.model.architecture.code_bits)  # B T S D
+    cells = of.keypoints.cells.swapaxes(1, 2)  # B T K
+    at_points = jnp.take_along_axis(predicted, cells[..., None], axis=2)  # B T K D
+    distance = jnp.sum(jnp.square(at_points[:, 1:] - at_points[:, :1]), axis=-1)
+    weight = of.keypoints.visible.swapaxes(1, 2)[:, 1:] * of.batch.weight[:, None, None]
+    return jnp.sum(distance * weight), jnp.sum(weight)
+
+
+def token_cross_entropy(
+    logits: Float[Array, "B T S n V"], tokens: Int[Array, "B T H W"], code_bits: int
+) -> Float[Array, "B T H W"]:
+    """Returns -log p of each cell's token: the sum of its vocabularies' cross-entropies, in nats."""
+    sub_tokens = lfq.split_tokens(tokens, code_bits, logits.shape[-2]).reshape(logits.shape[:-1])
+    chosen = jnp.take_along_axis(logits, sub_tokens[..., None], axis=-1)[..., 0]
+    return jnp.sum(jax.nn.logsumexp(logits, axis=-1) - chosen, axis=-1).reshape(tokens.shape)
+
+
+def expected_codes(logits: Float[Array, "*B n V"], code_bits: int) -> Float[Array, "*B D"]:
+    """Returns ŝ of Eq. 5: each bit's expectation in [-1, 1] under the predicted distribution."""
+    codes = lfq.vocabulary_codes(code_bits, logits.shape[-2])  # V, D/n
+    expected = jax.nn.softmax(logits, axis=-1) @ codes  # … n D/n
+    return expected.reshape(*expected.shape[:-2], code_bits)
+
+
+@implements(RoboScapeConfig)
+@dataclass(frozen=True)
+class RoboScape(WorldModel[Batch]):
+    """The dual-branch co-autoregressive transformer on the tokens of RGB frames and depth maps.
+
+    Attributes:
+        config: the family's settings.
+        architecture: the network's settings.
+        prompt_frames: frames that generation starts from; corruption in training leaves them alone.
+        tokenizer: settings of the tokenizer.
+        clips: the shape of the training clips.
+    """
+
+    config: TokenModelConfig
+    architecture: Architecture
+    prompt_frames: int
+    tokenizer: TokenizerConfig
+    clips: ClipShape
+
+    @classmethod
+    def create(cls, config: Config) -> "RoboScape":
+        assert isinstance(config.model, TokenModelConfig)
+        return cls(config.model, Architecture.create(config), config.prompt_frames, config.tokenizer, config.clips)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return self.config.loss_weights
+
+    @property
+    def loss(self) -> LossConfig:
+        """Settings of the keypoint terms."""
+        assert isinstance(self.config, RoboScapeConfig)
+        return self.config.loss
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return Transformer(self.architecture).init_params(key)
+
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Masks the batch, runs the network and computes the active terms.
+
+        Clips without depth do not count in the depth term, and all their depth cells are masked.
+        """
+        arch = self.architecture
+        clean = {branch: getattr(batch, branch) for branch in arch.branches}
+        shape = (self.prompt_frames, arch.code_bits, arch.vocabularies)
+        masked = masking.corrupt(self.config.mask, *shape, key, clean, batch.index)
+        drop = masking.dropped_actions(arch.action_dropout, key, batch.index) if arch.action_dropout else None
+        no_depth = None if batch.has_depth is None else batch.has_depth == 0
+        inputs = (masked.tokens, masked.mask, batch.actions)
+        logits, _ = Transformer(arch).apply({"params": params}, *inputs, drop_actions=drop, no_depth=no_depth)
+        predictions = Predictions(self, logits, clean, masked.mask, batch)
+        terms = {name: TERMS[name](predictions) for name in TERMS if name in self.loss_weights}
+        return jax.tree.map(lambda x: x.astype("float32"), terms)
+
+    def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
+        """Makes the tokens of every clip, stored beside the clips for all runs with this tokenizer."""
+        return tokenize_store(clips, self._codec(assets), self.clips.image_size, folder, max_damaged)
+
+    def transform(self, normalization: Normalization) -> Transform:
+        return partial(records.token_arrays, normalization, self.config.integrate_actions)
+
+    def batch(self, arrays: Arrays) -> Batch:
+        return records.token_batch(arrays)
+
+    def example(self, rng: np.random.Generator) -> Record:
+        arch = self.architecture
+        return records.random_record(rng, self.clips, arch.grid, arch.code_bits)
+
+    def generate(
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "B T A"],
+        *,
+        index: Int[np.ndarray, " B"] | None = None,
+        depth: bool = True,
+    ) -> Video:
+        return generate(self.config, self.architecture, self._codec(assets), params, prompt, actions, index, depth)
+
+    def plan(
+        self, params: Params, assets: Assets, prompt: Video, actions: Float[np.ndarray, "N T A"], depth: bool = True
+    ) -> Video:
+        return plan(self.config, self.architecture, self._codec(assets), params, prompt, actions, depth)
+
+    def reconstruct(self, assets: Assets, video: Video) -> Video:
+        codec = self._codec(assets)
+        return codec.decode(codec.encode(video), video.has_depth)
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        return pretrained.shapes(self.architecture, directory)
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        return pretrained.start(fresh, saved, directory)
+
+    def flops(self, frames: int) -> dict[str, int]:
+        forward = forward_flops(self.architecture, frames)
+        return {"forward": forward, "train": 3 * forward}
+
+    def _codec(self, assets: Assets) -> Codec:
+        assert assets.tokenizer is not None
+        return Codec(self.tokenizer, assets.tokenizer, assets.normalization)

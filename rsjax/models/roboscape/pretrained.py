@@ -1,0 +1,90 @@
+"""Starts training from the weights of another run or of a converted public checkpoint.
+
+Both directories contain ``config.json`` and ``world_model/weights``. A run's ``config.json`` is its configuration; a
+converted checkpoint's has a section ``architecture`` instead.
+"""
+
+from dataclasses import fields
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from rsjax.config import Config, ConfigError, TokenModelConfig, TransformerConfig, from_dict
+from rsjax.config.fields import differences
+from rsjax.errors import UserError
+from rsjax.files import read_json
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.trainable import Params
+
+# Fields that may differ between the saved network and the one to train.
+FREE = {"use_depth", "action_encoder", "action_inputs", "integrate_actions", "action_dropout"} | {
+    "compute_dtype",
+    "embed_std",
+    "position_std",
+    *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
+}
+
+
+def read_architecture(directory: Path) -> Architecture:
+    """Returns the architecture of a directory's world model.
+
+    Raises:
+        UserError: the settings are missing, damaged, of another version or of another family.
+    """
+    path = directory / "config.json"
+    settings = read_json(path, cure="make it with python -m rsjax.convert")
+    if not settings.keys() & {"architecture", "model"}:
+        raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
+    try:
+        if "architecture" in settings:
+            return from_dict(Architecture, settings["architecture"])
+        config = from_dict(Config, settings)
+    except (ConfigError, TypeError) as error:
+        raise UserError(f"{path}: the world model's settings cannot be read ({error}); make it again") from error
+    if not isinstance(config.model, TokenModelConfig):
+        raise UserError(f"{path}: holds a model of family {config.model.family!r}; start from RoboScape or Genie")
+    return Architecture.create(config)
+
+
+def shapes(own: Architecture, directory: Path) -> Params:
+    """Returns the shapes of the directory's weights.
+
+    Raises:
+        UserError: the weights are missing or of another network; the message names the differing fields.
+    """
+    if not (directory / "world_model" / "weights").exists():
+        raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
+    saved = read_architecture(directory)
+    # A trained action encoder needs the same inputs.
+    free = FREE - {"integrate_actions", "action_encoder"} if saved.action_inputs else FREE
+    if differing := differences(saved, own, free):
+        raise UserError(f"{directory}: holds another network ({differing}); set these alike")
+    return jax.eval_shape(Transformer(saved).init_params, jax.random.key(0))
+
+
+def start(fresh: Params, saved: Params, directory: Path) -> Params:
+    """Returns the parameters that training begins with: the saved ones, unchanged, completed by fresh ones.
+
+    The depth → RGB projection and the action encoder's last layer begin at zero, so that RGB logits are at first those
+    of the saved model. A saved action encoder is kept; it reads actions normalised for the new data.
+
+    Raises:
+        UserError: this model lacks a saved array, or has it in another shape.
+    """
+    params, own = flatten_dict(saved, sep="/"), flatten_dict(fresh, sep="/")
+    for path in params:
+        if path not in own:
+            raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")
+        if params[path].shape != own[path].shape:
+            raise UserError(f"{directory}: its {path} is {params[path].shape}, this model's is {own[path].shape}")
+    for path, x in own.items():
+        if path not in params:
+            params[path] = jnp.zeros_like(x) if _joins_rgb(path) else x
+    return unflatten_dict(params, sep="/")
+
+
+def _joins_rgb(path: str) -> bool:
+    return path.startswith(("blocks/depth_to_rgb/", "action_encoder/", "action_encoder_fc2/", "null_action"))

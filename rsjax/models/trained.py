@@ -1,0 +1,147 @@
+"""The public interface of a trained world model: numpy arrays in, numpy arrays out."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import Config
+from rsjax.errors import UserError
+from rsjax.models.base import Assets, WorldModel
+from rsjax.tokenizers.codec import Codec, Tokens
+from rsjax.trainable import Params
+
+
+class ShapeError(UserError):
+    """An array of the wrong shape or type. The message names the argument and the expected shape."""
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A world model with its parameters, ready to generate. Made by :func:`rsjax.load`."""
+
+    config: Config
+    model: WorldModel[Any]
+    params: Params
+    assets: Assets
+
+    def generate(
+        self,
+        frames: UInt8[np.ndarray, "*B P H W 3"],
+        actions: Float[np.ndarray, "*B T A"],
+        depth: Float[np.ndarray, "*B P H W"] | None = None,
+    ) -> Video:
+        """Generates the video that follows these frames under these actions.
+
+        Args:
+            frames: the first P frames of one clip or of B clips, 0–255, RGB; P = 1 in the paper.
+            actions: in the recording's units; row t leads into frame t, and row 0 is ignored. T may exceed the length
+                of the training clips.
+            depth: z-depth of the frames in metres; None if unknown.
+
+        Returns:
+            All T frames with their depth (None if the model or the clips have none); without a leading axis for one
+            clip. The first P frames are the prompt as the model sees it.
+
+        Raises:
+            ShapeError: an argument has the wrong shape or type for this model; the message says which.
+        """
+        prompt, single = self._video(frames, depth)
+        sequences = self._actions(actions, prompt, () if single else (len(prompt),))
+        video = self.model.generate(self.params, self.assets, prompt, sequences[None] if single else sequences)
+        return _first(video) if single else video
+
+    def plan(
+        self,
+        frames: UInt8[np.ndarray, "P H W 3"],
+        actions: Float[np.ndarray, "N T A"],
+        depth: Float[np.ndarray, "P H W"] | None = None,
+    ) -> Video:
+        """Generates the N videos that follow the frames of one clip under N action sequences.
+
+        All candidates share their random draws, so they differ only by their actions. Arguments and errors are those of
+        :meth:`generate`.
+        """
+        prompt, single = self._video(frames, depth)
+        if not single:
+            raise ShapeError(f"frames have shape {np.shape(frames)}; a plan starts from one clip, (P, H, W, 3)")
+        return self.model.plan(self.params, self.assets, prompt, self._actions(actions, prompt, ("N",)))
+
+    def encode(
+        self, frames: UInt8[np.ndarray, "*B T H W 3"], depth: Float[np.ndarray, "*B T H W"] | None = None
+    ) -> dict[str, Int[np.ndarray, "*B T h w"]]:
+        """Returns the tokens of frames as "rgb" and, if ``depth`` is passed, of depth maps as "depth".
+
+        Raises:
+            ShapeError: an array has the wrong shape or type for this model.
+            UserError: the model has no tokens.
+        """
+        video, single = self._video(frames, depth)
+        tokens = self._codec().encode(video)
+        return {name: grid[0] if single else grid for name, grid in tokens.items()}
+
+    def decode(self, tokens: dict[str, Int[np.ndarray, "*B T h w"]]) -> Video:
+        """Decodes tokens to a video.
+
+        Raises:
+            ShapeError: the tokens have the wrong shape or type for this model.
+            UserError: the model has no tokens.
+        """
+        codec, grid = self._codec(), self.config.grid
+        arrays = {name: np.asarray(x) for name, x in tokens.items()}
+        if not {"rgb"} <= arrays.keys() <= {"rgb", "depth"}:
+            raise ShapeError(f"tokens are of {', '.join(arrays) or 'nothing'}; expected rgb, or rgb and depth")
+        for name, x in arrays.items():
+            if x.ndim not in (3, 4) or x.shape[-2:] != (grid, grid) or x.dtype.kind not in "iu":
+                raise ShapeError(
+                    f"tokens {name!r} have shape {x.shape} and type {x.dtype}; expected (T, {grid}, {grid}) for one "
+                    f"clip or (B, T, {grid}, {grid}) for several, integers"
+                )
+            if x.shape != arrays["rgb"].shape:
+                raise ShapeError(f"tokens {name!r} have shape {x.shape}; expected {arrays['rgb'].shape}, that of 'rgb'")
+        single = arrays["rgb"].ndim == 3
+        batch: Tokens = {name: x[None] if single else x for name, x in arrays.items()}
+        video = codec.decode(batch, np.full(len(batch["rgb"]), "depth" in batch))
+        return _first(video) if single else video
+
+    def _codec(self) -> Codec:
+        if self.assets.tokenizer is None:
+            raise UserError(f"a model of family {self.config.model.family!r} has no tokens; use generate")
+        return Codec(self.config.tokenizer, self.assets.tokenizer, self.assets.normalization)
+
+    def _actions(self, actions: Any, prompt: Video, lead: tuple[int | str, ...]) -> Float32[np.ndarray, "*B T A"]:
+        """Checks and returns actions as float32; ``lead`` are the sizes of axes before T, "N" for any above 0."""
+        actions, width, past = np.asarray(actions), self.config.clips.action_dim, prompt.rgb.shape[1]
+        expected = ", ".join(map(str, (*lead, "T", width)))
+        fits = actions.ndim == len(lead) + 2 and actions.shape[-1] == width and actions.shape[-2] > past
+        if not fits or (lead and (not len(actions) if lead == ("N",) else len(actions) != lead[0])):
+            raise ShapeError(f"actions have shape {actions.shape}; expected ({expected}) with T above {past}")
+        if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
+            raise ShapeError(f"actions are {actions.dtype} with values that are not finite numbers; expected floats")
+        return actions.astype(np.float32)
+
+    def _video(self, frames: Any, depth: Any) -> tuple[Video, bool]:
+        """Checks and returns the arguments with a leading axis over clips, and whether that axis was added."""
+        frames, size = np.asarray(frames), self.config.clips.image_size
+        if frames.ndim not in (4, 5) or frames.shape[-3:] != (size, size, 3) or frames.dtype != np.uint8:
+            raise ShapeError(
+                f"frames have shape {frames.shape} and type {frames.dtype}; expected (P, {size}, {size}, 3) for one "
+                f"clip or (B, P, {size}, {size}, 3) for several, uint8"
+            )
+        single = frames.ndim == 4
+        if depth is None:
+            return Video(frames[None] if single else frames), single
+        depth = np.asarray(depth)
+        if depth.shape != frames.shape[:-1] or depth.dtype.kind not in "fiu":
+            raise ShapeError(
+                f"depth has shape {depth.shape} and type {depth.dtype}; expected {frames.shape[:-1]}, that of the "
+                f"frames, floats"
+            )
+        depth = depth.astype(np.float32)
+        return (Video(frames[None], depth[None]) if single else Video(frames, depth)), single
+
+
+def _first(video: Video) -> Video:
+    return Video(video.rgb[0], None if video.depth is None else video.depth[0])

@@ -1,0 +1,58 @@
+"""Loads a run directory's configuration, weights and trained model."""
+
+import json
+from pathlib import Path
+
+import jax
+
+from rsjax.config import Config, from_dict
+from rsjax.data.normalization import Normalization
+from rsjax.errors import UserError
+from rsjax.models.base import Assets, create_model
+from rsjax.models.trained import TrainedModel
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
+from rsjax.training.checkpoint import load_weights
+
+
+def load(run: Path | str) -> TrainedModel:
+    """Loads the trained world model of a run directory.
+
+    Raises:
+        UserError: the run is missing, unfinished or damaged, or was made by another version of rsjax.
+    """
+    run = Path(run)
+    config = load_config(run)
+    model = create_model(config)
+    params = load_weights(run / "world_model" / "weights", jax.eval_shape(model.init, jax.random.key(0)))
+    return TrainedModel(config, model, params, load_assets(config, run))
+
+
+def load_config(run: Path) -> Config:
+    """Reads the configuration of a run directory.
+
+    Raises:
+        UserError: it is missing, damaged or of another version.
+    """
+    path = run / "config.json"
+    if not path.exists():
+        raise UserError(f"{path}: missing, so {run} is not a run directory; make one with python -m experiments.train")
+    try:
+        return from_dict(Config, json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a configuration ({error}); the train command of this run writes it again"
+        ) from error
+
+
+def load_assets(config: Config, run: Path) -> Assets:
+    """Loads the data that the run's world model needs beside its own parameters."""
+    return Assets(Normalization.load(run / "tokens"), load_tokenizer(config, run))
+
+
+def load_tokenizer(config: Config, run: Path) -> Params | None:
+    """Loads the trained tokenizer's parameters; None for a model without tokens."""
+    if not config.model.uses_tokenizer:
+        return None
+    shapes = jax.eval_shape(Tokenizer(config.tokenizer).init_params, jax.random.key(0))
+    return load_weights(run / "tokenizer" / "weights", shapes)

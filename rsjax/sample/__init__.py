@@ -1,1 +1,0 @@
-"""Generation: first frame and actions in, the video that follows out."""

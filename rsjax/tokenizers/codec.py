@@ -1,0 +1,110 @@
+"""Encodes and decodes numpy images with a trained tokenizer: RGB frames and depth maps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import cast
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import TokenizerConfig
+from rsjax.data.depth_color import color_to_depth, depth_to_color
+from rsjax.data.normalization import Normalization
+from rsjax.errors import UserError
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
+
+Tokens = dict[str, Int[np.ndarray, "B T h w"]]
+
+CHUNK = 128  # most images per pass, to bound memory
+
+
+@dataclass(frozen=True)
+class Codec:
+    """A trained tokenizer that takes and returns numpy arrays."""
+
+    config: TokenizerConfig
+    params: Params
+    normalization: Normalization
+
+    def encode(self, video: Video) -> Tokens:
+        """Returns a video's tokens; "depth" only if a clip has depth, with zeros for clips without."""
+        tokens = {"rgb": self.encode_rgb(video.rgb)}
+        has_depth = video.has_depth
+        if video.depth is not None and has_depth.any():
+            grid = self.encode_depth(video.depth[has_depth])
+            tokens["depth"] = np.zeros((len(video), *grid.shape[1:]), grid.dtype)
+            tokens["depth"][has_depth] = grid
+        return tokens
+
+    def decode(self, tokens: Tokens, has_depth: Bool[np.ndarray, " B"]) -> Video:
+        """Decodes tokens to a video, with depth for the clips that have it and NaN for the others."""
+        rgb = self.decode_rgb(tokens["rgb"])
+        if "depth" not in tokens or not has_depth.any():
+            return Video(rgb)
+        metres = np.full(rgb.shape[:-1], np.nan, np.float32)
+        metres[has_depth] = self.decode_depth(np.asarray(tokens["depth"])[has_depth])
+        return Video(rgb, metres)
+
+    def encode_rgb(self, frames: UInt8[np.ndarray, "*B H W 3"]) -> Int[np.ndarray, "*B h w"]:
+        """Encodes frames 0–255."""
+        return self._chunked(_encode, frames, 3)
+
+    def encode_depth(self, depth: Float[np.ndarray, "*B H W"]) -> Int[np.ndarray, "*B h w"]:
+        """Encodes the colour maps of depth in metres.
+
+        Raises:
+            UserError: no clip of the data has depth.
+        """
+        colors = depth_to_color(depth, *self._depth_range(), self.config.depth_scale)
+        return self._chunked(_encode, colors.astype(np.uint8), 3)
+
+    def decode_rgb(self, tokens: Int[np.ndarray, "*B h w"]) -> UInt8[np.ndarray, "*B H W 3"]:
+        """Decodes tokens to frames 0–255."""
+        return np.round(self._chunked(_decode, np.asarray(tokens), 2)).astype(np.uint8)
+
+    def decode_depth(self, tokens: Int[np.ndarray, "*B h w"]) -> Float32[np.ndarray, "*B H W"]:
+        """Decodes tokens of depth colour maps to metres.
+
+        Raises:
+            UserError: no clip of the data has depth.
+        """
+        near, far = self._depth_range()
+        colors = self._chunked(_decode, np.asarray(tokens), 2)
+        return color_to_depth(colors, near, far, self.config.depth_scale)
+
+    def _depth_range(self) -> tuple[float, float]:
+        if self.normalization.depth_range is None:
+            raise UserError(
+                "depth_range is null: no clip of this run's training data has depth, so depth maps cannot be encoded; "
+                "pass RGB alone, or train on clips with depth"
+            )
+        return self.normalization.depth_range
+
+    def _chunked(
+        self, function: Callable[[TokenizerConfig, Params, ArrayLike], ArrayLike], images: np.ndarray, item_axes: int
+    ) -> np.ndarray:
+        lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
+        flat = images.reshape(-1, *item)
+        size = min(CHUNK, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
+        out = []
+        for start in range(0, len(flat), size):
+            chunk = flat[start : start + size]
+            padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
+            out.append(np.asarray(function(self.config, self.params, padded))[: len(chunk)])
+        joined = np.concatenate(out)
+        return joined.reshape(*lead, *joined.shape[1:])
+
+
+@partial(jax.jit, static_argnums=0)
+def _encode(config: TokenizerConfig, params: Params, images: ArrayLike) -> ArrayLike:
+    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, images, method="encode"))
+
+
+@partial(jax.jit, static_argnums=0)
+def _decode(config: TokenizerConfig, params: Params, tokens: ArrayLike) -> ArrayLike:
+    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, tokens, method="decode"))

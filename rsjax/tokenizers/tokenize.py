@@ -1,0 +1,155 @@
+"""Tokenizes a store of clips, once for all runs with the same tokenizer.
+
+The tokens are in ``tokens/KEY`` of the store's directory and move with it. A token record is a clip's record with
+tokens instead of pixels; actions stay in the data's units. The manifest lists unreadable clips, which have no tokens.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from rsjax.data.clips import readable
+from rsjax.data.codec import Record
+from rsjax.data.quarantine import NAME as QUARANTINE
+from rsjax.data.quarantine import Quarantine
+from rsjax.data.store import Store, StoreError, open_store, write_store
+from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
+from rsjax.files import lock
+from rsjax.progress import Progress, note
+from rsjax.sim.expert import difficulty
+from rsjax.tokenizers.codec import Codec
+from rsjax.trainable import Params
+
+UNITS = ("action_mean", "action_std", "action_count", "depth_range", "depth_unit")  # manifest entries that are copied
+_LEFT_OUT = "left_out"  # manifest entry: numbers of the clips without tokens by split
+
+
+def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max_damaged: float) -> Store:
+    """Makes the tokens of every clip, unless they exist.
+
+    Args:
+        codec: the trained tokenizer.
+        image_size: pixels per side of the tokenizer's images.
+        place: a directory for the list of damaged clips, and for the tokens if the store is write-protected.
+        max_damaged: the share of a split's clips that may be damaged.
+
+    Returns:
+        The store of tokens.
+
+    Raises:
+        StoreError: clips have another size than the tokenizer's images, too many are damaged, or the disk is full.
+    """
+    _check_size(clips, image_size)
+    (place / QUARANTINE).unlink(missing_ok=True)  # all clips are checked again
+    tokenizer = tokenizer_key(codec.config, fingerprint(codec.params))
+    key = tokens_key(str(clips.manifest.get("key")), tokenizer)
+    out = beside = clips.path.resolve() / FOLDER / tokenizer
+    if _is_made(beside, key, clips):
+        return _listed(beside, clips, max_damaged, place)
+    if not _writable(beside):
+        out = place.resolve() / "own" / tokenizer
+    with lock(_lock_of(out), wait=f"waiting for another process that makes {out}"):
+        if not _is_made(out, key, clips):
+            _write(out, clips, codec, key)
+    return _listed(out, clips, max_damaged, place)
+
+
+def _check_size(clips: Store, size: int) -> None:
+    clip = next((record for _, record in readable(clips.source("train"), tell=lambda _: None)), None)
+    if clip is None:
+        raise StoreError(f"{clips.path}: no clip of its train split can be read; get it again")
+    side = clip["rgb"].shape[1]
+    if side != size:
+        raise StoreError(f"{clips.path}: its pictures have {side} pixels a side, the tokenizer takes {size}")
+
+
+def _is_made(out: Path, key: str, clips: Store) -> bool:
+    """Returns whether these tokens are complete: no clip without tokens has become readable since."""
+    try:
+        manifest = open_store(out).manifest
+    except StoreError:
+        return False
+    missing = manifest.get(_LEFT_OUT, {})
+    repaired = (readable(clips.source(split), numbers, lambda _: None) for split, numbers in missing.items())
+    return manifest.get("key") == key and not any(next(records, None) for records in repaired)
+
+
+def _writable(out: Path) -> bool:
+    """Returns whether this user may write the set at ``out``; the store may be another user's."""
+    parent, lock_file = next(folder for folder in out.parents if folder.exists()), _lock_of(out)
+    return os.access(parent, os.W_OK) and (not lock_file.exists() or os.access(lock_file, os.W_OK))
+
+
+def _lock_of(out: Path) -> Path:
+    return out.with_name(f".{out.name}.lock")
+
+
+def _write(out: Path, clips: Store, codec: Codec, key: str) -> None:
+    total = sum(len(clips.source(split)) for split in clips.splits)
+    left_out: dict[str, list[int]] = {split: [] for split in clips.splits}
+    with Progress("tokens", total, "clips") as progress:
+        done = 0
+
+        def tokenized(split: str) -> Iterator[Record]:
+            nonlocal done
+            source = clips.source(split)
+            missing = set(range(len(source)))
+            for number, clip in readable(source, tell=lambda _: None):
+                missing.remove(number)
+                yield token_record(codec, clip)
+                done += 1
+                progress.update(done)
+            left_out[split] = sorted(missing)
+
+        meta = {name: clips.manifest[name] for name in UNITS if name in clips.manifest}
+        meta |= {"key": key, "source": str(clips.path), "tokenizer": fingerprint(codec.params), _LEFT_OUT: left_out}
+        write_store(out, "tokens", {split: tokenized(split) for split in clips.splits}, meta, labels)
+
+
+def _listed(path: Path, clips: Store, max_damaged: float, place: Path) -> Store:
+    """Opens the store of tokens and lists clips without tokens; raises if too many or of the test split."""
+    tokens = open_store(path)
+    for split, numbers in tokens.manifest.get(_LEFT_OUT, {}).items():
+        source = clips.source(split)
+        quarantine = Quarantine(place / QUARANTINE, len(source), max_damaged)
+        for number in numbers:
+            try:
+                source[number]
+            except StoreError as error:
+                if split != "train":
+                    raise
+                quarantine.note(source.locate(number), error, instead="it has no tokens")
+        if numbers:
+            note(f"{len(numbers)} of {len(source)} clips cannot be read and have no tokens: {place / QUARANTINE}")
+    return tokens
+
+
+def token_record(codec: Codec, clip: Record) -> Record:
+    """Returns a clip's token record; depth is None if the clip has none."""
+    return {
+        "rgb": codec.encode_rgb(clip["rgb"]),
+        "depth": None if clip["depth"] is None else codec.encode_depth(clip["depth"]),
+        "actions": clip["actions"],
+        "tracks": clip["tracks"],
+        "visible": clip["visible"],
+        "task": clip["task"],
+        "difficulty": clip["provenance"].get("difficulty") or difficulty(clip["provenance"]),
+        "provenance": clip["provenance"],
+    }
+
+
+def labels(record: Record) -> dict[str, str]:
+    """Returns the labels by which a curriculum selects token records."""
+    return {name: record[name] for name in ("task", "difficulty")}
+
+
+def fingerprint(params: Params) -> str:
+    """Returns 16 hex digits of all weights, which identify a tokenizer."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]

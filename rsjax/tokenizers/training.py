@@ -1,0 +1,215 @@
+"""Training of the tokenizer (reference: Open-MAGVIT2): images, parameters and loss terms for the train step.
+
+Axes: B images, H×W pixels, h×w token cells, D code bits.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from rsjax.config import Config, ConfigError, TokenizerConfig, TokenizerTrainConfig, from_dict, require
+from rsjax.config.fields import differences
+from rsjax.data.codec import Record
+from rsjax.data.depth_color import depth_to_color
+from rsjax.data.order import Arrays
+from rsjax.errors import UserError
+from rsjax.files import read_json
+from rsjax.tokenizers import lfq
+from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages, updated_averages
+from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
+from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
+from rsjax.tokenizers.magvit2 import Tokenizer, to_unit
+from rsjax.trainable import Extra, Params, Scalar, StepContext, Term, Trainable
+
+Images: TypeAlias = Float[Array, "B H W 3"]
+Latents: TypeAlias = Float[Array, "B h w D"]
+
+FREE = {"vocabularies", "depth_scale"}  # fields that may differ between the saved tokenizer and the one to train
+
+
+@dataclass(frozen=True)
+class TokenizerTraining(Trainable[Images]):
+    """Learns to reconstruct RGB frames and colourised depth maps. A batch is images 0–255, (B, H, W, 3).
+
+    Parameters are the tokenizer's; with an adversarial term, {"generator": the tokenizer's, "discriminator": …}.
+    """
+
+    tokenizer: TokenizerConfig
+    train: TokenizerTrainConfig
+    image_size: int
+
+    def __post_init__(self) -> None:
+        require(
+            not self.train.adversarial_weight or self.image_size >= MIN_SIZE,
+            f"clips have images of {self.image_size} pixels; the discriminator needs at least {MIN_SIZE}, "
+            f"or tokenizer_train.adversarial_weight 0",
+        )
+
+    @classmethod
+    def create(cls, config: Config) -> "TokenizerTraining":
+        """Returns the training of a configuration's tokenizer."""
+        return cls(config.tokenizer, config.tokenizer_train, config.clips.image_size)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return self.train.loss_weights
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        generator = Tokenizer(self.tokenizer).init_params(key)
+        if not self.train.adversarial_weight:
+            return generator
+        return {"generator": generator, "discriminator": Discriminator().init_params(jax.random.fold_in(key, 1))}
+
+    def init_extra(self) -> Extra:
+        """Returns LeCAM's averages and LPIPS's weights, which would be 59 MB of constants in the compiled step.
+
+        Raises:
+            LpipsError: the file ``train.lpips_weights`` is missing or damaged.
+            ConfigError: images are too small for the LPIPS network.
+        """
+        extra: dict[str, Any] = {}
+        if "perceptual" in self.loss_weights:
+            weights = load_lpips(self.train.lpips_weights)
+            require(
+                self.image_size >= min_size(weights),
+                f"clips have images of {self.image_size} pixels; the LPIPS network of {self.train.lpips_weights} "
+                f"needs at least {min_size(weights)}, or tokenizer_train.perceptual_weight 0",
+            )
+            extra["lpips"] = jax.tree.map(jnp.array, weights)
+        if "lecam" in self.loss_weights:
+            extra["lecam"] = initial_averages()
+        return extra or None
+
+    def loss_terms(self, params: Params, batch: Images, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        return tokenizer_terms(self.tokenizer, self.train, params, batch, *context)
+
+    def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
+        if extra is None or "lecam" not in self.loss_weights:
+            return extra
+        logits = (means["real_logit"], means["fake_logit"])
+        return extra | {"lecam": updated_averages(extra["lecam"], *logits, decay=self.train.lecam_decay)}
+
+    def tokenizer_params(self, params: Params) -> Params:
+        """Returns the tokenizer's parameters without the discriminator's."""
+        return params["generator"] if self.train.adversarial_weight else params
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        """Returns the shapes of the tokenizer's weights in a directory that training may start from.
+
+        Raises:
+            UserError: the weights are missing or of another network; the message names the differing fields.
+        """
+        if not (directory / "tokenizer" / "weights").exists():
+            raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
+        saved = read_tokenizer_config(directory)
+        if differing := differences(saved, self.tokenizer, FREE):
+            raise UserError(f"{directory}: holds another network ({differing}); set these fields of tokenizer alike")
+        return jax.eval_shape(Tokenizer(saved).init_params, jax.random.key(0))
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        """Returns the parameters that training begins with: the saved tokenizer, and a fresh discriminator."""
+        return fresh | {"generator": saved} if "generator" in fresh else saved
+
+
+def read_tokenizer_config(directory: Path) -> TokenizerConfig:
+    """Reads the settings of the tokenizer of a run or a converted public checkpoint.
+
+    Raises:
+        UserError: the settings are missing, damaged or of another version.
+    """
+    path = directory / "config.json"
+    settings = read_json(path, cure="make it with python -m rsjax.convert")
+    if "tokenizer" not in settings:
+        raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
+    try:
+        return from_dict(TokenizerConfig, settings["tokenizer"])
+    except (ConfigError, TypeError) as error:
+        raise UserError(f"{path}: the tokenizer's settings cannot be read ({error}); make it again") from error
+
+
+@dataclass(frozen=True)
+class TokenizerImages:
+    """The loader's transform: draws random frames of a clip, some of them as colourised depth.
+
+    Attributes:
+        count: frames per clip.
+        depth_share: probability that a frame is replaced by its depth map; 0 for clips without depth.
+        scale: of the depth maps' colours.
+        flip: whether to mirror each image left to right with probability ½.
+    """
+
+    count: int
+    depth_share: float
+    scale: Literal["linear", "inverse"]
+    flip: bool
+
+    def __call__(self, record: Record, rng: np.random.Generator) -> Arrays:
+        """Returns ``images``: uint8 (count, H, W, 3)."""
+        chosen = rng.choice(len(record["rgb"]), self.count, replace=self.count > len(record["rgb"]))
+        images = record["rgb"][chosen]
+        as_depth = rng.random(self.count) < self.depth_share
+        if record["depth"] is not None:
+            near, far = record["provenance"]["depth_range"]
+            colors = depth_to_color(record["depth"][chosen[as_depth]], near, far, self.scale)
+            images[as_depth] = colors.astype(np.uint8)
+        if self.flip:
+            mirrored = rng.random(self.count) < 0.5
+            images[mirrored] = images[mirrored, :, ::-1]
+        return {"images": images}
+
+
+def image_batch(arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
+    """Returns stacked outputs of :class:`TokenizerImages` as one batch of images."""
+    images = arrays["images"]
+    return images.reshape(-1, *images.shape[2:])
+
+
+def tokenizer_terms(
+    config: TokenizerConfig,
+    train: TokenizerTrainConfig,
+    params: Params,
+    images: Float[Array, "B H W 3"],
+    step: Int[Array, ""],
+    extra: Extra = None,
+    axis_name: str | None = None,
+) -> dict[str, Term]:
+    """Returns the active terms of one batch of images (0–255), named as their weights.
+
+    Args:
+        params: the tokenizer's; with an adversarial term, {"generator": the tokenizer's, "discriminator": …}.
+        step: the number of steps before this one.
+        extra: "lpips", the metric's weights, and "lecam", the averages of logits, if their terms are active.
+        axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
+    """
+    weights = train.loss_weights
+    generator = params["generator"] if "adversarial" in weights else params
+    target = to_unit(images)
+    output, latents = cast(tuple[Images, Latents], Tokenizer(config).apply({"params": generator}, target))
+    count = jnp.float32(images.shape[0])
+    error = (target - output).astype(jnp.float32)
+    total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
+    means = {
+        "l1": jnp.mean(jnp.abs(error)),
+        "l2": jnp.mean(jnp.square(error)),
+        "entropy": lfq.entropy_loss(latents, train.entropy_temperature, total),
+        "commitment": lfq.commitment_loss(latents),
+    }
+    if "perceptual" in weights:
+        means["perceptual"] = jnp.mean(lpips(_carried(extra, "lpips"), target, output))
+    terms = {name: (mean * count, count) for name, mean in means.items()}
+    if "adversarial" in weights:
+        active = (step >= train.disc_start).astype(jnp.float32)
+        terms |= adversarial_terms(
+            train, params["discriminator"], target, output, active, _carried(extra, "lecam"), axis_name
+        )
+    return terms
+
+
+def _carried(extra: Extra, name: str) -> Any:
+    assert extra is not None
+    return extra[name]

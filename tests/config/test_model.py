@@ -1,0 +1,98 @@
+"""Families of models: moving a run to another one, and reading one back from a file."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rsjax.config import (
+    FAMILIES,
+    Config,
+    ConfigError,
+    GenieConfig,
+    LossConfig,
+    MaskConfig,
+    ModelConfig,
+    RoboScapeConfig,
+    SampleConfig,
+    from_dict,
+    presets,
+    register_family,
+    to_dict,
+)
+
+DEBUG = presets.debug()
+CHANGED = (
+    RoboScapeConfig(
+        width=32, use_depth=False, loss=LossConfig(gamma=2.0), mask=MaskConfig(corruption_keep=0.5), max_frames=9
+    ),
+    GenieConfig(action_encoder="none", heads=2, sample=SampleConfig(steps=3, cache_dtype="bfloat16")),
+)
+
+
+def as_read(values: dict[str, Any]) -> Config:
+    """A configuration out of the JSON of a file."""
+    return from_dict(Config, json.loads(json.dumps(values)))
+
+
+@pytest.mark.parametrize("model", [*CHANGED, *(kind() for kind in FAMILIES.values())], ids=lambda model: model.family)
+def test_every_family_survives_json(model: ModelConfig) -> None:
+    config = replace(DEBUG, model=model)
+    values = to_dict(config)
+    assert values["model"]["family"] == model.family
+    assert as_read(values) == config
+    assert type(as_read(values).model) is type(model)
+    assert hash(as_read(values)) == hash(config)
+
+
+def test_a_family_keeps_changed_fields_and_its_own_defaults_for_the_others() -> None:
+    mask, sample = MaskConfig(random_token_rate=0.1), SampleConfig(steps=5)
+    config = replace(DEBUG, model=RoboScapeConfig(width=64, heads=4, use_depth=False, mask=mask, sample=sample))
+    genie = config.with_family("genie")
+    assert genie == replace(config, model=GenieConfig(width=64, heads=4, mask=mask, sample=sample))
+    # The action encoder is at RoboScape's default, so it becomes Genie's; set on purpose, it is kept.
+    assert (RoboScapeConfig().action_encoder, GenieConfig().action_encoder) == ("linear", "mlp")
+    assert genie.with_family("roboscape") == replace(config, model=replace(config.model, use_depth=True))  # type: ignore[call-arg]
+    without = replace(config, model=GenieConfig(width=64, heads=4, action_encoder="none"))
+    assert without.with_family("roboscape").model == RoboScapeConfig(width=64, heads=4, action_encoder="none")
+
+
+@pytest.mark.parametrize("name", ["roboscape", "genie"])
+def test_a_model_of_the_family_already_stays_as_it_is(name: str) -> None:
+    config = replace(DEBUG, model=replace(FAMILIES[name](), width=64))  # type: ignore[call-arg]
+    assert config.with_family(name) == config
+
+
+def test_an_unknown_family_is_refused_with_the_nearest_and_all() -> None:
+    expected = r"unknown model 'geni'; did you mean 'genie'\? \(models: roboscape, genie"
+    values = to_dict(DEBUG)
+    values["model"]["family"] = "geni"
+    with pytest.raises(ConfigError, match=expected):
+        as_read(values)
+    with pytest.raises(ConfigError, match=expected):
+        DEBUG.with_family("geni")
+
+
+def test_a_file_without_a_family_is_refused() -> None:
+    values = to_dict(DEBUG)
+    del values["model"]["family"]
+    with pytest.raises(ConfigError, match="model has no family; the file is of another version"):
+        as_read(values)
+
+
+def test_a_field_of_another_family_is_refused_by_name() -> None:
+    values = to_dict(replace(DEBUG, model=GenieConfig()))
+    values["model"]["use_depth"] = True
+    with pytest.raises(ConfigError, match="GenieConfig has no field use_depth"):
+        as_read(values)
+
+
+def test_two_families_of_one_name_are_refused() -> None:
+    with pytest.raises(ConfigError, match="two families of models are named 'genie'"):
+
+        @register_family("genie")
+        class Another(ModelConfig):
+            pass
+
+    assert FAMILIES["genie"] is GenieConfig

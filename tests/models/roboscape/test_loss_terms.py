@@ -1,0 +1,179 @@
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import LossConfig, MaskConfig, RoboScapeConfig
+from rsjax.models.roboscape import keypoints as kp
+from rsjax.models.roboscape import masking
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.trainable import StepContext, Term, combine
+from tests.models.roboscape.toy import roboscape
+
+MODEL = Architecture(frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=1, heads=2)
+MASK, LOSS = MaskConfig(), LossConfig(num_keypoints=3)
+KEY, CONTEXT = jax.random.key(3), StepContext(jnp.int32(0), None, None)
+
+
+def model_of(architecture: Architecture, loss: LossConfig) -> RoboScape:
+    config = RoboScapeConfig(use_depth=architecture.use_depth, loss=loss, mask=MASK)
+    return roboscape(architecture, config)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def terms_of(architecture: Architecture, loss: LossConfig, params: Any, batch: Batch) -> dict[str, Term]:
+    return model_of(architecture, loss).loss_terms(params, batch, KEY, CONTEXT)
+
+
+def random_params(model: Architecture) -> Any:
+    rng = np.random.default_rng(1)
+    shapes = jax.eval_shape(Transformer(model).init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: rng.normal(scale=0.3, size=x.shape).astype(np.float32), shapes)
+
+
+def random_batch(clips: int = 3) -> Batch:
+    rng = np.random.default_rng(2)
+    tokens = [rng.integers(0, 2**MODEL.code_bits, (clips, 4, 2, 2), np.int32) for _ in range(2)]
+    fields: dict[str, Any] = {
+        "rgb": tokens[0],
+        "depth": tokens[1],
+        "actions": rng.normal(size=(clips, 4, 3)).astype(np.float32),
+        "tracks": rng.random((clips, 7, 4, 2)).astype(np.float32),
+        "visible": rng.random((clips, 7, 4)) < 0.7,
+        "weight": np.array([1, 1, 0] + [1] * (clips - 3), np.float32)[:clips],
+        "index": np.arange(clips, dtype=np.int32),
+    }
+    return Batch(**fields)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("keypoints", [True, False])
+def test_what_is_off_has_no_term(depth: bool, keypoints: bool) -> None:
+    model, loss = replace(MODEL, use_depth=depth), replace(LOSS, use_keypoints=keypoints)
+    shapes = jax.eval_shape(Transformer(model).init_params, KEY)
+    terms = jax.eval_shape(partial(terms_of, model, loss), shapes, random_batch())
+    assert terms.keys() == model_of(model, loss).loss_weights.keys()
+    assert ("depth" in terms, "keypoint" in terms, "attention" in terms) == (depth, keypoints, keypoints)
+
+
+@pytest.mark.parametrize("has_depth", [None, (1, 0, 1), (0, 0, 0)])
+def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: tuple[int, ...] | None) -> None:
+    """Of clips without depth RGB alone, by a model to which all their depth is hidden."""
+    params, batch = random_params(MODEL), random_batch()
+    has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
+    batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
+    clean = {name: jnp.asarray(getattr(batch, name)) for name in MODEL.branches}
+    corrupt = jax.jit(partial(masking.corrupt, MASK, 1, MODEL.code_bits, MODEL.vocabularies))
+    given = corrupt(KEY, clean, batch.index)
+    inputs = (given.tokens, given.mask, batch.actions)
+    logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
+    points = kp.select(batch.tracks, batch.visible, LOSS.num_keypoints, MODEL.grid)
+    emphasis = np.asarray(kp.attention_map(points, MODEL.grid, LOSS.gamma))
+
+    expected = dict.fromkeys(("rgb", "depth", "attention"), 0.0)
+    cells = dict.fromkeys(expected, 0)
+    for clip, t, row, column in np.argwhere(np.asarray(given.mask)):
+        if not batch.weight[clip]:
+            continue
+        for name in clean:
+            if name == "depth" and not has[clip]:
+                continue
+            score, token = 0.0, int(clean[name][clip, t, row, column])
+            for k in range(2):
+                x = np.asarray(logits[name][clip, t, 2 * row + column, k])
+                score += float(np.log(np.exp(x).sum()) - x[(token // 4**k) % 4])
+            expected[name] += score
+            cells[name] += 1
+            if name == "rgb":
+                expected["attention"] += score * emphasis[clip, t, row, column]
+                cells["attention"] += 1
+
+    terms = terms_of(MODEL, LOSS, params, batch)
+    for name, value in expected.items():
+        np.testing.assert_allclose(terms[name], (value, cells[name]), rtol=1e-4, err_msg=name)
+
+
+def objective(params: Any, batch: Batch) -> tuple[Any, Any]:
+    return combine(terms_of(MODEL, LOSS, params, batch), model_of(MODEL, LOSS).loss_weights)
+
+
+GRADIENT = jax.jit(jax.value_and_grad(objective, has_aux=True))
+
+
+def test_where_every_clip_has_depth_it_is_as_if_nothing_was_said() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    told = batch.replace(has_depth=np.ones(3, np.float32))  # type: ignore[attr-defined]
+    close = partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)  # two programs, which may round differently
+    jax.tree.map(close, GRADIENT(params, told), GRADIENT(params, batch))
+
+
+def test_of_a_batch_without_depth_the_branch_learns_by_what_it_tells_rgb_alone() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    (loss, shares), gradient = GRADIENT(params, batch.replace(has_depth=np.zeros(3, np.float32)))  # type: ignore[attr-defined]
+    assert shares["depth"] == 0
+    assert np.isfinite(loss)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(gradient))
+    learns = lambda tree: any(np.any(x) for x in jax.tree.leaves(tree))  # noqa: E731
+    embed = gradient["depth_embed"]
+    assert not learns([gradient["depth_head"], embed["factored_embed_0"], embed["factored_embed_1"]])
+    assert learns(embed["mask_token_embed"])
+    assert learns(gradient["blocks"]["depth"])
+
+
+def test_depth_tokens_of_a_clip_without_depth_change_nothing() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    has = np.array([1, 0, 1], np.float32)
+    other = np.r_[batch.depth[:1], batch.depth[1:2] ^ 15, batch.depth[2:]]
+    before, after = (
+        GRADIENT(params, batch.replace(has_depth=has, depth=depth))  # type: ignore[attr-defined]
+        for depth in (batch.depth, other)
+    )
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+    all_told = GRADIENT(params, batch.replace(has_depth=np.ones(3, np.float32)))  # type: ignore[attr-defined]
+    assert all_told[0][1]["rgb"] != before[0][1]["rgb"]
+
+
+def test_a_padding_clip_changes_nothing() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    other = batch.replace(  # type: ignore[attr-defined]
+        rgb=np.r_[batch.rgb[:2], batch.rgb[2:] ^ 15],
+        depth=np.r_[batch.depth[:2], batch.depth[2:] ^ 15],
+        actions=np.r_[batch.actions[:2], batch.actions[2:] + 1],
+        tracks=np.r_[batch.tracks[:2], 1 - batch.tracks[2:]],
+    )
+    before, after = (terms_of(MODEL, LOSS, params, x) for x in (batch, other))
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+    counted = terms_of(MODEL, LOSS, params, other.replace(weight=np.ones(3, np.float32)))
+    for name, (total, weight) in counted.items():
+        assert total > after[name][0]
+        assert weight > after[name][1]
+
+
+def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
+    params, batch = random_params(MODEL), random_batch()
+    gradient = jax.jit(jax.jacrev(lambda p: {k: v[0] for k, v in terms_of(MODEL, LOSS, p, batch).items()}))(params)
+    reaches = lambda term, part: bool(np.any(gradient[term]["blocks"][part]["fc1"]["kernel"]))  # noqa: E731
+    for term in ("rgb", "keypoint", "attention"):
+        assert reaches(term, "rgb")
+        assert reaches(term, "depth")  # through the projection of Eq. 3
+    assert reaches("depth", "depth")
+    assert not reaches("depth", "rgb")
+
+
+def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:
+    model, loss = replace(MODEL, action_dropout=0.5), LossConfig(use_keypoints=False)
+    params, batch = random_params(model), random_batch(8)
+    drop = masking.dropped_actions(0.5, KEY, batch.index)
+    assert {False, True} == set(np.asarray(drop).tolist())
+    gradient = jax.jit(jax.grad(lambda params: terms_of(model, loss, params, batch)["rgb"][0]))(params)
+    assert np.any(gradient["null_action"])
+    assert np.any(gradient["action_encoder"]["kernel"])
+    plain = terms_of(MODEL, loss, {k: x for k, x in params.items() if k != "null_action"}, batch)
+    assert plain["rgb"][0] != terms_of(model, loss, params, batch)["rgb"][0]

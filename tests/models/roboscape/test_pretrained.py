@@ -1,0 +1,122 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import GenieConfig, presets, to_dict
+from rsjax.convert.directory import save
+from rsjax.convert.genie import from_public
+from rsjax.errors import UserError
+from rsjax.models.roboscape import pretrained
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.transformer import Transformer
+from rsjax.training.checkpoint import load_weights, save_weights
+from tests.convert.public import genie_shapes, random_tensors
+
+ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
+DUAL = replace(ALONE, use_depth=True, action_inputs=5, action_dropout=0.1)
+
+
+def random_params(network: Architecture, seed: int = 0) -> Any:
+    """Parameters without a zero among them, so that what has to be zero is made so where it is tested."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(Transformer(network).init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype(np.float32), shapes)
+
+
+def begin(own: Architecture, directory: Path, fresh: Any = None) -> Any:
+    """The parameters that training of ``own`` begins with where ``train.start_from`` is the directory."""
+    saved = load_weights(directory / "world_model" / "weights", pretrained.shapes(own, directory))
+    return pretrained.start(random_params(own, seed=1) if fresh is None else fresh, saved, directory)
+
+
+def rgb_logits(network: Architecture, params: Any) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    shape = (2, network.frames, network.grid, network.grid)
+    tokens, depth = (rng.integers(0, 2**network.code_bits, shape, np.int32) for _ in range(2))
+    mask, actions = rng.random(shape) < 0.4, rng.normal(size=(2, network.frames, network.action_inputs))
+    inputs = {"rgb": tokens, "depth": depth} if network.use_depth else {"rgb": tokens}
+    apply = jax.jit(lambda p, *x: Transformer(network).apply({"params": p}, *x)[0]["rgb"])
+    return np.asarray(apply(params, inputs, mask, actions.astype(np.float32)))
+
+
+@pytest.fixture(scope="module")
+def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with a model without actions."""
+    directory = tmp_path_factory.mktemp("public")
+    save(directory, ALONE, random_params(ALONE))
+    return directory
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"qk_norm": True, "mup": True}, {"compute_dtype": "bfloat16"}, {"action_encoder": "mlp"}],
+    ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions"],
+)
+def test_a_dual_model_begins_with_the_very_logits_of_the_genie_it_starts_from(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    settings = {"num_heads": ALONE.heads, "use_mup": options.get("mup", False)}
+    tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, options.get("qk_norm", False)))
+    config, params = from_public(Path("file"), tensors, settings)
+    save(tmp_path, config, params)
+    alone, dual = replace(config, **options), replace(DUAL, **options)
+    fresh = random_params(dual, seed=1)
+    begun = begin(dual, tmp_path, fresh)
+    expected = rgb_logits(alone, params)
+    np.testing.assert_array_equal(rgb_logits(dual, begun), expected)
+    assert expected.std() > 0.1
+    assert jax.tree.map(jnp.shape, begun) == jax.tree.map(jnp.shape, fresh)
+    for path in ("depth_embed", "depth_head"):
+        jax.tree.map(np.testing.assert_array_equal, begun[path], fresh[path])
+    jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["depth"], fresh["blocks"]["depth"])
+
+
+def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> None:
+    saved = random_params(DUAL)
+    save(tmp_path, DUAL, saved)
+    jax.tree.map(np.testing.assert_array_equal, begin(DUAL, tmp_path), saved)
+    with pytest.raises(UserError, match="action_encoder/bias has no place in this model"):
+        begin(ALONE, tmp_path)
+    wider = replace(DUAL, action_inputs=6)
+    with pytest.raises(UserError, match=r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"):
+        begin(wider, tmp_path)
+    integrated = replace(DUAL, integrate_actions=True)
+    with pytest.raises(UserError, match="integrate_actions is False there, True here"):
+        begin(integrated, tmp_path)
+    with pytest.raises(UserError, match="action_encoder is linear there, mlp here"):
+        begin(replace(DUAL, action_encoder="mlp"), tmp_path)
+
+
+def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Path) -> None:
+    integrated = replace(DUAL, integrate_actions=True)
+    assert not np.any(begin(integrated, public)["action_encoder"]["kernel"])
+
+
+@pytest.mark.parametrize(("field", "value"), [("heads", 4), ("mup", True), ("blocks", 3), ("frames", 5)])
+def test_another_network_is_refused_even_where_the_shapes_agree(public: Path, field: str, value: Any) -> None:
+    other = replace(DUAL, **{field: value})
+    with pytest.raises(UserError, match=f"{field} is {getattr(DUAL, field)} there, {value} here"):
+        begin(other, public)
+
+
+def test_a_run_is_such_a_directory_too(tmp_path: Path) -> None:
+    """Its settings are the whole configuration, from which the network follows."""
+    config = replace(presets.debug(), model=GenieConfig(width=8, blocks=1, heads=2, action_encoder="none"))
+    genie = Architecture.create(config)
+    (tmp_path / "world_model").mkdir()
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(config)))
+    save_weights(tmp_path / "world_model" / "weights", random_params(genie))
+    assert pretrained.read_architecture(tmp_path) == genie
+    begun = begin(replace(genie, use_depth=True, action_inputs=5, action_encoder="linear"), tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], random_params(genie)["blocks"]["rgb"])
+
+
+def test_a_directory_without_weights_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no world_model/weights with their settings"):
+        begin(ALONE, tmp_path)

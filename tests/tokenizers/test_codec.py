@@ -1,0 +1,84 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.clip import Video
+from rsjax.data.depth_color import depth_to_color
+from rsjax.data.normalization import Normalization
+from rsjax.errors import UserError
+from rsjax.tokenizers import codec as module
+from rsjax.tokenizers.codec import Codec
+from rsjax.tokenizers.magvit2 import Tokenizer
+from tests.pipeline import toy
+
+CONFIG = toy.config().tokenizer
+NEAR_FAR = (0.4, 3.0)
+NORMALIZATION = Normalization((0.0,), (1.0,), NEAR_FAR)
+
+
+@pytest.fixture(scope="module")
+def codec() -> Codec:
+    return Codec(CONFIG, toy.tokenizer_params(), NORMALIZATION)
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7])
+def test_chunks_of_any_size_give_the_same(codec: Codec, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (2, 3, 64, 64, 3), np.uint8)
+    tokens = rng.integers(0, 256, (2, 3, 8, 8), np.int32)
+    apply = jax.jit(Tokenizer(CONFIG).apply, static_argnames="method")
+    whole = apply({"params": codec.params}, frames.reshape(6, 64, 64, 3), method="encode")
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    np.testing.assert_array_equal(codec.encode_rgb(frames), np.reshape(whole, (2, 3, 8, 8)))
+    decoded = apply({"params": codec.params}, tokens.reshape(6, 8, 8), method="decode")
+    plain = np.round(np.reshape(decoded, frames.shape)).astype(np.uint8)
+    got = codec.decode_rgb(tokens)
+    assert got.dtype == np.uint8
+    assert np.abs(got.astype(int) - plain).max() <= 1  # at a half, rounding follows float32's last bit
+
+
+def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = np.random.default_rng(0).uniform(*NEAR_FAR, (2, 3, 64, 64)).astype(np.float32)
+    colors = depth_to_color(depth, *NEAR_FAR, "inverse").astype(np.uint8)
+    tokens = codec.encode_depth(depth)
+    np.testing.assert_array_equal(tokens, codec.encode_rgb(colors))
+    # With a tokenizer that keeps everything, metres are right to half of one of the map's 766 levels.
+    monkeypatch.setattr(module, "_decode", lambda config, params, tokens: np.resize(colors, (len(tokens), 64, 64, 3)))
+    metres = codec.decode_depth(tokens)
+    assert metres.shape == depth.shape
+    level = (1 / NEAR_FAR[0] - 1 / NEAR_FAR[1]) / 765
+    assert np.abs(1 / metres - 1 / depth).max() <= 0.51 * level
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda codec: codec.encode_depth(np.ones((1, 64, 64), np.float32)),
+        lambda codec: codec.decode_depth(np.zeros((1, 8, 8), np.int32)),
+    ],
+    ids=["encode", "decode"],
+)
+def test_depth_has_no_tokens_where_no_clip_has_depth(codec: Codec, use: Callable[[Codec], object]) -> None:
+    blind = replace(codec, normalization=replace(NORMALIZATION, depth_range=None))
+    with pytest.raises(UserError, match="depth_range is null: none of the clips .* has depth"):
+        use(blind)
+
+
+def test_a_videos_depth_is_that_of_the_clips_that_have_it(codec: Codec) -> None:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (2, 3, 64, 64, 3), np.uint8)
+    depth = rng.uniform(*NEAR_FAR, (2, 3, 64, 64)).astype(np.float32)
+    depth[1] = np.nan
+    video = Video(rgb, depth)
+    tokens = codec.encode(video)
+    np.testing.assert_array_equal(tokens["depth"][0], codec.encode_depth(depth[0]))
+    assert not tokens["depth"][1].any()
+    again = codec.decode(tokens, video.has_depth)
+    np.testing.assert_array_equal(again.rgb, codec.decode_rgb(tokens["rgb"]))
+    assert again.depth is not None and np.isnan(again.depth[1]).all()
+    np.testing.assert_array_equal(again.depth[0], codec.decode_depth(tokens["depth"][0]))
+    assert codec.encode(Video(rgb)).keys() == {"rgb"} and codec.encode(video[1:]).keys() == {"rgb"}
+    assert codec.decode(tokens, np.zeros(2, bool)).depth is None

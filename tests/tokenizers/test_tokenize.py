@@ -1,0 +1,50 @@
+"""The tokens of a store of clips, of which some are damaged."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.data.quarantine import read_quarantine
+from rsjax.data.store import Store, StoreError
+from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
+from tests.pipeline import toy
+from tests.pipeline.damage import damage
+
+
+def tokenized(clips: Store, place: Path, max_damaged: float = 0.01) -> Store:
+    return tokenize_store(clips, toy.codec(clips), toy.config().clips.image_size, place, max_damaged)
+
+
+def test_a_damaged_test_clip_is_an_error(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    damage(clips, "test", 2)
+    with pytest.raises(StoreError, match="number 2 of the split"):
+        tokenized(clips, tmp_path)
+    assert not (tmp_path / "quarantine.jsonl").exists()
+
+
+def test_every_run_lists_the_clips_that_lack_tokens_until_they_are_mended(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    sound = (clips.path / "train-00000.array_record").read_bytes()
+    damage(clips, "train", 1)
+    first = tokenized(clips, tmp_path / "a")
+    made = (first.path / "manifest.json").stat().st_mtime_ns
+    assert tokenized(clips, tmp_path / "b").path == first.path
+    assert (first.path / "manifest.json").stat().st_mtime_ns == made, "they were there"
+    rows = [[row["record"] for row in read_quarantine(tmp_path / run / "quarantine.jsonl")] for run in "ab"]
+    assert rows == [[1], [1]]
+    with pytest.raises(StoreError, match="max_damaged"):
+        tokenized(clips, tmp_path / "c", max_damaged=0.0)
+    (clips.path / "train-00000.array_record").write_bytes(sound)
+    again = tokenized(clips, tmp_path / "b")
+    assert len(again.source("train")) == toy.TRAIN and not (tmp_path / "b" / "quarantine.jsonl").exists()
+
+
+def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:
+    params = {"a": np.zeros(3, np.float32), "b": {"c": np.ones((2, 2), np.float32)}}
+    other = jax.tree.map(np.copy, params)
+    assert fingerprint(params) == fingerprint(other)
+    other["b"]["c"][1, 1] += 1e-6  # type: ignore[index, call-overload]
+    assert fingerprint(params) != fingerprint(other)
