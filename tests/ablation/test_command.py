@@ -1,7 +1,6 @@
 """A grid for real, through the command."""
 
 import json
-import re
 from pathlib import Path
 
 from rsjax.training.log import read_log
