@@ -1,13 +1,13 @@
 """Loads a run directory's configuration, weights and trained model."""
 
-import json
 from pathlib import Path
 
 import jax
 
-from rsjax.config import Config, from_dict
+from rsjax.config import Config, ConfigError, from_dict
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
+from rsjax.files import read_json
 from rsjax.models.base import Assets, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.magvit2 import Tokenizer
@@ -38,10 +38,11 @@ def load_config(run: Path) -> Config:
     if not path.exists():
         raise UserError(f"{path}: missing, so {run} is not a run directory; make one with python -m experiments.train")
     try:
-        return from_dict(Config, json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
+        return from_dict(Config, read_json(path, cure="the train command of this run writes it again"))
+    except (ConfigError, TypeError) as error:
         raise UserError(
-            f"{path}: not a configuration ({error}); the train command of this run writes it again"
+            f"{path}: not a configuration of this version of rsjax ({error}); train the run again with --overwrite, or "
+            f"use the version that made it (run.json names it)"
         ) from error
 
 

@@ -100,4 +100,4 @@ def test_weights_of_another_architecture_are_refused(run: Path, command: Command
 
 def test_a_damaged_configuration_is_named(run: Path, command: Commands) -> None:
     (run / "config.json").write_text('{"name": ')
-    assert f"{run / 'config.json'}: not a configuration" in command.refused(PROGRAM, run)
+    assert f"{run / 'config.json'}: not JSON" in command.refused(PROGRAM, run)
