@@ -142,7 +142,7 @@ def test_torch_is_compared_on_one_device_and_with_a_single_branch_only(
     [
         ({"only": ["trian"]}, "--only has no part 'trian'; did you mean 'train'"),
         ({"batch": 0}, "--batch is 0"),
-        ({"horizons": (4, 1)}, "--horizons has 1; the prompt is 1 frame"),
+        ({"horizons": (4, 1)}, "--horizons has 1; a rollout has 1 prompt frame"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is(request_: dict[str, Any], line: str) -> None:

@@ -82,7 +82,7 @@ def test_what_does_not_exist_or_fit_is_one_line_and_nothing_is_written(
         ),
         (("--clips", 0, "--actions", tmp_path / "text.npy"), "text.npy: not a readable .npy file"),
         (("--clips", 0, "--fps", 0), "--fps is 0.0"),
-        (("--clips", 0, "--frames", 1), "--frames is 1, of which 1 are given"),
+        (("--clips", 0, "--frames", 1), "--frames is 1, but the prompt has 1"),
         (("--clips", 0, "--guidance", 2), "model.sample.guidance is 2.0 but the model never saw clips without actions"),
     ):
         assert words in command.refused(PROGRAM, debug, "--out", tmp_path / "out", *arguments)

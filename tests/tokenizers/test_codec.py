@@ -63,7 +63,7 @@ def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, m
 )
 def test_depth_has_no_tokens_where_no_clip_has_depth(codec: Codec, use: Callable[[Codec], object]) -> None:
     blind = replace(codec, normalization=replace(NORMALIZATION, depth_range=None))
-    with pytest.raises(UserError, match="depth_range is null: none of the clips .* has depth"):
+    with pytest.raises(UserError, match="depth_range is null: no clip of .* has depth"):
         use(blind)
 
 
