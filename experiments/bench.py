@@ -1,13 +1,12 @@
 """Measures a preset's speed. ``python -m experiments.bench roboscape_s --batch 1 --json bench.json``"""
 
-import json
 import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from experiments.cli import main_errors, parse
+from rsjax.files import write_json
 from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.bench"
@@ -42,18 +41,9 @@ def main() -> None:
     jax.config.update("jax_enable_compilation_cache", False)  # to measure compilation
     console = Console()
     only = tuple(options.only.split(",")) if options.only else PARTS
-    keep = partial(write, options.json) if options.json else lambda numbers: None
+    keep = partial(write_json, options.json) if options.json else lambda numbers: None
     numbers = bench(config, options.batch, only, options.horizons, options.torch, say=console.print, keep=keep)
     console.print(table(numbers))
-
-
-def write(path: Path, numbers: dict[str, Any]) -> None:
-    """Writes the numbers to the file, replacing it."""
-    from rsjax.files import disk_guard, write_atomically
-
-    with disk_guard(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, f"{json.dumps(numbers, indent=1)}\n".encode())
 
 
 if __name__ == "__main__":

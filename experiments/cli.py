@@ -13,6 +13,7 @@ from tyro import _errors as parse_errors  # private; the alternative is to parse
 from rsjax.command import main_errors as main_errors  # every command imports both from here
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets
 from rsjax.config.curriculum import format_stage, parse_stage
+from rsjax.config.leaves import leaves
 from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
@@ -133,7 +134,7 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
     default: Any = dataclasses.make_dataclass("Command", kinds)(**parts)
 
     def refuse(event: parse_errors.ParseErrorEvent) -> None:
-        flags = [flag for part in parts.values() for flag in _flags(part)]
+        flags = [name.replace("_", "-") for part in parts.values() for name in leaves(part)]
         if message := _message(event, flags):  # of an event without a message, tyro prints its own report
             raise ConfigError(f"{message} (see {prog} --help)")
 
@@ -184,12 +185,3 @@ def _first_fields(preset: Config) -> Any:
         kinds.append((key, Annotated[get_type_hints(type(part))[field], tyro.conf.arg(name=name, help=text)]))
         values[key] = value
     return dataclasses.make_dataclass("FirstFields", kinds)(**values)
-
-
-def _flags(value: Any, prefix: str = "") -> list[str]:
-    """Returns the flags of a dataclass's fields, nested ones included, without their leading dashes."""
-    names: list[str] = []
-    for field in dataclasses.fields(value):
-        inner, name = getattr(value, field.name), prefix + field.name.replace("_", "-")
-        names += _flags(inner, f"{name}.") if dataclasses.is_dataclass(inner) else [name]
-    return names

@@ -1,6 +1,5 @@
 """Counts a configuration's parameters, operations and memory from shapes, without allocating arrays."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -157,14 +156,10 @@ def _kept(config: Config) -> list[jax.ShapeDtypeStruct]:
 
         return jax.vjp(loss, params)[1]  # a tree of the arrays that are kept
 
-    kept = jax.eval_shape(backward, params, _batch(config, _CLIPS), jax.random.key(0))
+    one = inputs.batch_shapes(model, config)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((_CLIPS, *x.shape[1:]), x.dtype), one)
+    kept = jax.eval_shape(backward, params, batch, jax.random.key(0))
     return [x for x in jax.tree.leaves(kept) if x.size % _CLIPS == 0]
-
-
-def _batch(config: Config, clips: int) -> Any:
-    """Returns the shapes of a batch."""
-    one = inputs.batch_shapes(create_model(config), config)
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((clips, *x.shape[1:]), x.dtype), one)
 
 
 def _bytes(tree: Any) -> int:
@@ -190,13 +185,10 @@ def render(description: Description) -> Group:
 def _grow(tree: Tree, shapes: Shapes) -> None:
     """Adds a line for each module with its own parameters, nested as the modules are."""
     for name, x in shapes.items():
-        inner = {key: y for key, y in x.items() if isinstance(y, dict)} if isinstance(x, dict) else {}
-        own = [f"{key} {y.shape}" for key, y in _leaves(x) if key not in inner]
+        parts = x if isinstance(x, dict) else {"": x}
+        inner = {key: y for key, y in parts.items() if isinstance(y, dict)}
+        own = [f"{key} {y.shape}" for key, y in parts.items() if key not in inner]
         _grow(tree.add("  ".join([name, *own, f"[dim]{count(x):,}[/]"])), inner)
-
-
-def _leaves(x: Any) -> Iterator[tuple[str, Any]]:
-    yield from x.items() if isinstance(x, dict) else [("", x)]
 
 
 def _title(name: str) -> str:

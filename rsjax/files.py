@@ -74,6 +74,22 @@ def write_atomically(path: Path, payload: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: Path, payload: bytes) -> None:
+    """Writes a file atomically, with its parent directories.
+
+    Raises:
+        FileError: the disk is full, or the directory is not writable.
+    """
+    with disk_guard(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, payload)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes a JSON file as :func:`write_file` does."""
+    write_file(path, json.dumps(content, indent=1).encode())
+
+
 @contextmanager
 def disk_guard(path: Path) -> Iterator[None]:
     """Turns a full disk or a refused write into a :class:`FileError` that names ``path``."""

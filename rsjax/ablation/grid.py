@@ -4,7 +4,6 @@ import dataclasses
 import fnmatch
 import hashlib
 import itertools
-import json
 import math
 import re
 import typing
@@ -17,7 +16,7 @@ from typing import Any, Literal
 from rsjax.config import Config, ConfigError, from_dict, require, to_dict
 from rsjax.config.leaves import Leaf, leaves, with_values
 from rsjax.errors import UserError, did_you_mean
-from rsjax.files import disk_guard, lock, read_json, write_atomically
+from rsjax.files import lock, read_json, write_json
 from rsjax.progress import note
 
 Value = bool | int | float | str
@@ -263,6 +262,5 @@ def add_cells(out: Path, new: Grid, choice: Choice) -> tuple[Grid, tuple[str, ..
         base = to_dict(next(iter(grid.cells.values())))
         cells = {name: values_of(config, (*grid.fields, SEED)) for name, config in grid.cells.items()}
         content = {"fields": grid.fields, "cells": cells, "config": base, "versions": grid.versions}
-        with disk_guard(out):
-            write_atomically(out / FILE, json.dumps(content, indent=1).encode())
+        write_json(out / FILE, content)
     return grid, chosen

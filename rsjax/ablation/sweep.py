@@ -6,7 +6,6 @@ content key. They come into the cells as hard links, so every cell is a whole ru
 or deleted by itself and takes no disk space twice.
 """
 
-import json
 import os
 import shutil
 import time
@@ -33,7 +32,7 @@ from rsjax.ablation.table import (
 )
 from rsjax.config import require
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, lock, write_atomically
+from rsjax.files import FileError, disk_guard, lock, write_atomically, write_json
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
 from rsjax.progress import note, stage
@@ -97,9 +96,8 @@ def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> St
         line = " ".join((str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}").split())
         note(f"failed: {line}")
         record = {"error": line, "time": time.strftime("%Y-%m-%d %H:%M:%S"), "traceback": traceback.format_exc()}
-        with suppress(OSError):  # on a full disk only the terminal shows it, and the cell counts as interrupted
-            failure.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(failure, json.dumps(record, indent=1).encode())
+        with suppress(FileError):  # on a full disk only the terminal shows it, and the cell counts as interrupted
+            write_json(failure, record)
         return "failed"
     finally:
         jax.clear_caches()  # no other cell uses a cell's compiled programs; they would pile up
@@ -197,7 +195,7 @@ def write_tables(out: Path, data: Path) -> list[Row]:
         rows = tabulate(map(read_result, runs), grid.fields)
         write_atomically(out / "table.md", as_markdown(rows).encode())
         write_atomically(out / "table.csv", as_csv(rows).encode())
-        write_atomically(out / "table.json", json.dumps(as_json(rows), indent=1).encode())
+        write_json(out / "table.json", as_json(rows))
         write_atomically(out / "table.png", draw(rows, f"{next(iter(runs)).config.name}: {out.name}"))
     return rows
 

@@ -8,13 +8,13 @@ Axes: B clips, T frames, S cells, C width, n vocabularies of V codes.
 """
 
 import math
+from collections import OrderedDict
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rsjax.bench.plain import check_plain
 from rsjax.config import OptimizerConfig
 from rsjax.models.roboscape.architecture import Architecture
 
@@ -35,18 +35,6 @@ class Attention(nn.Module):
         return self.proj(out.transpose(1, 2).reshape(n, length, width))
 
 
-class Mlp(nn.Module):
-    """Two linear layers around the exact GELU."""
-
-    def __init__(self, width: int, ratio: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(width, ratio * width)
-        self.fc2 = nn.Linear(ratio * width, width)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x)))
-
-
 class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x), without a norm; x += MLP(norm2 x)."""
 
@@ -55,7 +43,9 @@ class STBlock(nn.Module):
         self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
         self.spatial_attn = Attention(config.width, config.heads)
         self.temporal_attn = Attention(config.width, config.heads)
-        self.mlp = Mlp(config.width, config.mlp_ratio)
+        hidden = config.mlp_ratio * config.width
+        layers = {"fc1": nn.Linear(config.width, hidden), "gelu": nn.GELU(), "fc2": nn.Linear(hidden, config.width)}
+        self.mlp = nn.Sequential(OrderedDict(layers))
 
     def forward(self, x: Tensor) -> Tensor:
         b, t, s, c = x.shape
@@ -68,13 +58,12 @@ class STBlock(nn.Module):
 class GenieTorch(nn.Module):
     """Maps tokens (B, T, S) to logits (B, T, S, n, V); without actions, as in the public Genie.
 
-    Raises:
-        ConfigError: the model has options that the public code lacks (other norms, rotary positions, …).
+    Args:
+        config: passes :func:`rsjax.bench.torch_part.check_plain`.
     """
 
     def __init__(self, config: Architecture) -> None:
         super().__init__()
-        check_plain(config)
         self.config = config
         self.pos_embed_TSC = nn.Parameter(torch.zeros(1, config.frames, config.grid**2, config.width))
         self.factored_embeds = nn.ModuleList(

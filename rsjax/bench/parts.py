@@ -19,6 +19,8 @@ from rsjax.bench import inputs
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config
 from rsjax.data import loader
+from rsjax.data.curriculum import plan
+from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.model import RoboScape
@@ -38,12 +40,13 @@ PRODUCTS_PER_RUN = 10  # to hide the cost of a launch
 PROMPT_FRAMES = 1  # of rollouts, as in the paper, for every preset
 UNCACHED_FRAMES = 2  # frames decoded without the cache; all cost the same, so few are enough
 LOADER_CLIPS, LOADER_BATCHES = 64, 16
+FEED_CLIPS = 256
+WARM_UP, LEAST, MOST = 3, 10, 200  # steps of the part "feed"
 
 
-def matmul(dtype: str, budget: float, shapes: tuple[tuple[int, int, int], ...] | None = None) -> Numbers:
+def matmul(dtype: str, budget: float) -> Numbers:
     """Measures matrix products with float32 accumulation; the ceiling is the fastest rate in operations a second."""
-    if shapes is None:
-        shapes = CPU_PRODUCTS if jax.default_backend() == "cpu" else ACCELERATOR_PRODUCTS
+    shapes = CPU_PRODUCTS if jax.default_backend() == "cpu" else ACCELERATOR_PRODUCTS
     product = jax.jit(lambda x, w: jnp.matmul(x, w, preferred_element_type=jnp.float32))
     rates = {}
     for n, k, m in shapes:
@@ -140,3 +143,44 @@ def load(config: Config, batch: int, budget: float) -> Numbers:
         with loader.batches(source, transform, batch, config.train.seed) as clips:
             seconds = median_seconds(lambda: [model.batch(next(clips)) for _ in range(LOADER_BATCHES)], budget)
     return {"loader_clips_per_s": batch * LOADER_BATCHES / seconds}
+
+
+def feed(config: Config, budget: float) -> Numbers:
+    """Measures the share of time that training steps on one device wait for their batch.
+
+    It uses the preset's batch size and workers, and random clips from a store on disk. Each step finishes before the
+    next batch is requested, so the time until the batch arrives is the time that the device waits.
+
+    Args:
+        budget: seconds after which no further step begins, but at least ``LEAST`` steps are run.
+    """
+    loop = dataclasses.replace(config.train, sharding="jit", fsdp=1, curriculum=())
+    model = create_model(config)
+    transform = model.transform(inputs.normalization(config))
+    rng = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "store"
+        write_store(path, "tokens", {"train": (model.example(rng) for _ in range(FEED_CLIPS))}, {})
+        loop, make = plan(loop, open_store(path), lambda store: transform, Path(folder))
+        sharding = Sharding.create(loop)
+        step = sharding.compile(train_step, model, loop)
+        state = jax.jit(lambda: create_state(model, loop))()
+        with Prefetch(make(None), lambda arrays: sharding.put_batch(model.batch(arrays))) as batches:
+            steps, began, waited = 0, 0.0, 0.0
+            while steps < WARM_UP + MOST:
+                if steps == WARM_UP:
+                    began, waited = time.monotonic(), batches.waited
+                state, metrics = step(state, next(batches).batch)
+                jax.block_until_ready(metrics)
+                steps += 1
+                if steps >= WARM_UP + LEAST and time.monotonic() - began > budget:
+                    break
+            seconds, waited = time.monotonic() - began, batches.waited - waited
+    return {
+        "feed_batch": loop.batch_size,
+        "feed_workers": loop.workers,
+        "feed_steps": steps - WARM_UP,
+        "feed_step_s": seconds / (steps - WARM_UP),
+        "data_wait_s": waited / (steps - WARM_UP),
+        "data_wait_share": waited / seconds,
+    }

@@ -11,7 +11,6 @@ import jax
 from rich.table import Table
 
 from rsjax.bench import parts
-from rsjax.bench.feed import feed
 from rsjax.bench.timing import peak_memory_bytes
 from rsjax.bench.torch_part import check_torch, torch_baseline
 from rsjax.config import Config, ConfigError
@@ -60,7 +59,7 @@ def bench(
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
         "loader": lambda: parts.load(config, batch, budget),
-        "feed": lambda: feed(config, budget),
+        "feed": lambda: parts.feed(config, budget),
         "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),
     }
     numbers = facts(config, batch)

@@ -6,11 +6,12 @@ from typing import Any
 
 import jax
 
-from rsjax.bench.plain import check_plain
 from rsjax.bench.timing import median_seconds
 from rsjax.config import Config, ConfigError, TokenModelConfig
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
+
+ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup")  # options that the baseline lacks
 
 
 def check_torch(config: Config) -> Architecture:
@@ -28,6 +29,21 @@ def check_torch(config: Config) -> Architecture:
             "--torch needs PyTorch, which is not installed; pip install 'rsjax[torch]', or leave --torch out"
         )
     return arch
+
+
+def check_plain(model: Architecture) -> None:
+    """Raises :class:`ConfigError` if the model has an option that the baseline lacks."""
+    for name in ADDED:
+        if getattr(model, name):
+            raise ConfigError(
+                f"model.{name} is on, and the PyTorch baseline is the plain Genie, without it; "
+                f"set it to False, or leave the baseline out"
+            )
+    if model.positions != "learned":
+        raise ConfigError(
+            f"model.positions is {model.positions!r}, and the PyTorch baseline is the plain Genie, which learns them; "
+            f"set it to 'learned', or leave the baseline out"
+        )
 
 
 def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from rsjax.config import ConfigError, TokenizerConfig, from_dict, to_dict
 from rsjax.convert import directory, genie, lpips, tokenizer
-from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_file, write_safetensors
+from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
+from rsjax.files import write_file
 
 METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported tokenizer
 

@@ -3,14 +3,13 @@
 A directory holds a tokenizer, a world model or both; training starts from it (``start_from``), as from a run.
 """
 
-import json
 from pathlib import Path
 
 import jax
 
 from rsjax.config import TokenizerConfig, to_dict
 from rsjax.convert.files import ConvertError
-from rsjax.files import disk_guard, read_json, write_atomically
+from rsjax.files import disk_guard, read_json, write_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -40,9 +39,9 @@ def save(directory: Path, config: TokenizerConfig | Architecture, params: Params
         (directory / place).parent.mkdir(parents=True, exist_ok=True)
         # Stopped in between, there is no such network rather than one's settings beside another's weights.
         if settings.pop(section, None) is not None:
-            write_atomically(path, json.dumps(settings, indent=1).encode())
+            write_json(path, settings)
         save_weights(directory / place, params)
-        write_atomically(path, json.dumps(settings | {section: to_dict(config)}, indent=1).encode())
+        write_json(path, settings | {section: to_dict(config)})
 
 
 def load_tokenizer(directory: Path) -> tuple[TokenizerConfig, Params]:

@@ -9,7 +9,7 @@ import safetensors
 import safetensors.numpy
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import write_file
 
 Tensors = dict[str, np.ndarray]
 
@@ -41,21 +41,10 @@ def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
 
 
 def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
-    """Writes a safetensors file atomically. Errors as in :func:`write_file`."""
+    """Writes a safetensors file atomically. Errors as in :func:`rsjax.files.write_file`."""
     # safetensors writes memory in its order, ignoring strides.
     contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
     write_file(path, safetensors.numpy.save(contiguous, metadata))
-
-
-def write_file(path: Path, payload: bytes) -> None:
-    """Writes a file atomically, with its parent directories.
-
-    Raises:
-        FileError: the disk is full, or the directory is not writable.
-    """
-    with disk_guard(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, payload)
 
 
 def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:

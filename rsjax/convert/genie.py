@@ -12,6 +12,7 @@ import jax
 
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
+from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.trainable import Params
@@ -59,20 +60,15 @@ def read_settings(weights: Path) -> dict[str, Any]:
     """Reads the GenieConfig beside a file of weights; returns an empty dict if there is none.
 
     Raises:
-        ConvertError: the file is damaged or is not a GenieConfig.
+        UserError: the file is damaged or is not a GenieConfig.
     """
     path = weights.parent / CONFIG
     if not path.exists():
         return {}
-    try:
-        settings = json.loads(path.read_text())
-    except ValueError as error:
-        raise ConvertError(f"{path}: not JSON ({error})") from error
-    if not isinstance(settings, dict) or not settings.keys() & {"num_layers", "num_heads"}:
-        raise ConvertError(
-            f"{path}: not a GenieConfig; it has neither num_layers nor num_heads; put the published one beside "
-            f"{weights.name}, or delete it"
-        )
+    cure = f"put the published one beside {weights.name}, or delete it"
+    settings = read_json(path, cure=cure)
+    if not settings.keys() & {"num_layers", "num_heads"}:
+        raise ConvertError(f"{path}: not a GenieConfig; it has neither num_layers nor num_heads; {cure}")
     return settings
 
 

@@ -69,6 +69,17 @@ def spread(source: Sized, count: int) -> list[int]:
     return np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int)).tolist()
 
 
+def first_clip(store: Store) -> Record:
+    """Returns the first readable record of a store's train split.
+
+    Raises:
+        StoreError: none can be read.
+    """
+    for _, record in readable(store.source("train"), tell=lambda _: None):
+        return record
+    raise StoreError(f"{store.path}: no clip of its train split can be read; get it again")
+
+
 def readable(
     source: RecordSource, numbers: Iterable[int] | None = None, tell: Callable[[str], None] = note
 ) -> Iterator[tuple[int, Record]]:

@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from rsjax.config import Config, DataConfig
-from rsjax.data.clips import readable
-from rsjax.data.store import MANIFEST, Store, StoreError, open_store
+from rsjax.data.clips import first_clip
+from rsjax.data.store import MANIFEST, StoreError, open_store
 
 
 def on_store(config: Config, path: Path) -> Config:
@@ -17,21 +17,7 @@ def on_store(config: Config, path: Path) -> Config:
         StoreError: the store is missing, is not of clips, or has no content key.
         ConfigError: the model or the tokenizer does not fit its clips; the message names the fields.
     """
-    return replace(config, data=_data(open_store(path)))
-
-
-def relocated(config: Config, path: Path) -> Config:
-    """Returns the configuration of a run with the new path of its store, which was moved.
-
-    Raises:
-        StoreError: the store is missing, or the run's clips were simulated.
-    """
-    if not config.data.key:
-        raise StoreError(f"{path}: this run's clips were simulated; name their directory with --data-dir")
-    return replace(config, data=replace(config.data, store=str(open_store(path).path.absolute())))
-
-
-def _data(store: Store) -> DataConfig:
+    store = open_store(path)
     manifest, where = store.manifest, store.path / MANIFEST
     if manifest.get("kind") != "clips" or not manifest.get("key"):
         raise StoreError(
@@ -44,10 +30,8 @@ def _data(store: Store) -> DataConfig:
             f"{where}: {counts['train']} train and {counts['test']} test clips; training takes one and two at least: "
             f"ingest it with a larger --test-share, or more episodes"
         )
-    clip = next((record for _, record in readable(store.source("train"), tell=lambda _: None)), None)
-    if clip is None:
-        raise StoreError(f"{store.path}: no clip of its train split can be read; get it again")
-    return DataConfig(
+    clip = first_clip(store)
+    data = DataConfig(
         store=str(store.path.absolute()),
         key=manifest["key"],
         frames=len(clip["rgb"]),
@@ -56,3 +40,15 @@ def _data(store: Store) -> DataConfig:
         action_dim=clip["actions"].shape[1],
         test_clips=counts["test"],
     )
+    return replace(config, data=data)
+
+
+def relocated(config: Config, path: Path) -> Config:
+    """Returns the configuration of a run with the new path of its store, which was moved.
+
+    Raises:
+        StoreError: the store is missing, or the run's clips were simulated.
+    """
+    if not config.data.key:
+        raise StoreError(f"{path}: this run's clips were simulated; name their directory with --data-dir")
+    return replace(config, data=replace(config.data, store=str(open_store(path).path.absolute())))

@@ -17,7 +17,7 @@ import jax
 import rsjax
 from rsjax.config import to_dict
 from rsjax.data.store import MANIFEST
-from rsjax.files import disk_guard, read_json, write_atomically
+from rsjax.files import read_json, write_json
 from rsjax.pipeline.run import Run
 
 NAME = "run.json"
@@ -61,7 +61,7 @@ def record_start(run: Run, command: str) -> list[str]:
         "data": data_fingerprints(run),
     }
     starts = read_starts(run.directory)
-    _write(run.directory, [*starts, now])
+    write_json(run.directory / NAME, [*starts, now])
     before = starts[-1] if starts else {}
     return [name for name in DECIDE if any(_differ(old, now[name].get(k)) for k, old in before.get(name, {}).items())]
 
@@ -77,12 +77,7 @@ def record_data(run: Run) -> None:
     """Updates the last start's entry with the data that it has made since."""
     starts = read_starts(run.directory)
     if starts:
-        _write(run.directory, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
-
-
-def _write(directory: Path, starts: list[dict[str, Any]]) -> None:
-    with disk_guard(directory):
-        write_atomically(directory / NAME, json.dumps(starts, indent=1).encode())
+        write_json(run.directory / NAME, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
 
 
 def data_fingerprints(run: Run) -> dict[str, Any]:

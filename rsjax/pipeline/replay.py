@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,9 +55,10 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
     setup = tokenizer_setup(run) if stage == "tokenizer" else world_model_setup(run)
     state, sources = _newest(setup, run.directory / stage), rows[step]["records"]
     batch = setup.to_batch(setup.loader.replay(rows[step]["data"]))
+    clips = jax.tree.map(lambda x: x.reshape(len(sources), -1, *x.shape[1:]), batch)
     key = jax.random.fold_in(jax.random.key(setup.loop.seed + 1), step - 1)
     for number, source in enumerate(sources):
-        part = jax.tree.map(partial(_rows, number, len(sources)), batch)
+        part = jax.tree.map(itemgetter(number), clips)
         context = StepContext(jnp.int32(step - 1), state.extra, None)
         scalars = _measure(setup.model, state.params, part, key, context)
         yield Clip(source, {name: float(value) for name, value in scalars.items()})
@@ -74,11 +76,6 @@ def _newest(setup: Setup, directory: Path) -> TrainState:
         checkpoints.close()
 
 
-def _rows(number: int, clips: int, x: Array) -> Array:
-    size = len(x) // clips
-    return x[number * size : (number + 1) * size]
-
-
 @partial(jax.jit, static_argnums=0)
 def _measure(model: Trainable[Any], params: Params, batch: Any, key: Array, context: StepContext) -> dict[str, Array]:
     def loss(params: Params) -> tuple[Array, dict[str, Array]]:
@@ -93,5 +90,5 @@ def skipped_steps(run: Run, stage: str) -> list[str]:
     """Returns a line for each skipped step."""
     return [
         f"step {row['step']}: loss {row['loss']}, gradient {row['grad_norm']}, {len(row['records'])} clips"
-        for row in read_skipped(Path(run.directory) / stage)
+        for row in read_skipped(run.directory / stage)
     ]

@@ -18,7 +18,7 @@ from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_s
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import write_json
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
@@ -34,6 +34,7 @@ OUTPUTS = {  # in the run directory; clips are elsewhere, and "tokens" is a link
     "evaluation": "evaluation/result.msgpack",
     "report": "report.html",
 }
+MARK = "stage.json"
 RECIPE = 1  # increase it when the same configuration gives new results
 
 
@@ -130,27 +131,22 @@ class Run:
                         f"({self._differences(stage)}); choose another --run-dir, or train it again with --overwrite"
                     )
                 shutil.rmtree(self.directory / stage)
-        with disk_guard(self.directory):
-            self.directory.mkdir(parents=True, exist_ok=True)
-            write_atomically(self.directory / "config.json", json.dumps(to_dict(self.config), indent=1).encode())
+        write_json(self.directory / "config.json", to_dict(self.config))
 
     def _differences(self, stage: str) -> str:
         """Describes the fields that differ from the saved stage's, except those without effect on results."""
         try:
-            saved = _flat(to_dict(from_dict(Config, json.loads((self.directory / "config.json").read_text()))))
+            saved = from_dict(Config, json.loads((self.directory / "config.json").read_text()))
         except ConfigError as error:
             return f"of another version: {error}"
         except (OSError, ValueError, TypeError):
             return "its config.json is missing or damaged"
-        here, free = _flat(to_dict(self.config)), _free_fields(self.config)
-        names = [
-            name
-            for name in here | saved
-            if here.get(name) != saved.get(name) and name not in free and name.partition(".")[0] in DECIDED_BY[stage]
-        ]
-        return "; ".join(f"{name} is {_shown(saved, name)} there, {_shown(here, name)} here" for name in names) or (
-            "older code"
+        there, here = (
+            {name: value for part in DECIDED_BY[stage] for name, value in _deciding(getattr(config, part), part)}
+            for config in (saved, self.config)
         )
+        pairs = {name: (there.get(name, "not set"), here.get(name, "not set")) for name in here | there}
+        return "; ".join(f"{name} is {a} there, {b} here" for name, (a, b) in pairs.items() if a != b) or "older code"
 
     def output(self, stage: str) -> Path:
         """Returns the path of the stage's output, a file or directory that is written atomically."""
@@ -159,12 +155,10 @@ class Run:
     def finished(self, stage: str) -> bool:
         """Returns whether the stage's output exists and was made by this configuration."""
         mark = self.mark(stage)
-        done = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
-        if not (done and self.output(stage).exists()):
-            return False
-        return stage != "tokens" or self._has_its_tokens()
-
-    def _has_its_tokens(self) -> bool:
+        marked = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
+        done = marked and self.output(stage).exists()
+        if not done or stage != "tokens":
+            return done
         try:
             manifest = json.loads((self.output("tokens") / MANIFEST).read_text())
         except (OSError, ValueError):
@@ -174,12 +168,9 @@ class Run:
     def mark(self, stage: str) -> dict[str, Any]:
         """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started."""
         try:
-            return json.loads(self._mark_path(stage).read_text())
+            return json.loads((self.directory / stage / MARK).read_text())
         except (OSError, ValueError):
             return {}
-
-    def _mark_path(self, stage: str) -> Path:
-        return self.directory / stage / "stage.json"
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Path]:
@@ -199,39 +190,21 @@ class Run:
             self._write_mark(stage, before + time.monotonic() - began, finished)
 
     def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
-        path = self._mark_path(stage)
         content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
-        with disk_guard(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, json.dumps(content).encode())
+        write_json(self.directory / stage / MARK, content)
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns values by dotted names, such as ``train.curriculum.0.epochs``."""
-    out: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, list) and any(isinstance(item, dict) for item in value):
-            value = {str(i): item for i, item in enumerate(value)}
-        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return out
-
-
-def _shown(values: dict[str, Any], name: str) -> Any:
-    value = values.get(name, "not set")
-    return "empty" if value == "" else value
-
-
-def _free_fields(config: Any, prefix: str = "") -> set[str]:
-    names: set[str] = set()
-    for field in fields(config):
-        value, name = getattr(config, field.name), prefix + field.name
-        if field.metadata.get("runtime"):
-            names.add(name)
-        elif field.metadata.get("sampling"):
-            names |= set(_flat({name: to_dict(value)}))
-        elif is_dataclass(value):
-            names |= _free_fields(value, f"{name}.")
-    return names
+def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yields the fields that decide results, by dotted name such as ``train.curriculum.0.epochs``."""
+    if isinstance(value, tuple) and any(map(is_dataclass, value)):
+        for i, item in enumerate(value):
+            yield from _deciding(item, f"{name}.{i}")
+    elif is_dataclass(value):
+        decide = [field.name for field in fields(value) if not field.metadata.keys() & {"runtime", "sampling"}]
+        for key in ["family"] * hasattr(value, "family") + decide:
+            yield from _deciding(getattr(value, key), f"{name}.{key}")
+    else:
+        yield name, "empty" if value == "" else value
 
 
 def link(target: Path, at: Path) -> None:

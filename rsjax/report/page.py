@@ -1,6 +1,5 @@
 """Writes a run's HTML report: one self-contained page without scripts."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,10 +9,12 @@ import jinja2
 from markupsafe import Markup
 
 from rsjax.evaluation.registry import metrics
+from rsjax.files import write_file
+from rsjax.progress import duration
 from rsjax.report.curves import curves_svg
 from rsjax.report.figures import ClipFigure, animation, filmstrip, keypoints
 from rsjax.report.targets import judge
-from rsjax.report.video import animation_uri, webp_uri, write_file
+from rsjax.report.video import animation_uri, webp_uri
 
 _HEADLINE_CLIPS = 2  # clips whose animations head the page
 _FPS = 4.0
@@ -59,7 +60,7 @@ class Report:
     show_targets: bool = True
 
 
-def write_report(path: Path | str, report: Report) -> None:
+def write_report(path: Path, report: Report) -> None:
     """Writes the page atomically.
 
     Raises:
@@ -90,7 +91,7 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["duration"] = _duration
+    environment.filters["duration"] = duration
     return environment
 
 
@@ -135,10 +136,3 @@ def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tu
         if isinstance(value, Mapping):
             sections |= _settings(value, key if name == "run" else f"{name}.{key}")
     return sections
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(math.floor(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from rsjax.files import write_atomically
+from rsjax.files import write_file
 
 Resample = Literal["nearest", "bicubic"]
 
@@ -22,7 +22,7 @@ _H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
 _TURBO = np.round(matplotlib.colormaps["turbo"](np.linspace(1, 0, 256))[:, :3] * 255).astype(np.uint8)
 
 
-def write_mp4(path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
+def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
     """Writes an H.264 (yuv420p) video that browsers and players can open.
 
     Args:
@@ -48,17 +48,10 @@ def write_mp4(path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float
     write_file(path, buffer.getvalue())
 
 
-def write_gif(path: Path | str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
+def write_gif(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
     """Writes a GIF that loops and shows its last frame longer. Arguments and errors as in :func:`write_mp4`."""
     _check(frames, fps)
     write_file(path, _encode_animation("GIF", resize(frames, upscale, "nearest"), fps))
-
-
-def write_file(path: Path | str, payload: bytes) -> None:
-    """Writes a file atomically, with its parent directories."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, payload)
 
 
 def webp_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:

@@ -30,7 +30,7 @@ class BatchNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
-        scale = self.param("scale", _near_one, x.shape[-1:])
+        scale = self.param("scale", lambda key: 1 + 0.02 * jax.random.normal(key, x.shape[-1:]))
         bias = self.param("bias", nn.initializers.zeros, x.shape[-1:])
         mean = self._over_batch(x)
         variance = self._over_batch(jnp.square(x - mean))
@@ -74,7 +74,3 @@ def _conv(features: int, index: int, stride: int = 1, bias: bool = False) -> nn.
         kernel_init=nn.initializers.normal(0.02),
         name=f"main_{index}",
     )
-
-
-def _near_one(key: Array, shape: tuple[int, ...]) -> Float[Array, " C"]:
-    return 1.0 + 0.02 * jax.random.normal(key, shape)

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from rsjax.data.clips import readable
+from rsjax.data.clips import first_clip, readable
 from rsjax.data.codec import Record
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
@@ -43,7 +43,9 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
     Raises:
         StoreError: clips have another size than the tokenizer's images, too many are damaged, or the disk is full.
     """
-    _check_size(clips, image_size)
+    side = first_clip(clips)["rgb"].shape[1]
+    if side != image_size:
+        raise StoreError(f"{clips.path}: its pictures have {side} pixels a side, the tokenizer takes {image_size}")
     (place / QUARANTINE).unlink(missing_ok=True)  # all clips are checked again
     tokenizer = tokenizer_key(codec.config, fingerprint(codec.params))
     key = tokens_key(str(clips.manifest.get("key")), tokenizer)
@@ -56,15 +58,6 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
         if not _is_made(out, key, clips):
             _write(out, clips, codec, key)
     return _listed(out, clips, max_damaged, place)
-
-
-def _check_size(clips: Store, size: int) -> None:
-    clip = next((record for _, record in readable(clips.source("train"), tell=lambda _: None)), None)
-    if clip is None:
-        raise StoreError(f"{clips.path}: no clip of its train split can be read; get it again")
-    side = clip["rgb"].shape[1]
-    if side != size:
-        raise StoreError(f"{clips.path}: its pictures have {side} pixels a side, the tokenizer takes {size}")
 
 
 def _is_made(out: Path, key: str, clips: Store) -> bool:

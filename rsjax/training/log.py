@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import disk_guard, write_file
 from rsjax.training.tensorboard import TensorBoardWriter
 from rsjax.training.wandb_run import WandbRun
 
@@ -38,8 +38,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Writes a file of JSON lines, atomically."""
-    write_atomically(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+    """Writes a file of JSON lines as :func:`rsjax.files.write_file` does."""
+    write_file(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
 def read_log(directory: Path) -> list[dict[str, Any]]:
@@ -98,8 +98,7 @@ class ScalarLog:
         buffer = io.BytesIO()
         Image.fromarray(image).save(buffer, "PNG")
         with disk_guard(self._directory):
-            path.parent.mkdir(exist_ok=True)
-            write_atomically(path, buffer.getvalue())
+            write_file(path, buffer.getvalue())
             for view in self._views:
                 view.image(step, name, image)
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from rsjax.files import disk_guard
 from rsjax.training.log import read_rows, write_rows
 
 NAME = "skipped.jsonl"
@@ -31,7 +30,7 @@ class SkippedSteps:
         self._path = directory / NAME
         self._rows = [row for row in read_skipped(directory) if row["step"] <= start]
         if self._path.exists():
-            self._write()
+            write_rows(self._path, self._rows)
 
     def add(self, step: int, scalars: dict[str, float], records: list[dict[str, Any]], data: dict[str, Any]) -> None:
         """Adds a step.
@@ -41,8 +40,4 @@ class SkippedSteps:
         """
         reason = {name: str(scalars[name]) for name in ("loss", "grad_norm")}
         self._rows.append({"step": step, **reason, "records": records, "data": data})
-        self._write()
-
-    def _write(self) -> None:
-        with disk_guard(self._path):
-            write_rows(self._path, self._rows)
+        write_rows(self._path, self._rows)

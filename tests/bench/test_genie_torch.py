@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rsjax.bench.torch_part import check_plain
 from rsjax.config import ConfigError, OptimizerConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -104,7 +105,5 @@ def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(par
 
 
 def test_what_the_public_code_has_not_is_refused() -> None:
-    from rsjax.bench.genie_torch import GenieTorch
-
     with pytest.raises(ConfigError, match="model.final_norm is on"):
-        GenieTorch(dataclasses.replace(TOY, final_norm=True))
+        check_plain(dataclasses.replace(TOY, final_norm=True))

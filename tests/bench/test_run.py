@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from rsjax.bench import feed, parts
+from rsjax.bench import parts
 from rsjax.bench.run import PARTS, bench, ratios, table
 from rsjax.config import Config, ConfigError, presets
 from rsjax.config.leaves import with_values
@@ -93,11 +93,11 @@ def test_steps_wait_for_a_slow_loader_and_not_for_a_quick_one(
         return state, {}
 
     sharding = SimpleNamespace(compile=lambda *_: step, put_batch=lambda batch: time.sleep(batch_s))
-    monkeypatch.setattr(feed.Sharding, "create", lambda loop: sharding)
-    monkeypatch.setattr(feed, "create_state", lambda model, loop: 0)
+    monkeypatch.setattr(parts.Sharding, "create", lambda loop: sharding)
+    monkeypatch.setattr(parts, "create_state", lambda model, loop: 0)
     measured = bench(toy(), only=["feed"], budget=0.0)
     assert low < measured["data_wait_share"] < high
-    assert (measured["feed_steps"], measured["feed_batch"]) == (feed.LEAST, toy().train.batch_size)
+    assert (measured["feed_steps"], measured["feed_batch"]) == (parts.LEAST, toy().train.batch_size)
 
 
 def test_rollouts_begin_with_one_frame_whatever_the_preset_trains_with(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import pytest
 from rsjax.convert.files import ConvertError
 from rsjax.convert.genie import from_public, infer_config, read_settings, settings_of, table
 from rsjax.convert.table import public_shapes, to_tensors
+from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from tests.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
@@ -96,7 +97,7 @@ def test_settings_are_read_from_beside_the_weights(tmp_path: Path) -> None:
     assert read_settings(source(tmp_path)) == SETTINGS
     for damaged in ("{", "[1]"):
         beside.write_text(damaged)
-        with pytest.raises(ConvertError, match="config.json"):
+        with pytest.raises(UserError, match="config.json"):
             read_settings(source(tmp_path))
 
 
