@@ -139,13 +139,9 @@ def _make(maker: Run, run: Run, name: str) -> None:
     for before in (before for before in SHARED[: SHARED.index(name)] if before in run.stages):
         link_stage(run, maker, before)
     note(f"for all cells that share it, in {maker.directory}: {name.replace('_', ' ')}")
+    train = {"tokenizer": stages.train_tokenizer, "world_model": stages.train_world_model}
     with maker.stage(name):
-        if name == "tokenizer":
-            stages.train_tokenizer(maker, resume=True)
-        elif name == "tokens":
-            stages.prepare(maker)
-        else:
-            stages.train_world_model(maker, resume=True)
+        train[name](maker, resume=True) if name in train else stages.prepare(maker)
 
 
 def link_stage(source: Run, run: Run, name: str) -> None:
@@ -170,7 +166,6 @@ def link_stage(source: Run, run: Run, name: str) -> None:
 
 
 def _hard_link(path: str, to: str) -> bool:
-    """Whether the file system made the link."""
     try:
         os.link(path, to)
     except OSError:

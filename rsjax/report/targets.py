@@ -1,11 +1,10 @@
 """Quality targets of the ``tiny`` preset on test episodes, judged from a run's flat metrics."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(NamedTuple):
     """A lower (or upper) bound on a quantity computed from metrics."""
 
     name: str
@@ -15,21 +14,12 @@ class Target:
     unit: str = "dB"
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """A target and its measurement. A negative ``margin`` is the amount by which the target was missed."""
 
     target: Target
     measured: float
-
-    @property
-    def margin(self) -> float:
-        difference = self.measured - self.target.bound
-        return difference if self.target.at_least else -difference
-
-    @property
-    def met(self) -> bool:
-        return self.margin >= 0
+    margin: float
 
 
 TARGETS = (
@@ -53,7 +43,9 @@ def judge(metrics: Mapping[str, float]) -> list[Verdict]:
     verdicts = []
     for target in TARGETS:
         try:
-            verdicts.append(Verdict(target, float(target.measure(metrics))))
+            measured = float(target.measure(metrics))
         except KeyError:
             continue  # not measured: a model without a depth branch, for example
+        margin = measured - target.bound if target.at_least else target.bound - measured
+        verdicts.append(Verdict(target, measured, margin))
     return verdicts

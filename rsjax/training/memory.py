@@ -1,6 +1,5 @@
 """Memory that a process uses."""
 
-import os
 from pathlib import Path
 
 import jax
@@ -15,18 +14,11 @@ def memory_scalars() -> dict[str, float]:
     device without such counts, such as a CPU, those of the process. ``host_gib`` is the process's resident set; 0 if
     the operating system is not Linux.
     """
-    host, host_peak = _resident_set()
+    host, host_peak, status = 0, 0, Path("/proc/self/status")
+    if status.exists():  # psutil has no peak
+        fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        host, host_peak = (int(fields[name].split()[0]) * 1024 for name in ("VmRSS", "VmHWM"))
     stats = [device.memory_stats() or {} for device in jax.local_devices()]
     now = max((s["bytes_in_use"] for s in stats if "bytes_in_use" in s), default=host)
     peak = max((s["peak_bytes_in_use"] for s in stats if "peak_bytes_in_use" in s), default=host_peak)
     return {"device_gib": now / GIB, "device_peak_gib": max(now, peak) / GIB, "host_gib": host / GIB}
-
-
-def _resident_set() -> tuple[int, int]:
-    """Returns the bytes of this process that are in memory, now and at the peak, which psutil does not have."""
-    path = Path(f"/proc/{os.getpid()}/status")
-    if not path.exists():
-        return 0, 0
-    fields = dict(line.split(":", 1) for line in path.read_text().splitlines())
-    now, peak = (int(fields[name].split()[0]) * 1024 for name in ("VmRSS", "VmHWM"))
-    return now, peak
