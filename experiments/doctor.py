@@ -79,7 +79,8 @@ def main() -> None:
         for kind, count in counts.items():
             table.add_row(kind, str(count), KINDS[kind])
         console.print(table, soft_wrap=False)
-    total, bad = len(diagnosis.refs), diagnosis.bad()
+    reasons, total = diagnosis.reasons(), len(diagnosis.refs)
+    bad = sum(name in reasons for name, _ in diagnosis.refs)
     common = [kind for kind, count in counts.items() if count == total]
     for kind in common:
         console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")
@@ -88,7 +89,7 @@ def main() -> None:
         console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
     if options.fix is not None:
         about = f"{source.name} {options.path or options.what}"
-        kept, out = write_selection(options.fix, about, diagnosis.refs, diagnosis.reasons())
+        kept, out = write_selection(options.fix, about, diagnosis.refs, reasons)
         line = f"{options.fix}: keeps {kept}, leaves out {out}"
         if not kept:
             cure = " ".join(common) or "the kinds that are as they should be"

@@ -157,7 +157,7 @@ def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np
     before = np.concatenate([rows[:1], rows[:-1]])
     for first in layout.quaternions:
         part = slice(first, first + 4)
-        steps[:, part] = _shorter_way(_product(_inverse(_unit(before[:, part])), _unit(rows[:, part])))
+        steps[:, part] = _shorter_way(_product(_unit(before[:, part]) * [-1.0, -1.0, -1.0, 1.0], _unit(rows[:, part])))
     for held in layout.held:
         steps[:, held] = rows[:, held]
     return steps
@@ -191,10 +191,6 @@ def _unit(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"
     """Scales to length 1; zeros, which fill up damaged data, become no rotation."""
     length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.where(length > 0, quaternion / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])
-
-
-def _inverse(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
-    return quaternion * [-1.0, -1.0, -1.0, 1.0]
 
 
 def _shorter_way(turn: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:

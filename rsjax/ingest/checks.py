@@ -102,15 +102,13 @@ def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], 
         problems += _depth(name, maps, limits.frames)
     if not episode.task.strip():
         problems.append(("no-task", "its task is empty"))
-    return [Finding(episode.id, kind, detail) for kind, detail in problems], _stats(episode, first)
-
-
-def _stats(episode: Episode, first: UInt8[np.ndarray, "H W 3"] | None) -> EpisodeStats:
     states = np.zeros((0, 0), np.float32) if episode.states is None else episode.states
-    content = b"" if first is None else first.tobytes() + episode.actions.tobytes() + states.tobytes()
-    digest = hashlib.sha256(content).digest() if content else None
-    steps = np.diff(states, axis=0)
-    return EpisodeStats(digest, tuple(episode.cameras), _largest(episode.actions[1:]), _largest(steps))
+    digest = None
+    if first is not None:
+        digest = hashlib.sha256(first.tobytes() + episode.actions.tobytes() + states.tobytes()).digest()
+    reach, jump = _largest(episode.actions[1:]), _largest(np.diff(states, axis=0))
+    stats = EpisodeStats(digest, tuple(episode.cameras), reach, jump)
+    return [Finding(episode.id, kind, detail) for kind, detail in problems], stats
 
 
 def _largest(rows: Float[np.ndarray, "N n"]) -> Float32[np.ndarray, " n"]:

@@ -47,11 +47,6 @@ class Diagnosis:
             affected[kind] += episodes[name]
         return {kind: affected[kind] for kind in KINDS if affected[kind]}
 
-    def bad(self) -> int:
-        """Counts the episodes that have a finding."""
-        reasons = self.reasons()
-        return sum(name in reasons for name, _ in self.refs)
-
     def reasons(self) -> dict[str, list[str]]:
         """Returns the findings of each episode that has some, as text by its id."""
         reasons: dict[str, list[str]] = {}

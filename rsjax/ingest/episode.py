@@ -8,6 +8,7 @@ Axes: N recorded frames, H×W pixels, A action dimensions, S state dimensions.
 
 import errno
 import hashlib
+import itertools
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -80,6 +81,12 @@ class Segment:
     end: int
     text: str
     skill: str = ""
+
+
+def runs(texts: Sequence[str]) -> list[Segment]:
+    """Returns a segment for each run of frames with the same text."""
+    starts = [row for row, text in enumerate(texts) if row == 0 or text != texts[row - 1]]
+    return [Segment(start, end, texts[start]) for start, end in itertools.pairwise([*starts, len(texts)])]
 
 
 class Frames(Protocol):
@@ -227,11 +234,6 @@ def regular(path: Path) -> Path:
     return path
 
 
-def _bytes(text: str) -> bytes:
-    """Encodes as UTF-8, including the bytes of a file's name that are not UTF-8."""
-    return text.encode("utf-8", "surrogatepass")
-
-
 def fingerprint(paths: Sequence[Path], *values: object) -> str:
     """Returns 16 hex digits of files and values. A missing file counts too; folders do not, so a data set may be moved.
 
@@ -239,22 +241,19 @@ def fingerprint(paths: Sequence[Path], *values: object) -> str:
     """
     digest = hashlib.sha256(repr(values).encode())
     for path in paths:
-        digest.update(_file_digest(*_stamp(path)))
+        try:
+            status = path.stat()
+            digest.update(_file_digest(path, status.st_size, status.st_mtime_ns))
+        except OSError:
+            digest.update(_file_digest(path, -1, 0))
     return digest.hexdigest()[:16]
-
-
-def _stamp(path: Path) -> tuple[Path, int, int]:
-    try:
-        status = path.stat()
-    except OSError:
-        return path, -1, 0
-    return path, status.st_size, status.st_mtime_ns
 
 
 @lru_cache(maxsize=1024)  # one file may contain hundreds of episodes
 def _file_digest(path: Path, size: int, modified: int) -> bytes:
     large = size > _WHOLE
-    digest = hashlib.sha256(_bytes(f"{path.name} {size} {modified if large else ''}"))
+    name = f"{path.name} {size} {modified if large else ''}"
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass"))  # names of files need not be UTF-8
     try:
         with regular(path).open("rb") as file:
             digest.update(file.read(_EDGE if large else _WHOLE))

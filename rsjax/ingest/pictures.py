@@ -1,105 +1,85 @@
 """Pictures and depth maps that are stored one by one or are in memory, behind the interface that videos have too."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, reason
 
 _NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # JPEG markers of tables, between the markers of frame headers
 
 
+@dataclass(frozen=True, eq=False)
 class ArrayFrames:
-    """Pictures in memory, as :class:`rsjax.ingest.episode.Frames`."""
+    """Pictures in memory, as :class:`rsjax.ingest.episode.Frames`, or depth maps, float32 [N, H, W], as ``Depths``."""
 
-    def __init__(self, pictures: UInt8[np.ndarray, "N H W 3"]) -> None:
-        self.pictures = pictures
+    pictures: UInt8[np.ndarray, "N H W 3"] | Float32[np.ndarray, "N H W"]
 
     def __len__(self) -> int:
         return len(self.pictures)
 
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """Returns these pictures."""
+    def read(self, indices: Sequence[int]) -> np.ndarray:
+        """Returns these pictures or maps."""
         return self.pictures[np.asarray(indices, np.int64)]
 
 
-class ArrayDepths:
-    """Depth maps in memory, as :class:`rsjax.ingest.episode.Depths`."""
-
-    def __init__(self, maps: Float[np.ndarray, "N H W"]) -> None:
-        self._maps = maps
-
-    def __len__(self) -> int:
-        return len(self._maps)
-
-    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """Returns these maps, in the unit of the array."""
-        return self._maps[np.asarray(indices, np.int64)].astype(np.float32)
-
-
+@dataclass(frozen=True, eq=False)
 class EncodedFrames:
     """PNG or JPEG pictures in memory, decoded when they are read, as :class:`rsjax.ingest.episode.Frames`.
 
-    Args:
+    Attributes:
         payloads: each frame's PNG or JPEG.
         where: the file and field that messages name.
     """
 
-    def __init__(self, payloads: Sequence[bytes], where: str) -> None:
-        self.payloads, self._where = list(payloads), where
+    payloads: Sequence[bytes]
+    where: str
 
     def __len__(self) -> int:
         return len(self.payloads)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
         """Returns these pictures; :class:`EpisodeError` names one that is damaged or of another size."""
-        return decode_pictures((f"{self._where} frame {index}", self.payloads[index]) for index in indices)
+        return decode_pictures((f"{self.where} frame {index}", self.payloads[index]) for index in indices)
 
 
+@dataclass(frozen=True, eq=False)
 class PictureFiles:
-    """One PNG or JPEG file per frame, as :class:`rsjax.ingest.episode.Frames`.
+    """One PNG or JPEG file per frame, as :class:`rsjax.ingest.episode.Frames`."""
 
-    Args:
-        paths: each frame's file.
-    """
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = list(paths)
+    paths: Sequence[Path]
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self.paths)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
         """Returns these pictures; :class:`EpisodeError` names one that is missing, damaged or of another size."""
-        return decode_pictures((path, _bytes(path)) for path in (self._paths[index] for index in indices))
+        return decode_pictures((path, _bytes(path)) for path in (self.paths[index] for index in indices))
 
 
+@dataclass(frozen=True, eq=False)
 class DepthFiles:
-    """One 16-bit PNG file per frame, as :class:`rsjax.ingest.episode.Depths`.
+    """One 16-bit PNG file per frame, in millimetres, as :class:`rsjax.ingest.episode.Depths`."""
 
-    Args:
-        paths: each frame's file.
-        unit: metres that a value of 1 stands for.
-    """
-
-    def __init__(self, paths: Sequence[Path], unit: float = 0.001) -> None:
-        self._paths, self._unit = list(paths), unit
+    paths: Sequence[Path]
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self.paths)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
         """Returns these maps in metres, 0 where nothing was measured; raises as :class:`PictureFiles`."""
-        return stack_pictures((path, self._depth(path)) for path in (self._paths[index] for index in indices))
+        return stack_pictures((path, _depth(path)) for path in (self.paths[index] for index in indices))
 
-    def _depth(self, path: Path) -> Float32[np.ndarray, "H W"]:
-        raw = _decode(_bytes(path), cv2.IMREAD_UNCHANGED, path)
-        if raw.dtype != np.uint16 or raw.ndim != 2:
-            raise EpisodeError.at(path, f"{raw.dtype} {raw.shape}, a depth map has 16 bits and one channel")
-        return raw.astype(np.float32) * np.float32(self._unit)
+
+def _depth(path: Path) -> Float32[np.ndarray, "H W"]:
+    raw = _decode(_bytes(path), cv2.IMREAD_UNCHANGED, path)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise EpisodeError.at(path, f"{raw.dtype} {raw.shape}, a depth map has 16 bits and one channel")
+    return raw.astype(np.float32) * np.float32(0.001)
 
 
 def decode_pictures(payloads: Iterable[tuple[Path | str, bytes]]) -> UInt8[np.ndarray, "n H W 3"]:
@@ -132,8 +112,12 @@ def stack_pictures(pictures: Iterable[tuple[Path | str, np.ndarray]]) -> np.ndar
 
 
 def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
+    """Decodes a picture, sides first: a few bytes can claim a picture of gigabytes."""
     problem = f"not a readable picture ({len(payload)} bytes)"
-    sides = _sides(payload)
+    if payload.startswith(b"\x89PNG\r\n\x1a\n"):
+        sides = _png_sides(payload)
+    else:
+        sides = _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
     if sides is None:
         raise EpisodeError.at(where, f"{problem}: neither a whole PNG nor a JPEG", kind="undecodable")
     if not 0 < sides[0] * sides[1] <= MAX_PIXELS:
@@ -145,13 +129,6 @@ def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
     if picture is None:
         raise EpisodeError.at(where, problem)
     return picture
-
-
-def _sides(payload: bytes) -> tuple[int, int] | None:
-    """Reads width and height of a PNG or JPEG before memory is taken: a few bytes can claim a picture of gigabytes."""
-    if payload.startswith(b"\x89PNG\r\n\x1a\n"):
-        return _png_sides(payload)
-    return _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
 
 
 def _png_sides(payload: bytes) -> tuple[int, int] | None:

@@ -88,8 +88,7 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
         EpisodeError: no frame is that near, or one frame is nearest to two of the times.
     """
     times = scan(path).times()
-    after = np.clip(np.searchsorted(times, seconds), 1, max(1, len(times) - 1))
-    after = np.minimum(after, len(times) - 1)
+    after = np.clip(np.searchsorted(times, seconds), min(1, len(times) - 1), len(times) - 1)
     before = np.maximum(after - 1, 0)
     numbers = np.where(np.abs(times[before] - seconds) <= np.abs(times[after] - seconds), before, after)
     away = np.abs(times[numbers] - seconds)
@@ -102,8 +101,7 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
             kind="time",
         )
     if (twice := np.flatnonzero(np.diff(numbers) <= 0)).size:
-        problem = f"rows {twice[0]} and {twice[0] + 1} of the table show the same frame"
-        raise EpisodeError.at(path, problem, kind="time")
+        raise EpisodeError.at(path, f"rows {twice[0]} and {twice[0] + 1} of the table show the same frame", kind="time")
     return VideoFrames(path, numbers.astype(np.int64))
 
 
@@ -127,8 +125,7 @@ def _scan(path: Path, size: int, modified: int) -> VideoIndex:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
         if not 0 < height * width <= MAX_PIXELS:
-            problem = f"its header says pictures of {width} × {height}"
-            raise EpisodeError.at(path, problem, kind="undecodable")
+            raise EpisodeError.at(path, f"its header says pictures of {width} × {height}", kind="undecodable")
         promised, time_base = stream.frames, stream.time_base
         packets = _packets(path, container)
     if not packets or time_base is None:
@@ -197,13 +194,6 @@ def _set_aside() -> None:
 
 
 os.register_at_fork(after_in_child=_set_aside)
-
-
-def close_all() -> None:
-    """Closes the files that this process keeps open."""
-    with _lock:
-        while _decoders:
-            _decoders.popitem()[1].close()
 
 
 @contextlib.contextmanager

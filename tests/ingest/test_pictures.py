@@ -32,7 +32,7 @@ def test_pictures_are_rgb_in_the_order_asked_for(tmp_path: Path) -> None:
 
 def test_depth_is_in_metres(tmp_path: Path) -> None:
     raw = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
-    frames = DepthFiles([write(tmp_path / "d.png", raw)], unit=0.001)
+    frames = DepthFiles([write(tmp_path / "d.png", raw)])
     np.testing.assert_allclose(frames.read([0])[0], raw / 1000, rtol=1e-6)
 
 

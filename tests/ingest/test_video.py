@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rsjax.ingest import video
 from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.video import VideoFrames, at_times, scan
-from tests.ingest.formats.videos import numbers_of, write_video
+from tests.ingest.formats.videos import close_videos, numbers_of, write_video
 
 
 @pytest.fixture(scope="module")
@@ -76,14 +76,14 @@ def test_frames_by_time(clip: Path) -> None:
 
 
 def test_files_kept_open_are_bounded(tmp_path: Path, clip: Path) -> None:
-    video.close_all()
+    close_videos()
     payload = clip.read_bytes()
     for number in range(video.OPEN_FILES + 3):
         copy = tmp_path / f"{number}.mp4"
         copy.write_bytes(payload)
         VideoFrames(copy).read([0])
     assert len(video._decoders) == video.OPEN_FILES
-    video.close_all()
+    close_videos()
 
 
 PROGRAM = """

@@ -20,7 +20,7 @@ from rsjax.ingest.ingest import ingest
 from rsjax.ingest.summary import IngestSummary
 from rsjax.ingest.windows import WindowConfig
 from rsjax.ingest.work_items import IngestPlan, Inputs, Records, Step
-from tests.ingest.videos import ArrayDepths
+from tests.ingest.videos import ArrayFrames
 
 FPS = 10.0
 CONFIG = ClipConfig(
@@ -170,7 +170,7 @@ class Relative(Annotator):
 
     def __call__(self, episode: Episode, camera: str) -> DepthMaps:
         frames = len(episode.timestamps)
-        return DepthMaps(ArrayDepths(np.full((frames, 12, 16), 3, np.float32)), "relative", (0.0, 1.0))
+        return DepthMaps(ArrayFrames(np.full((frames, 12, 16), 3, np.float32)), "relative", (0.0, 1.0))
 
     def load(self) -> None:
         if not self.loads:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsjax.ingest.episode import Episode, Segment
-from rsjax.ingest.pictures import ArrayDepths, ArrayFrames
+from rsjax.ingest.pictures import ArrayFrames
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.float32]:
@@ -48,7 +48,7 @@ def episode(
         actions=actions,
         states=None,
         cameras={"top": frames},
-        depth={} if depth is None else {"top": ArrayDepths(depth)},
+        depth={} if depth is None else {"top": ArrayFrames(depth.astype(np.float32))},
         segments=segments,
         meta={"actions": {"kind": "delta", "held": [1]}},
     )

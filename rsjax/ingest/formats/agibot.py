@@ -176,4 +176,4 @@ def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
     paths = [media(folder / name) for name in chosen]
     if len(paths) != count:
         return None, f"{len(paths)} depth maps for {count} frames" if paths else ""
-    return DepthFiles(paths, unit=0.001), ""
+    return DepthFiles(paths), ""

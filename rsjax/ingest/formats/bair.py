@@ -105,8 +105,7 @@ def _rows(example: Example, key: str, count: int) -> Float32[np.ndarray, "N n"]:
     rows = [example.numbers(f"{step}/{key}", 1) for step in range(count)]
     for step, row in enumerate(rows):
         if row.shape != rows[0].shape:
-            problem = f"{step}/{key} has {row.size} values, that of step 0 {rows[0].size}"
-            raise EpisodeError.at(example.where, problem)
+            raise EpisodeError.at(example.where, f"{step}/{key} has {row.size} values, that of step 0 {rows[0].size}")
     return np.concatenate(rows)
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -17,7 +18,6 @@ from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, fingerpr
 
 MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
 _MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share
-_WIDTHS = ("", *(f"{zero}{width}" for zero in ("", "0") for width in range(1, 10)))
 
 
 @contextmanager
@@ -68,7 +68,7 @@ def fill(template: str, **fields: int | str) -> str:
         for text, name, spec, conversion in Formatter().parse(template):
             filled.append(text)
             if name is not None:
-                if name not in fields or conversion or (spec and not (spec[-1:] == "d" and spec[:-1] in _WIDTHS)):
+                if name not in fields or conversion or not re.fullmatch("((0?[1-9])?d)?", spec or ""):
                     raise ValueError(f"field {name!r} with {spec!r}")
                 filled.append(format(fields[name], spec or ""))
     except ValueError as error:
@@ -234,12 +234,13 @@ def subfolders(path: Path) -> list[Path]:
         SourceError: the folder cannot be listed.
     """
     with looking(path):
-        folders = [entry for entry in path.iterdir() if _is_folder(entry) and not entry.name.startswith(".")]
+        folders = [
+            entry
+            for entry in path.iterdir()
+            if (entry.is_dir() or (entry.is_symlink() and not entry.exists() and not entry.suffix))
+            and not entry.name.startswith(".")
+        ]
     return sorted(folders, key=lambda entry: (not entry.name.isdecimal(), len(entry.name), entry.name))
-
-
-def _is_folder(path: Path) -> bool:
-    return path.is_dir() or (path.is_symlink() and not path.exists() and not path.suffix)
 
 
 def near(path: Path, pattern: str) -> list[Path]:

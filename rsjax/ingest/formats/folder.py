@@ -200,8 +200,7 @@ def _actions(rows: Float32[np.ndarray, "N A"], count: int, after: bool, path: Pa
     if not after and len(rows) == count - 1:
         rows = np.concatenate([rows, rows[-1:]])
     if len(rows) != count:
-        problem = f"{len(rows)} rows of actions for {count} pictures"
-        raise EpisodeError.at(path, problem, "one row per frame", "length")
+        raise EpisodeError.at(path, f"{len(rows)} rows of actions for {count} pictures", "one row per frame", "length")
     return align_actions(rows, after)
 
 

@@ -105,8 +105,7 @@ def read_table(path: Path) -> pa.Table:
     if path.suffix.lower() == ".npy":
         array = load_npy(path)
         if array.ndim != 2 or not array.size:
-            problem = f"shape {array.shape}, should be (frames, action dimensions)"
-            raise EpisodeError.at(path, problem, "save it again")
+            raise EpisodeError.at(path, f"shape {array.shape}, should be (frames, action dimensions)", "save it again")
         return pa.table({"action": array.astype(np.float32).tolist()})
     if path.suffix.lower() == ".parquet":
         return parquet_columns(path)

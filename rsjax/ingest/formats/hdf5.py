@@ -68,72 +68,45 @@ def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
     return values[:, None] if values.ndim == 1 else values
 
 
-class _Pictures:
-    """The pictures of a data set; subclasses say which shapes and types they can read."""
-
-    expected: str
-
-    def __init__(self, path: Path, key: str, turned: bool = False) -> None:
-        self._path, self._key, self._turned = path, key, turned
-        with open_file(path) as file:
-            data = member(file, key, path)
-            if not isinstance(data, h5py.Dataset) or data.shape is None:
-                raise EpisodeError.at(path, f"{key} is no array", f"render it again or {LEAVE_OUT}")
-            shape, kind = data.shape, data.dtype
-        if not self._fits(shape, kind) or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
-            raise EpisodeError.at(path, f"{key} is {kind} {shape}, should be {self.expected}", "render it again")
-        self._count = int(shape[0])
-
-    @staticmethod
-    def _fits(shape: tuple[int, ...], kind: np.dtype) -> bool:
-        raise NotImplementedError
-
-    def __len__(self) -> int:
-        return self._count
-
-    def read(self, indices: Sequence[int]) -> np.ndarray:
-        """Returns these pictures, upright; :class:`EpisodeError` if the file is damaged."""
-        wanted, order = np.unique(np.asarray(indices, np.int64), return_inverse=True)  # h5py wants them increasing
-        with open_file(self._path) as file:
-            pictures = file[self._key][wanted][order]
-        return np.ascontiguousarray(pictures[:, ::-1, ::-1]) if self._turned else pictures
-
-
-class H5Frames(_Pictures):
-    """Pictures in an HDF5 file, as :class:`rsjax.ingest.episode.Frames`.
+class H5Frames:
+    """Pictures in an HDF5 file, as :class:`rsjax.ingest.episode.Frames`, or depth maps, as ``Depths``.
 
     Args:
         path: the file.
-        key: of the data set, uint8 [N, H, W, 3].
+        key: of the data set: pictures, uint8 [N, H, W, 3]; depth maps, floats [N, H, W] or [N, H, W, 1] in metres.
         turned: whether they are upside down, by half a turn.
+        depth: whether they are depth maps.
 
     Raises:
         EpisodeError: the data set has another shape or type.
     """
 
-    expected = "uint8 (N, H, W, 3)"
+    def __init__(self, path: Path, key: str, turned: bool = False, depth: bool = False) -> None:
+        self._path, self._key, self._turned, self._depth = path, key, turned, depth
+        with open_file(path) as file:
+            data = member(file, key, path)
+            if not isinstance(data, h5py.Dataset) or data.shape is None:
+                raise EpisodeError.at(path, f"{key} is no array", f"render it again or {LEAVE_OUT}")
+            shape, kind = data.shape, data.dtype
+        if depth:
+            fits, expected = kind.kind == "f" and len(shape) in (3, 4) and shape[3:] in ((), (1,)), "floats (N, H, W)"
+        else:
+            fits, expected = kind == np.uint8 and len(shape) == 4 and shape[3] == 3, "uint8 (N, H, W, 3)"
+        if not fits or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
+            raise EpisodeError.at(path, f"{key} is {kind} {shape}, should be {expected}", "render it again")
+        self._count = int(shape[0])
 
-    @staticmethod
-    def _fits(shape: tuple[int, ...], kind: np.dtype) -> bool:
-        return kind == np.uint8 and len(shape) == 4 and shape[3] == 3
+    def __len__(self) -> int:
+        return self._count
 
-
-class H5Depths(_Pictures):
-    """Depth maps in an HDF5 file, as :class:`rsjax.ingest.episode.Depths`: floats [N, H, W] or [N, H, W, 1] in metres.
-
-    Arguments and errors as in :class:`H5Frames`.
-    """
-
-    expected = "floats (N, H, W)"
-
-    @staticmethod
-    def _fits(shape: tuple[int, ...], kind: np.dtype) -> bool:
-        return kind.kind == "f" and len(shape) in (3, 4) and shape[3:] in ((), (1,))
-
-    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """Returns these maps, upright; :class:`EpisodeError` if the file is damaged."""
-        maps = super().read(indices).astype(np.float32)
-        return maps[..., 0] if maps.ndim == 4 else maps
+    def read(self, indices: Sequence[int]) -> np.ndarray:
+        """Returns these pictures or maps, upright; :class:`EpisodeError` if the file is damaged."""
+        wanted, order = np.unique(np.asarray(indices, np.int64), return_inverse=True)  # h5py wants them increasing
+        with open_file(self._path) as file:
+            pictures = file[self._key][wanted][order]
+        if self._depth:
+            pictures = pictures.reshape(pictures.shape[:3]).astype(np.float32)
+        return np.ascontiguousarray(pictures[:, ::-1, ::-1]) if self._turned else pictures
 
 
 def attribute(group: Any, name: str) -> Any:

@@ -4,8 +4,8 @@ A row's action is given at that row's frame, so it leads into the next one. v2 h
 camera; in v3 many episodes share a file, and an episode's pictures are looked up by time.
 """
 
-import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from rsjax.ingest.episode import (
     EpisodeError,
     EpisodeRef,
     Frames,
-    Segment,
     SourceError,
     checked,
     fingerprint,
+    runs,
 )
 from rsjax.ingest.formats.files import (
     broken,
@@ -130,7 +130,7 @@ class LeRobot:
             actions=align_actions(actions),
             states=matrix(table, self._state, path) if self._state in table.column_names else None,
             cameras=self._cameras(location, times, path),
-            segments=_segments(tasks),
+            segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
             meta={"actions": self._layout.to_json(), "action_names": self._info.features[self._action].get("names")},
         )
         return checked(episode, path)
@@ -225,37 +225,39 @@ class LeRobot:
         return cameras
 
 
+@dataclass(frozen=True, eq=False)
 class TablePictures:
     """Encoded pictures in an episode's table, as :class:`rsjax.ingest.episode.Frames`.
 
-    Args:
+    Attributes:
         path: the table.
         column: of ``{bytes, path}``.
         location: the episode's.
     """
 
-    def __init__(self, path: Path, column: str, location: dict[str, Any]) -> None:
-        self._path, self._column, self._location = path, column, location
+    path: Path
+    column: str
+    location: dict[str, Any]
 
     def __len__(self) -> int:
-        return self._location["length"]
+        return self.location["length"]
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
         """Returns these pictures; :class:`EpisodeError` names one that is missing or damaged."""
-        table = parquet_columns(self._path, [self._column], _only(self._location))
-        if self._column not in table.column_names:
-            raise EpisodeError.at(self._path, f"has no column {self._column!r}")
+        table = parquet_columns(self.path, [self.column], _only(self.location))
+        if self.column not in table.column_names:
+            raise EpisodeError.at(self.path, f"has no column {self.column!r}")
         if table.num_rows != len(self):
-            raise EpisodeError.at(self._path, f"{table.num_rows} rows of {self._column}, not {len(self)}")
-        return decode_pictures(self._payloads(indices, table[self._column].take(list(indices)).to_pylist()))
-
-    def _payloads(self, indices: Sequence[int], cells: list[Any]) -> Iterator[tuple[str, bytes]]:
+            raise EpisodeError.at(self.path, f"{table.num_rows} rows of {self.column}, not {len(self)}")
+        cells = table[self.column].take(list(indices)).to_pylist()
+        payloads: list[tuple[str, bytes]] = []
         for index, cell in zip(indices, cells, strict=True):
-            where = f"{self._path}: {self._column} of row {index}"
+            where = f"{self.path}: {self.column} of row {index}"
             payload = cell.get("bytes") if isinstance(cell, dict) else cell
             if not isinstance(payload, bytes):
                 raise EpisodeError.at(where, "has no encoded picture", kind="undecodable")
-            yield where, payload
+            payloads.append((where, payload))
+        return decode_pictures(payloads)
 
 
 def _tasks(meta: Path, shared: bool) -> dict[int, str]:
@@ -281,11 +283,3 @@ def _only(location: dict[str, Any]) -> list[tuple[str, str, int]] | None:
 
 def _camera(key: str) -> str:
     return key.removeprefix("observation.images.").removeprefix("observation.")
-
-
-def _segments(tasks: list[str]) -> tuple[Segment, ...]:
-    """Returns parts with one task each; none if the whole episode has one."""
-    starts = [0, *(row for row in range(1, len(tasks)) if tasks[row] != tasks[row - 1]), len(tasks)]
-    if len(starts) <= 2:
-        return ()
-    return tuple(Segment(start, end, tasks[start]) for start, end in itertools.pairwise(starts))

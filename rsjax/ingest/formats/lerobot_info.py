@@ -32,11 +32,13 @@ class Info:
 
     def of_type(self, dtype: str) -> list[str]:
         """Returns the camera columns of a dtype (``video`` or ``image``), without coloured depth."""
-        return [
-            key
-            for key, feature in self.features.items()
-            if feature.get("dtype") == dtype and not _is_depth(feature) and "depth" not in key.rpartition(".")[2]
-        ]
+        keys = []
+        for key, feature in self.features.items():
+            details = feature.get("info") or feature.get("video_info")
+            is_depth = isinstance(details, dict) and details.get("video.is_depth_map")
+            if feature.get("dtype") == dtype and not is_depth and "depth" not in key.rpartition(".")[2]:
+                keys.append(key)
+        return keys
 
 
 def read_info(path: Path) -> Info:
@@ -64,8 +66,3 @@ def read_info(path: Path) -> Info:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise SourceError(f"{path}: field missing or wrong ({error}); fetch the file again") from error
     return info
-
-
-def _is_depth(feature: dict[str, Any]) -> bool:
-    details = feature.get("info") or feature.get("video_info") or {}
-    return bool(isinstance(details, dict) and details.get("video.is_depth_map"))

@@ -9,7 +9,6 @@ RLDS the action of a step was done *after* its observation.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from jaxtyping import Float32
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Layout, align_actions, check_layout
-from rsjax.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, Segment, SourceError, checked
+from rsjax.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, runs
 from rsjax.ingest.formats.files import broken, exists, near, read_json
 from rsjax.ingest.formats.keymap import KeyMap, check_keys, key_map
 from rsjax.ingest.formats.tfrecord import Example, read_record, record_refs
@@ -103,6 +102,7 @@ class RldsSource:
         layout = Layout(self.keys.kind, self.keys.quaternions, self.keys.held)
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
+        segments = [segment for segment in runs(texts) if segment.text]
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -112,7 +112,7 @@ class RldsSource:
             actions=align_actions(actions, self.keys.after),
             states=_joined(example, self.keys.state, count) if self.keys.state else None,
             cameras=cameras,
-            segments=_segments(texts),
+            segments=tuple(segments) if len({segment.text for segment in segments}) > 1 else (),
             meta={
                 "source": "rlds",
                 "file": ref.location["file"],
@@ -125,7 +125,7 @@ class RldsSource:
 
 
 def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], list[str]]:
-    """Returns the cameras by name, and the names of the placeholders.
+    """Returns the cameras by name, and the names of the placeholders: all pictures the same, of one colour.
 
     BridgeData has flags for these (``has_image_0``), but files exist in which they are all false.
     """
@@ -133,13 +133,12 @@ def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], 
         name: EncodedFrames(example.blobs(f"steps/{key}"), f"{example.where}: steps/{key}")
         for name, key in keys.cameras.items()
     }
-    blank = [name for name, pictures in frames.items() if _is_blank(pictures)]
+    blank = [
+        name
+        for name, pictures in frames.items()
+        if len(set(pictures.payloads)) == 1 and not np.ptp(pictures.read([0]), axis=(0, 1, 2)).any()
+    ]
     return {name: pictures for name, pictures in frames.items() if name not in blank}, blank
-
-
-def _is_blank(frames: EncodedFrames) -> bool:
-    """Whether all are the same picture of one colour, which is stored if there was no such camera."""
-    return len(set(frames.payloads)) == 1 and not np.ptp(frames.read([0]), axis=(0, 1, 2)).any()
 
 
 def _joined(example: Example, keys: Sequence[str], count: int) -> Float32[np.ndarray, "N n"]:
@@ -148,30 +147,16 @@ def _joined(example: Example, keys: Sequence[str], count: int) -> Float32[np.nda
 
 def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
     """Returns the text of each step, from the first of these features that is not empty."""
-    for key in (f"steps/{key}" for key in keys):
-        if key not in example:
-            continue
-        rows = example.blobs(key) if example.is_bytes(key) else _characters(example.numbers(key, count))
+    for key in (f"steps/{key}" for key in keys if f"steps/{key}" in example):
+        if example.is_bytes(key):
+            rows = example.blobs(key)
+        else:  # each text is a row of numbers, padded with zeros
+            codes = np.nan_to_num(example.numbers(key, count))
+            rows = [bytes(int(code) & 0xFF for code in row if code) for row in codes]
         texts = [row.decode("utf-8", "replace").strip() for row in rows]
         if any(texts):
             return texts
     return []
-
-
-def _characters(codes: Float32[np.ndarray, "N n"]) -> list[bytes]:
-    """Converts text that is stored as a row of numbers, padded with zeros."""
-    return [bytes(int(code) & 0xFF for code in row if code) for row in np.nan_to_num(codes)]
-
-
-def _segments(texts: list[str]) -> tuple[Segment, ...]:
-    """Returns the parts of an episode whose text changes on the way; an episode of one text has none."""
-    segments, start = [], 0
-    for text, run in groupby(texts):
-        end = start + len(list(run))
-        if text:
-            segments.append(Segment(start, end, text))
-        start = end
-    return tuple(segments) if len({segment.text for segment in segments}) > 1 else ()
 
 
 def _metadata(example: Example) -> dict[str, Any]:

@@ -7,7 +7,7 @@ other conventions (:mod:`rsjax.ingest.formats.libero`), so this module reads bot
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from rsjax.ingest.episode import (
     fingerprint,
 )
 from rsjax.ingest.formats.files import broken, inside, location_of
-from rsjax.ingest.formats.hdf5 import H5Depths, H5Frames, attribute, member, open_file, rows
+from rsjax.ingest.formats.hdf5 import H5Frames, attribute, member, open_file, rows
 
 _RENDER = "render them with robomimic's dataset_states_to_obs.py --camera_names …"
 
@@ -81,13 +81,14 @@ def open_source(path: Path, filter: str = "", depth: bool = False) -> "DemoSourc
 
 def open_demos(path: Path, convention: Convention, filter: str, depth: bool) -> "DemoSource":
     """Opens a data set of this layout. Arguments and errors as in :func:`open_source`."""
-    if path.is_file():
-        source = DemoSource(path.parent, (path.name,), convention, filter, depth)
-    else:
+    folder, files = path.parent, [path]
+    if not path.is_file():
+        folder = path
         files = sorted({file for ending in ("hdf5", "h5") for file in path.glob(f"**/*.{ending}") if file.is_file()})
-        if not files:
-            raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
-        source = DemoSource(path, tuple(str(file.relative_to(path)) for file in files), convention, filter, depth)
+    if not files:
+        raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
+    names = tuple(str(file.relative_to(folder)) for file in files)
+    source = DemoSource(folder, names, convention, filter, depth, convention.name)
     source.check_pictures()
     return source
 
@@ -108,12 +109,9 @@ class DemoSource:
     folder: Path
     files: tuple[str, ...]
     convention: Convention
-    filter: str = ""
-    depth: bool = False
-    name: str = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.name = self.convention.name
+    filter: str
+    depth: bool
+    name: str
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses."""
@@ -149,9 +147,10 @@ class DemoSource:
         cameras = _picture_keys(observed, how)
         if not cameras:
             raise EpisodeError.at(path, f"{observed.name} has no pictures (*{how.endings[0]})", _RENDER)
-        depths = [camera for camera in cameras if self.depth and f"{camera}_depth" in observed]
         fps = _fps(settings, path) or how.fps
         states, flipped = _states(observed, how, path)
+        width = commands.shape[1]  # a gripper is the last dimension of each arm's seven, of other robots the last alone
+        grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -161,14 +160,18 @@ class DemoSource:
             actions=align_actions(commands, how.after),
             states=states,
             cameras={camera: H5Frames(path, f"{observed.name}/{key}", how.turned) for camera, key in cameras.items()},
-            depth={camera: H5Depths(path, f"{observed.name}/{camera}_depth", how.turned) for camera in depths},
+            depth={
+                camera: H5Frames(path, f"{observed.name}/{camera}_depth", how.turned, depth=True)
+                for camera in cameras
+                if self.depth and f"{camera}_depth" in observed
+            },
             meta={
                 "source": how.name,
                 "file": ref.location["file"],
                 "demo": ref.location["demo"],
                 "environment": str(settings.get("env_name", "")),
                 "notes": {"flipped": flipped} if flipped else {},
-                "actions": Layout("delta", held=_grippers(commands.shape[1])).to_json(),
+                "actions": Layout("delta", held=grippers).to_json(),
             },
         )
 
@@ -254,8 +257,7 @@ def _fps(settings: dict[str, Any], path: Path) -> float:
     arguments = settings.get("env_kwargs")
     fps = arguments.get("control_freq", 0) if isinstance(arguments, dict) else 0
     if not isinstance(fps, int | float) or not 0 <= fps <= MAX_FPS:
-        problem = f"control_freq in data.env_args is {fps!r}, should be steps per second"
-        raise EpisodeError.at(path, problem, "mend it")
+        raise EpisodeError.at(path, f"control_freq in data.env_args is {fps!r}, should be steps per second", "mend it")
     return float(fps)
 
 
@@ -272,11 +274,6 @@ def _task(group: Any, settings: dict[str, Any], path: Path, how: Convention) -> 
     if instruction:
         return str(instruction).strip('" ')
     return path.stem.removesuffix("_demo").replace("_", " ") if how.after else str(settings.get("env_name", ""))
-
-
-def _grippers(width: int) -> tuple[int, ...]:
-    """Returns the last dimension of each arm's seven; of other robots the last alone."""
-    return tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
 
 
 def _number(demo: str) -> tuple[int, str]:

@@ -16,7 +16,7 @@ from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
 from rsjax.ingest.actions import Layout
 from rsjax.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
-from rsjax.ingest.pictures import ArrayDepths, ArrayFrames
+from rsjax.ingest.pictures import ArrayFrames
 
 FPS = 5.0  # of a clip that does not say how it was made
 _CURE = f"make the store again or {LEAVE_OUT}"
@@ -95,7 +95,7 @@ class StoreSource:
             actions=record["actions"].astype(np.float32),
             states=None,
             cameras={camera: ArrayFrames(record["rgb"])},
-            depth={camera: ArrayDepths(record["depth"])} if measured else {},
+            depth={camera: ArrayFrames(record["depth"].astype(np.float32))} if measured else {},
             meta={
                 "source": self.store.manifest.get("source", "sim"),
                 "clip": place,

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -69,32 +69,26 @@ class Span:
 
 def spans(path: Path) -> Iterator[Span]:
     """Yields every record of a file, in order, from the heads alone. If the file is damaged, the last one says how."""
+    offset = 0
     try:
         with regular(path).open("rb") as file:
-            yield from _spans(file, path.stat().st_size)
-    except OSError as error:
-        yield Span(0, 0, damage=reason(error))
-
-
-def _spans(file: IO[bytes], size: int) -> Iterator[Span]:
-    offset = 0
-    while offset < size:
-        file.seek(offset)
-        head = file.read(_HEAD)
-        if len(head) < _HEAD:
-            yield Span(offset, 0, damage=f"truncated: {len(head)} bytes where a record's head takes {_HEAD}")
-            return
-        length, check = struct.unpack("<QI", head)
-        if check != masked_crc(head[:8]):
-            yield Span(offset, 0, damage="the checksum of a record's length is wrong")
-            return
-        end = offset + _HEAD + length + _FOOT
-        if end > size:
-            yield Span(offset, 0, damage=f"truncated: a record ends at byte {end}, the file at byte {size}")
-            return
-        file.seek(end - _FOOT)
-        yield Span(offset, length, int.from_bytes(file.read(_FOOT), "little"))
-        offset = end
+            size = path.stat().st_size
+            while offset < size:
+                file.seek(offset)
+                head = file.read(_HEAD)
+                if len(head) < _HEAD:
+                    raise EpisodeError(f"truncated: {len(head)} bytes where a record's head takes {_HEAD}")
+                length, check = struct.unpack("<QI", head)
+                if check != masked_crc(head[:8]):
+                    raise EpisodeError("the checksum of a record's length is wrong")
+                end = offset + _HEAD + length + _FOOT
+                if end > size:
+                    raise EpisodeError(f"truncated: a record ends at byte {end}, the file at byte {size}")
+                file.seek(end - _FOOT)
+                yield Span(offset, length, int.from_bytes(file.read(_FOOT), "little"))
+                offset = end
+    except (OSError, EpisodeError) as error:
+        yield Span(offset, 0, damage=reason(error) if isinstance(error, OSError) else str(error))
 
 
 def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], settings: Any) -> Iterator[EpisodeRef]:

@@ -14,11 +14,11 @@ from rsjax.ingest.annotators.depth import (
     relative_depth,
 )
 from rsjax.ingest.episode import EpisodeError
-from tests.ingest.videos import ArrayDepths
+from tests.ingest.videos import ArrayFrames
 
 
 def filled(depth, most_holes=0.5):
-    return FilledDepths(ArrayDepths(depth), most_holes, "depth of top")
+    return FilledDepths(ArrayFrames(depth), most_holes, "depth of top")
 
 
 def test_depth_without_holes_stays_as_recorded():

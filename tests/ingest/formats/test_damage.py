@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.errors import UserError
-from rsjax.ingest import video
 from rsjax.ingest.formats import open_source
 from tests.ingest.formats import test_agibot, test_bair, test_folder, test_lerobot, test_libero, test_sim
 from tests.ingest.formats.toy_demos import demo, write_demos
 from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
+from tests.ingest.formats.videos import close_videos
 
 
 def write_sim(root: Path) -> None:
@@ -110,7 +110,7 @@ def test_what_may_not_be_read(whole: tuple[str, Path]) -> None:
         Path(folder).chmod(0o755)
         read_everything(name, root)  # libraries import parts of themselves at first use
         for path in [root, *sorted(root.rglob("*"))]:
-            video.close_all()
+            close_videos()
             with forbidden(path):
                 _, messages = read_everything(name, root)
             assert messages or "depth" in path.parts, path

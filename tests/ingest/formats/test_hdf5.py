@@ -6,7 +6,7 @@ import pytest
 
 from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.formats import open_source
-from rsjax.ingest.formats.hdf5 import H5Depths, H5Frames, member, open_file, rows
+from rsjax.ingest.formats.hdf5 import H5Frames, member, open_file, rows
 from tests.ingest.formats.toy_demos import demo, write_demos
 
 
@@ -52,9 +52,9 @@ def test_what_lies_in_another_file_is_refused(path: Path, change: object) -> Non
     change(path)  # type: ignore[operator]
     with pytest.raises(EpisodeError, match=r"a.h5: /linked lies in another file"), open_file(path) as file:
         rows(file, "linked", path)
-    for kind in (H5Frames, H5Depths):
+    for depth in (False, True):
         with pytest.raises(EpisodeError, match="lies in another file"):
-            kind(path, "linked")
+            H5Frames(path, "linked", depth=depth)
 
 
 def test_a_demo_of_another_file_is_refused(tmp_path: Path) -> None:
@@ -87,6 +87,6 @@ def test_chunks_of_gigantic_size_are_refused(path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["group", "nothing", "rows"])
 def test_what_is_no_picture_is_reported(path: Path, key: str) -> None:
-    for kind in (H5Frames, H5Depths):
+    for depth in (False, True):
         with pytest.raises(EpisodeError, match=rf"a.h5: {key} is "):
-            kind(path, key)
+            H5Frames(path, key, depth=depth)

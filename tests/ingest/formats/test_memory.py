@@ -15,14 +15,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from rsjax.data.store import Record, write_store
-from rsjax.ingest import video
 from rsjax.ingest.episode import EpisodeRef, EpisodeSource
 from rsjax.ingest.formats import open_source
 from tests.ingest.formats.test_agibot import write_agibot
 from tests.ingest.formats.test_lerobot import V3_PATHS, write_info
 from tests.ingest.formats.toy_demos import write_demos
 from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
-from tests.ingest.formats.videos import write_video
+from tests.ingest.formats.videos import close_videos, write_video
 
 EPISODES, FIRST, STEPS, SIDE = 50, 10, 12, 128
 MOST = 16 * 2**20  # bytes; fifty episodes that are held take 29 MB and more
@@ -138,7 +137,7 @@ def cost(source: EpisodeSource, episodes: int) -> int:
     forget()
     before = peak()
     read_all(source, islice(source.episodes(), episodes))
-    video.close_all()
+    close_videos()
     return peak() - before
 
 

@@ -8,8 +8,16 @@ from typing import Any
 import av
 import numpy as np
 
+from rsjax.ingest import video
+
 SIZE = (32, 32)
 _OPTIONS = {"libsvtav1": {"preset": "12", "crf": "10"}, "libx264": {"crf": "1"}}
+
+
+def close_videos() -> None:
+    """Closes the videos that this process keeps open."""
+    while video._decoders:
+        video._decoders.popitem()[1].close()
 
 
 def picture(number: int, size: tuple[int, int] = SIZE) -> np.ndarray:

@@ -6,12 +6,12 @@ import pytest
 from rsjax.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
 from rsjax.ingest.annotators.protocols import AnnotationError
 from tests.ingest.annotators.networks.checkouts import check_out
-from tests.ingest.videos import ArrayDepths, sliding
+from tests.ingest.videos import ArrayFrames, sliding
 
 torch = pytest.importorskip("torch")
 FRAMES = sliding(9, (2, -1), (48, 64))
 STEP = np.array([2 / 64, -1 / 48], np.float32)
-DEPTH = ArrayDepths(np.ones((9, 48, 64), np.float32) + np.linspace(0, 1, 64, dtype=np.float32))
+DEPTH = ArrayFrames(np.ones((9, 48, 64), np.float32) + np.linspace(0, 1, 64, dtype=np.float32))
 
 
 @pytest.fixture
@@ -70,4 +70,4 @@ def test_spatial_tracker_follows_through_fewer_frames_than_its_window(spatial):
 @pytest.mark.parametrize("depth", [1.0, 0.0, np.nan])
 def test_depth_that_stops_spatial_tracker_is_refused(spatial, depth):
     with pytest.raises(AnnotationError, match="finite and not the same everywhere"):
-        spatial(FRAMES, ArrayDepths(np.full((9, 48, 64), depth, np.float32)))
+        spatial(FRAMES, ArrayFrames(np.full((9, 48, 64), depth, np.float32)))
