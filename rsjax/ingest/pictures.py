@@ -49,30 +49,29 @@ class EncodedFrames:
 
 @dataclass(frozen=True, eq=False)
 class PictureFiles:
-    """One PNG or JPEG file per frame, as :class:`rsjax.ingest.episode.Frames`."""
+    """One file per frame: PNG or JPEG as :class:`rsjax.ingest.episode.Frames`, or depth maps as ``Depths``.
+
+    Attributes:
+        paths: each frame's file.
+        depth: whether they are depth maps: 16-bit PNG in millimetres, 0 where nothing was measured.
+    """
 
     paths: Sequence[Path]
+    depth: bool = False
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """Returns these pictures; :class:`EpisodeError` names one that is missing, damaged or of another size."""
-        return decode_pictures((path, _bytes(path)) for path in (self.paths[index] for index in indices))
+    def read(self, indices: Sequence[int]) -> np.ndarray:
+        """Returns these pictures, or maps in metres.
 
-
-@dataclass(frozen=True, eq=False)
-class DepthFiles:
-    """One 16-bit PNG file per frame, in millimetres, as :class:`rsjax.ingest.episode.Depths`."""
-
-    paths: Sequence[Path]
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """Returns these maps in metres, 0 where nothing was measured; raises as :class:`PictureFiles`."""
-        return stack_pictures((path, _depth(path)) for path in (self.paths[index] for index in indices))
+        Raises:
+            EpisodeError: one is missing, damaged or of another size.
+        """
+        paths = [self.paths[index] for index in indices]
+        if self.depth:
+            return stack_pictures((path, _depth(path)) for path in paths)
+        return decode_pictures((path, _bytes(path)) for path in paths)
 
 
 def _depth(path: Path) -> Float32[np.ndarray, "H W"]:

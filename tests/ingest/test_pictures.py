@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError
-from rsjax.ingest.pictures import DepthFiles, PictureFiles, decode_pictures
+from rsjax.ingest.pictures import PictureFiles, decode_pictures
 
 
 def write(path: Path, image: np.ndarray) -> Path:
@@ -32,7 +32,7 @@ def test_pictures_are_rgb_in_the_order_asked_for(tmp_path: Path) -> None:
 
 def test_depth_is_in_metres(tmp_path: Path) -> None:
     raw = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
-    frames = DepthFiles([write(tmp_path / "d.png", raw)])
+    frames = PictureFiles([write(tmp_path / "d.png", raw)], depth=True)
     np.testing.assert_allclose(frames.read([0])[0], raw / 1000, rtol=1e-6)
 
 
@@ -40,7 +40,7 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     gray = write(tmp_path / "gray.png", np.zeros((4, 6), np.uint8))
     wide = write(tmp_path / "wide.png", np.zeros((4, 8), np.uint8))
     with pytest.raises(EpisodeError, match=r"gray.png: uint8 \(4, 6\), a depth map has 16 bits"):
-        DepthFiles([gray]).read([0])
+        PictureFiles([gray], depth=True).read([0])
     with pytest.raises(EpisodeError, match=r"wide.png: pictures of several sizes \(8 × 4 and 6 × 4\)"):
         PictureFiles([gray, wide]).read([0, 1])
     with pytest.raises(EpisodeError, match=r"gone.png: missing"):

@@ -22,7 +22,7 @@ from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, chec
 from rsjax.ingest.formats.agibot_proprio import Proprio
 from rsjax.ingest.formats.files import broken, exists, inside, location_of, media, read_json, subfolders
 from rsjax.ingest.formats.hdf5 import open_file
-from rsjax.ingest.pictures import DepthFiles
+from rsjax.ingest.pictures import PictureFiles
 from rsjax.ingest.video import VideoFrames
 
 FPS = 30.0
@@ -164,7 +164,7 @@ def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list
     return tuple(sorted(good, key=lambda segment: segment.start)), bad
 
 
-def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
+def _depth(folder: Path, count: int) -> tuple[PictureFiles | None, str]:
     """Returns the head camera's depth maps in mm, or why they are left out."""
     try:
         names = [path.name for path in folder.iterdir()]
@@ -176,4 +176,4 @@ def _depth(folder: Path, count: int) -> tuple[DepthFiles | None, str]:
     paths = [media(folder / name) for name in chosen]
     if len(paths) != count:
         return None, f"{len(paths)} depth maps for {count} frames" if paths else ""
-    return DepthFiles(paths), ""
+    return PictureFiles(paths, depth=True), ""

@@ -121,11 +121,9 @@ class Proprio:
         """Returns the frames at which the commands of a field were sent."""
         if count == self._count:
             return np.arange(count)
-        chosen = f"action/{name.partition('/')[0]}/index"
-        index = self._rows(chosen, 1)[:, 0]
-        if not len(index):
-            chosen = "action/joint/index"
-            index = self._rows(chosen, 1)[:, 0]
+        for chosen in (f"action/{name.partition('/')[0]}/index", "action/joint/index"):
+            if len(index := self._rows(chosen, 1)[:, 0]):
+                break
         if len(index) != count:
             raise self._error(f"action/{name} has {count} rows, {chosen} {len(index)}")
         places = index.astype(np.int64)

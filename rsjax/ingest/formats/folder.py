@@ -132,8 +132,9 @@ class Folder:
             problem = f"has no video ({', '.join(parts.VIDEOS)}) and no folder of pictures"
             raise EpisodeError.at(place, problem, "add one or leave it out")
         count = len(next(iter(cameras.values())))
-        description = parts.read_description(place.with_name(f"{name}.json") if flat else place / "episode.json", count)
-        table, fps = parts.read_table(table_path), description.fps or config.fps
+        json_path = place.with_name(f"{name}.json") if flat else place / "episode.json"
+        task, own_fps, segments = parts.read_description(json_path, count)
+        table, fps = parts.read_table(table_path), own_fps or config.fps
         states = [column for column in table.column_names if column.startswith("state")]
         actions = [column for column in table.column_names if column.startswith("action")]
         actions = actions or [column for column in table.column_names if column not in ("timestamp", *states)]
@@ -147,14 +148,14 @@ class Folder:
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=config.task if description.task is None else description.task,
+            task=config.task if task is None else task,
             fps=fps or _rate(times),
             timestamps=times - times[0],
             actions=_actions(commands, count, config.after, table_path),
             states=parts.columns(table, states, table_path) if states else None,
             cameras=cameras,
             depth=depth,
-            segments=description.segments,
+            segments=segments,
             meta={"actions": layout.to_json(), "action_names": actions},
         )
         return checked(episode, table_path)

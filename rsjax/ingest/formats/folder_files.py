@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from rsjax.ingest.episode import LEAVE_OUT, MAX_FPS, Depths, EpisodeError, Frames, Segment, SourceError, reason, regular
 from rsjax.ingest.formats.files import exists, load_npy, matrix, media, parquet_columns, read_json
-from rsjax.ingest.pictures import DepthFiles, PictureFiles
+from rsjax.ingest.pictures import PictureFiles
 from rsjax.ingest.video import VideoFrames
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -21,16 +21,8 @@ _DEPTH = ".depth"
 _MOST_BYTES = 2**28  # of a table that is text
 
 
-class Description(NamedTuple):
-    """What an episode's JSON says; the task is None and the rate 0 if it does not name them."""
-
-    task: str | None
-    fps: float
-    segments: tuple[Segment, ...]
-
-
-def read_description(path: Path, count: int) -> Description:
-    """Reads an episode's JSON; there may be none.
+def read_description(path: Path, count: int) -> tuple[str | None, float, tuple[Segment, ...]]:
+    """Reads task, rate and segments of an episode's JSON, if there is one; None and 0 if it does not name them.
 
     Args:
         count: the episode's frames.
@@ -48,7 +40,7 @@ def read_description(path: Path, count: int) -> Description:
         raise EpisodeError(str(error)) from error
     except (AttributeError, TypeError, ValueError) as error:
         raise EpisodeError.at(path, f"task, fps or segments are wrong ({error})", "mend the file") from error
-    return Description(task, fps, tuple(sorted(segments, key=lambda segment: segment.start)))
+    return task, fps, tuple(sorted(segments, key=lambda segment: segment.start))
 
 
 def _segment(path: Path, place: int, entry: Any, count: int) -> Segment:
@@ -71,7 +63,7 @@ def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], 
         if path.suffix.lower() in VIDEOS:
             name, frames = "main" if flat else path.stem, VideoFrames(media(path))
         elif path.is_dir() and path.suffix == _DEPTH:
-            depth[path.stem] = DepthFiles(_pictures(path, (".png",)))
+            depth[path.stem] = PictureFiles(_pictures(path, (".png",)), depth=True)
             continue
         elif path.is_dir() and (pictures := _pictures(path, PICTURES)):
             name, frames = path.name, PictureFiles(pictures)

@@ -89,7 +89,15 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool) -> 
         raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
     names = tuple(str(file.relative_to(folder)) for file in files)
     source = DemoSource(folder, names, convention, filter, depth, convention.name)
-    source.check_pictures()
+    for file in files:  # if the first demo that can be read has no pictures, none has
+        try:
+            demos = source.demos(file)
+            with open_file(file) as content:
+                if demos and not _picture_keys(content[f"data/{demos[0]}/obs"], convention):
+                    raise SourceError(f"{file}: data/{demos[0]}/obs has no *{convention.endings[0]}; {_RENDER}")
+            break
+        except (EpisodeError, KeyError):
+            continue  # its episodes are listed, and refused one by one
     return source
 
 
@@ -118,7 +126,7 @@ class DemoSource:
         for file in self.files:
             path, stem = self.folder / file, file.rpartition(".")[0].replace("/", "-")
             try:
-                demos = self._demos(path)
+                demos = self.demos(path)
             except EpisodeError as error:
                 yield broken(safe_id(stem), str(error))
                 continue
@@ -175,20 +183,7 @@ class DemoSource:
             },
         )
 
-    def check_pictures(self) -> None:
-        """Raises :class:`SourceError` if the first demo that can be read has no pictures: then none has."""
-        for path in (self.folder / file for file in self.files):
-            try:
-                demos = self._demos(path)
-                with open_file(path) as file:
-                    if demos and not _picture_keys(file[f"data/{demos[0]}/obs"], self.convention):
-                        ending = self.convention.endings[0]
-                        raise SourceError(f"{path}: data/{demos[0]}/obs has no *{ending}; {_RENDER}")
-                return
-            except (EpisodeError, KeyError):
-                continue  # its episodes are listed, and refused one by one
-
-    def _demos(self, path: Path) -> list[str]:
+    def demos(self, path: Path) -> list[str]:
         """Returns the demos of a file in the order of their numbers.
 
         Raises:

@@ -17,8 +17,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, te
 from google.protobuf.message import DecodeError
 from jaxtyping import Float32
 
-from rsjax.ingest.episode import FETCH_AGAIN, EpisodeError, EpisodeRef, fingerprint, reason, regular
-from rsjax.ingest.formats.files import broken, inside, location_of
+from rsjax.ingest.episode import EpisodeError, EpisodeRef, fingerprint, regular
+from rsjax.ingest.formats.files import broken, inside, location_of, reading
 
 _HEAD, _FOOT = 12, 4  # bytes around a payload
 _PROTO = """
@@ -58,37 +58,36 @@ class Span:
         offset: bytes to its head.
         length: bytes of its payload.
         crc: the payload's masked checksum, as it is written in the file.
-        damage: why neither this record nor what follows it in the file can be read; "" if it can.
     """
 
     offset: int
     length: int
-    crc: int = 0
-    damage: str = ""
+    crc: int
 
 
 def spans(path: Path) -> Iterator[Span]:
-    """Yields every record of a file, in order, from the heads alone. If the file is damaged, the last one says how."""
+    """Yields every record of a file, in order, from the heads alone.
+
+    Raises:
+        EpisodeError: the file cannot be read, or is damaged after the last record that was yielded.
+    """
     offset = 0
-    try:
-        with regular(path).open("rb") as file:
-            size = path.stat().st_size
-            while offset < size:
-                file.seek(offset)
-                head = file.read(_HEAD)
-                if len(head) < _HEAD:
-                    raise EpisodeError(f"truncated: {len(head)} bytes where a record's head takes {_HEAD}")
-                length, check = struct.unpack("<QI", head)
-                if check != masked_crc(head[:8]):
-                    raise EpisodeError("the checksum of a record's length is wrong")
-                end = offset + _HEAD + length + _FOOT
-                if end > size:
-                    raise EpisodeError(f"truncated: a record ends at byte {end}, the file at byte {size}")
-                file.seek(end - _FOOT)
-                yield Span(offset, length, int.from_bytes(file.read(_FOOT), "little"))
-                offset = end
-    except (OSError, EpisodeError) as error:
-        yield Span(offset, 0, damage=reason(error) if isinstance(error, OSError) else str(error))
+    with reading(path), regular(path).open("rb") as file:
+        size = path.stat().st_size
+        while offset < size:
+            file.seek(offset)
+            head = file.read(_HEAD)
+            if len(head) < _HEAD:
+                raise EpisodeError.at(path, f"truncated: {len(head)} bytes where a record's head takes {_HEAD}")
+            length, check = struct.unpack("<QI", head)
+            if check != masked_crc(head[:8]):
+                raise EpisodeError.at(path, "the checksum of a record's length is wrong")
+            end = offset + _HEAD + length + _FOOT
+            if end > size:
+                raise EpisodeError.at(path, f"truncated: a record ends at byte {end}, the file at byte {size}")
+            file.seek(end - _FOOT)
+            yield Span(offset, length, int.from_bytes(file.read(_FOOT), "little"))
+            offset = end
 
 
 def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], settings: Any) -> Iterator[EpisodeRef]:
@@ -101,16 +100,16 @@ def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], sett
         expected: how many records there should be, and what says so.
         settings: what else the episodes depend on, for their fingerprints.
     """
-    records = list(spans(root / file))
-    if len(records) < expected[0] and not (records and records[-1].damage):
-        records.append(Span(0, 0, damage=f"has {len(records)} of the {expected[0]} records that {expected[1]}"))
-    for number, span in enumerate(records):
-        identity = ids.format(number)
-        if span.damage:
-            yield broken(identity, f"{root / file}: {span.damage}; {FETCH_AGAIN}")
-            continue
-        mark = fingerprint((), file, span.length, span.crc, span.damage, settings)
-        yield EpisodeRef(identity, mark, {"file": file, "offset": span.offset, "length": span.length})
+    number = 0
+    try:
+        for number, span in enumerate(spans(root / file), 1):
+            mark = fingerprint((), file, span.length, span.crc, "", settings)
+            location = {"file": file, "offset": span.offset, "length": span.length}
+            yield EpisodeRef(ids.format(number - 1), mark, location)
+        if number < expected[0]:
+            raise EpisodeError.at(root / file, f"has {number} of the {expected[0]} records that {expected[1]}")
+    except EpisodeError as error:
+        yield broken(ids.format(number), str(error))
 
 
 def read_record(root: Path, ref: EpisodeRef) -> "Example":
@@ -126,12 +125,9 @@ def read_payload(path: Path, offset: int, length: int) -> bytes:
     Raises:
         EpisodeError: the file cannot be read, has changed, or its checksum is wrong.
     """
-    try:
-        with regular(path).open("rb") as file:
-            file.seek(offset)
-            record = file.read(_HEAD + length + _FOOT)
-    except OSError as error:
-        raise EpisodeError.at(path, reason(error)) from error
+    with reading(path), regular(path).open("rb") as file:
+        file.seek(offset)
+        record = file.read(_HEAD + length + _FOOT)
     if len(record) < _HEAD + length + _FOOT or int.from_bytes(record[:8], "little") != length:
         raise EpisodeError(f"{path}: no record of {length} bytes at byte {offset}: the file has changed; list it again")
     payload = record[_HEAD:-_FOOT]

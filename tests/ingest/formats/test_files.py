@@ -133,6 +133,7 @@ def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> 
         lambda path: list(json_lines(path)),
         lambda path: list(parquet_rows(path, ["x"])),
         lambda path: read_payload(path, 0, 8),
+        lambda path: list(spans(path)),
         lambda path: open_file(path).__enter__(),
         lambda path: key_map(str(path), "", path),
         read_table,
@@ -148,5 +149,4 @@ def test_pipes_and_devices_are_refused_where_they_would_never_end(tmp_path: Path
         path.symlink_to("/dev/zero")
     with pytest.raises(UserError, match=r"data.json: .*a pipe or device, not a file"):
         read(path)
-    assert [span.damage for span in spans(path)] == ["cannot be read (a pipe or device, not a file)"]
     assert fingerprint([path]) == fingerprint([path])
