@@ -95,18 +95,12 @@ def disk_guard(path: Path) -> Iterator[None]:
     """Turns a full disk or a refused write into a :class:`FileError` that names ``path``."""
     try:
         yield
-    except OSError as error:
-        if error.errno == errno.ENOSPC:
-            raise _disk_full(path) from error
-        raise FileError(f"{path}: cannot write ({error}); check the place and its permissions") from error
-    except (RuntimeError, ValueError) as error:  # ArrayRecord reports a full disk by these
-        if "No space left" in str(error):
-            raise _disk_full(path) from error
+    except (OSError, RuntimeError, ValueError) as error:  # ArrayRecord reports a full disk by the latter two
+        if getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error):
+            raise FileError(f"{path}: the disk is full; free some space there and run again") from error
+        if isinstance(error, OSError):
+            raise FileError(f"{path}: cannot write ({error}); check the place and its permissions") from error
         raise
-
-
-def _disk_full(path: Path) -> FileError:
-    return FileError(f"{path}: the disk is full; free some space there and run again")
 
 
 @contextmanager

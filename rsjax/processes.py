@@ -95,7 +95,10 @@ def run_items(
             while len(busy) < workers and (entry := again.popleft() if again else next(fresh, None)):
                 worker = idle.pop() if idle else _start(first_message, started)
                 busy[worker.pipe] = worker, *entry
-                _send(worker, entry[0])
+                try:
+                    worker.pipe.send(entry[0])
+                except OSError:  # it died while it was idle, which the next wait sees
+                    worker.process.kill()
             if not busy:
                 return
             ready = wait(list(busy), _LOOK_SECONDS)
@@ -140,13 +143,6 @@ def _start(first_message: bytes, started: list[_Worker]) -> _Worker:
     except OSError:  # it died already, which the next wait sees
         process.kill()
     return started[-1]
-
-
-def _send(worker: _Worker, item: object) -> None:
-    try:
-        worker.pipe.send(item)
-    except OSError:  # it died while it was idle, which the next wait sees
-        worker.process.kill()
 
 
 def _stop(workers: list[_Worker]) -> None:

@@ -10,13 +10,11 @@ import numpy as np
 
 from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
 from rsjax.config.curriculum import format_stage
-from rsjax.data.labels import Labels
 from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
 from rsjax.data.store import Store, StoreError, open_store
 
-LABELS = ("task", "difficulty")
 SPLIT = "train"
 EVERYTHING = CurriculumStageConfig()
 
@@ -109,9 +107,12 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     labels = store.labels(SPLIT)
     chosen = np.flatnonzero(labels.matching(patterns))
     if not len(chosen):
+        counts = labels.counts()
+        words = {name: ", ".join(f"{word!r} {n}×" for word, n in sorted(counts[name].items())) for name in patterns}
+        listed = "; ".join(f"{name} {counted}" for name, counted in words.items())
         raise StoreError(
             f"{store.path}: no {SPLIT} record has a difficulty like {' or '.join(part.difficulties)} and a task like "
-            f"{' or '.join(part.tasks)}; it has {_listed(labels)}: change the stage's patterns"
+            f"{' or '.join(part.tasks)}; it has {listed}: change the stage's patterns"
         )
     return chosen
 
@@ -154,13 +155,6 @@ def _shapes(component: MixtureComponent) -> dict[str, str]:
     _, record = Readable(component, Quarantine(None, len(component.source), 1.0))[0]
     arrays = component.transform(record, np.random.default_rng(0))
     return {name: f"{array.dtype} {array.shape}" for name, array in arrays.items()}
-
-
-def _listed(labels: Labels) -> str:
-    counts = labels.counts()
-    return "; ".join(
-        f"{name} " + ", ".join(f"{word!r} {count}×" for word, count in sorted(counts[name].items())) for name in LABELS
-    )
 
 
 def _distinct(stages: tuple[CurriculumStage, ...]) -> int:

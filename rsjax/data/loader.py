@@ -5,6 +5,7 @@ which :meth:`Loader.identify` names its clips, and ``index`` int32, the place in
 multi-host run.
 """
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -129,10 +130,14 @@ class Loader:
         ``store``, ``split``, ``record`` and ``file`` say where it lies (``record`` alone if the source is no store's);
         ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
         """
-        return [
-            _describe(self._components[part].source, int(record))
-            for part, record in zip(arrays["part"], arrays["record"], strict=True)
-        ]
+        rows = []
+        for part, number in zip(arrays["part"], arrays["record"], strict=True):
+            source = self._components[part].source
+            rows.append(place_of(source, int(number)))
+            with contextlib.suppress(StoreError):
+                record = source[int(number)]
+                rows[-1] |= {name: record[name] for name in ("task", "provenance") if name in record}
+        return rows
 
     def whole(self, state: dict[str, Any]) -> "Loader":
         """Returns a loader from this state on that reads the rows of all processes alone, to look at a batch again."""
@@ -175,15 +180,6 @@ def batches(
     """
     stages = [CurriculumStage((MixtureComponent(source, transform),), 0)]
     return Loader(stages, batch_size, seed, Quarantine(quarantine, len(source), max_damaged), **options)
-
-
-def _describe(source: RecordSource, record: int) -> dict[str, Any]:
-    place = place_of(source, record)
-    try:
-        read = source[record]
-    except StoreError:
-        return place
-    return place | {name: read[name] for name in ("task", "provenance") if name in read}
 
 
 def _start_worker(index: int, count: int) -> None:

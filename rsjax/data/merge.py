@@ -7,6 +7,7 @@ manifest names its files without their place.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
     _check_mergeable(stores, out)
     key = content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores))
     merged = _write_merged(stores, out, key)
-    if all(_depth_range(store) == _depth_range(merged) for store in stores):
+    if all(store.manifest.get("depth_range") == merged.manifest.get("depth_range") for store in stores):
         sets = [token_sets(store) for store in stores]
         for tokenizer in set.intersection(*map(set, sets)):
             _write_merged([one[tokenizer] for one in sets], out / FOLDER / tokenizer, tokens_key(key, tokenizer))
@@ -110,6 +111,9 @@ class _Copy(dict[str, Any]):
     words: Words
 
 
+_words = attrgetter("words")  # the label of a copy
+
+
 def _copies(
     parts: Iterable[tuple[Store, str, Iterable[int]]], labelled: bool, changes: dict[str, Any]
 ) -> Iterator[_Copy]:
@@ -139,13 +143,15 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
     meta |= {"key": key, "merged": [{"path": str(one.path), "key": one.manifest.get("key")} for one in stores]}
     meta |= {name: _left_out(stores, name) for name in LEFT_OUT if any(name in store.manifest for store in stores)}
     if all("episodes" in store.manifest for store in stores):
-        meta["episodes"] = _episodes(stores)
+        meta["episodes"] = {}
+        for split_name, ids in (entry for store in stores for entry in store.manifest["episodes"].items()):
+            meta["episodes"].setdefault(split_name, []).extend(ids)
     if all(store.manifest.get("success_share") is not None for store in stores):
         sizes = [sum(store.counts().values()) for store in stores]
         shares = [store.manifest["success_share"] * size for store, size in zip(stores, sizes, strict=True)]
         meta["success_share"] = sum(shares) / max(1, sum(sizes))
     stamp = {"depth_range": meta["depth_range"]}
-    changed = first["kind"] == "clips" and any(_depth_range(store) != meta["depth_range"] for store in stores)
+    changed = first["kind"] == "clips" and any(one.manifest.get("depth_range") != meta["depth_range"] for one in stores)
     labelled = _labelled(stores)
     splits = {
         name: _copies(
@@ -159,16 +165,8 @@ def _write_merged(stores: Sequence[Store], out: Path, key: str) -> Store:
     return open_store(out)
 
 
-def _words(record: Any) -> Words:
-    return record.words
-
-
 def _labelled(stores: Sequence[Store]) -> bool:
     return all(store.labelled(name) for store in stores for name, count in store.counts().items() if count)
-
-
-def _depth_range(store: Store) -> Any:
-    return store.manifest.get("depth_range")
 
 
 def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
@@ -178,15 +176,6 @@ def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
         for episode, why in store.manifest.get(name, {}).items():
             reasons[f"{episode} ({store.path})" if episode in reasons else episode] = why
     return reasons
-
-
-def _episodes(stores: Sequence[Store]) -> dict[str, list[str]]:
-    """Returns the episodes of all stores by split."""
-    episodes: dict[str, list[str]] = {}
-    for store in stores:
-        for name, ids in store.manifest["episodes"].items():
-            episodes.setdefault(name, []).extend(ids)
-    return episodes
 
 
 def _statistics(stores: Sequence[Store]) -> dict[str, Any]:

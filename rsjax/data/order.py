@@ -7,6 +7,7 @@ to be picklable: a function of a module, or a ``functools.partial`` of one.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import grain
@@ -57,18 +58,19 @@ class Readable:
     """
 
     def __init__(self, component: MixtureComponent, quarantine: Quarantine) -> None:
-        self._source, self._chosen, self._quarantine = component.source, component.chosen, quarantine
+        self._component, self._quarantine = component, quarantine
 
     def __len__(self) -> int:
-        return len(self._source) if self._chosen is None else len(self._chosen)
+        return len(self._component)
 
     def __getitem__(self, index: int) -> tuple[int, Record]:
+        source, chosen = self._component.source, self._component.chosen
         for place in range(index, index + len(self)):
-            number = place % len(self) if self._chosen is None else int(self._chosen[place % len(self)])
+            number = place % len(self) if chosen is None else int(chosen[place % len(self)])
             try:
-                return number, self._source[number]
+                return number, source[number]
             except StoreError as error:
-                self._quarantine.note(place_of(self._source, number), error)
+                self._quarantine.note(place_of(source, number), error)
                 last = error
         raise last
 
@@ -88,7 +90,10 @@ def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine
     for place, stage in enumerate(stages):
         datasets = []
         for component in stage.components:
-            datasets.append(_dataset(component, number, _seed(seed, number), quarantine))
+            # The first component keeps the seed itself, so that it alone is the loader without stages.
+            own_seed = int(np.random.SeedSequence((seed, number)).generate_state(1)[0]) if number else seed
+            records = grain.MapDataset.source(Readable(component, quarantine)).seed(own_seed).shuffle().repeat(None)
+            datasets.append(records.random_map(partial(_transform, component.transform, number)))
             number += 1
         # Grain rounds weights to percents of the smallest one.
         weights = [component.weight for component in stage.components]
@@ -100,23 +105,6 @@ def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine
     return grain.MapDataset.concatenate(mixed) if before else mixed[0]
 
 
-def _dataset(component: MixtureComponent, number: int, seed: int, quarantine: Quarantine) -> grain.MapDataset:
-    dataset = grain.MapDataset.source(Readable(component, quarantine)).seed(seed).shuffle().repeat(None)
-    return dataset.random_map(_Numbered(component.transform, number))
-
-
-def _seed(seed: int, number: int) -> int:
-    """Returns the seed itself for the first component, so that it alone is the loader without stages."""
-    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0]) if number else seed
-
-
-@dataclass(frozen=True)
-class _Numbered:
-    """A transform of (number, record) that keeps the number."""
-
-    transform: Transform
-    part: int
-
-    def __call__(self, numbered: tuple[int, Record], rng: np.random.Generator) -> Arrays:
-        number, record = numbered
-        return self.transform(record, rng) | {"part": np.array(self.part, np.int32), "record": np.array(number)}
+def _transform(transform: Transform, part: int, numbered: tuple[int, Record], rng: np.random.Generator) -> Arrays:
+    number, record = numbered
+    return transform(record, rng) | {"part": np.array(part, np.int32), "record": np.array(number)}

@@ -119,6 +119,3 @@ class _Batches:
 
     def get_state(self) -> dict[str, Any]:
         return self._loader.state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        raise NotImplementedError("a loader starts from its state")

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,7 +25,6 @@ MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
 SHARD_BYTES = 256 * 2**20
 NO_ARRAY = "none"  # the shape of an array that a record does without
-LINK_CURE = "mend the link or permission"
 
 
 class StoreError(FileError):
@@ -193,7 +192,7 @@ def open_store(path: Path | str) -> Store:
             except FileNotFoundError as error:
                 raise StoreError(f"{shard}: missing; {again}") from error
             except OSError as error:
-                raise StoreError(f"{shard}: cannot be read ({error.strerror}); {LINK_CURE}") from error
+                raise StoreError(f"{shard}: cannot be read ({error.strerror}); mend the link or permission") from error
             if size != file["bytes"]:
                 raise StoreError(f"{shard}: {size} bytes, should be {file['bytes']}; {again}")
     return Store(path, manifest)
@@ -246,15 +245,8 @@ def write_store(
 def _write_split(folder: Path, split: str, records: Iterable[Record], label: Label | None) -> dict[str, Any]:
     """Writes the shards and labels of one split and returns its entry in the manifest."""
     labels = LabelWriter()
-    files = _write_shards(folder, split, labels.noting(records, label) if label else records)
-    entry: dict[str, Any] = {"files": files, "count": sum(file["count"] for file in files)}
-    return entry | ({"labels": labels.write(folder / f"{split}-labels.npy")} if label and files else {})
-
-
-def _write_shards(folder: Path, split: str, records: Iterable[Record]) -> list[dict[str, Any]]:
-    """Writes the shards of one split and returns the name, count and size in bytes of each."""
     files: list[dict[str, Any]] = []
-    payloads: Iterator[bytes] = map(encode, records)
+    payloads = map(encode, labels.noting(records, label) if label else records)
     payload = next(payloads, None)
     while payload is not None:
         name, count, size = f"{split}-{len(files):05d}.array_record", 0, 0
@@ -265,4 +257,5 @@ def _write_shards(folder: Path, split: str, records: Iterable[Record]) -> list[d
             payload = next(payloads, None)
         writer.close()
         files.append({"name": name, "count": count, "bytes": (folder / name).stat().st_size})
-    return files
+    entry: dict[str, Any] = {"files": files, "count": sum(file["count"] for file in files)}
+    return entry | ({"labels": labels.write(folder / f"{split}-labels.npy")} if label and files else {})

@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from rsjax.config import content_key
 from rsjax.data.codec import Record
@@ -31,7 +31,6 @@ from rsjax.ingest.annotators.protocols import (
     FlowEstimator,
     SemanticsAnnotator,
     ShotDetector,
-    Tracked,
     Tracker,
 )
 from rsjax.ingest.annotators.semantics import OwnSemantics
@@ -217,61 +216,37 @@ class StoredDepths:
     """
 
     def __init__(self, records: Source, episode: Episode) -> None:
-        self._records, self._episode = _FrameRecords(records), episode
-        self.unit = str(self._records.current["unit"])
+        self._records, self._episode = FrameRecords(records), episode
+        self.unit = str(records[0]["unit"])
 
     def __len__(self) -> int:
         return len(self._episode.timestamps)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
         """Raises :class:`EpisodeError` where a frame has no map."""
-        return np.stack([self._map(int(index)) for index in indices])
+        maps = []
+        for frame in map(int, indices):
+            record = self._records.with_frames(frame, frame)
+            if record is None:
+                raise EpisodeError(f"depth: no map of frame {frame} of episode {self._episode.id}; annotate it again")
+            maps.append(record["depth"][frame - int(record["first"])].astype(np.float32))
+        return np.stack(maps)
 
-    def _map(self, frame: int) -> Float32[np.ndarray, "H W"]:
-        record = self._records.with_frames(frame, frame, lambda record: len(record["depth"]))
-        if record is None:
-            raise EpisodeError(f"depth: no map of frame {frame} of episode {self._episode.id}; annotate it again")
-        return record["depth"][frame - int(record["first"])].astype(np.float32)
 
-
-class StoredTracks:
-    """The points of the tracks step.
-
-    Args:
-        records: none where nothing was tracked.
-    """
+class FrameRecords:
+    """Records of consecutive frames, of depth or tracks. The last one read is kept, as windows come in order."""
 
     def __init__(self, records: Source) -> None:
-        self._records = _FrameRecords(records) if len(records) else None
+        self._records, self._number, self._current = records, -1, Record()
 
-    def at(self, frames: Int[np.ndarray, " T"]) -> Tracked | None:
-        """Reads the points of the shot with these increasing frames, at these frames; None where no shot has all."""
-        if self._records is None:
-            return None
-        first, last = int(frames[0]), int(frames[-1])
-        record = self._records.with_frames(first, last, lambda record: record["points"].shape[1])
-        if record is None:
-            return None
-        columns = frames - int(record["first"])
-        return Tracked(record["points"][:, columns].astype(np.float32), record["visible"][:, columns])
-
-
-class _FrameRecords:
-    """Records of consecutive frames. The last one that was read is kept, as windows come in order."""
-
-    def __init__(self, records: Source) -> None:
-        self._records, self._number, self.current = records, 0, records[0]
-
-    def with_frames(self, first: int, last: int, length: Callable[[Record], int]) -> Record | None:
-        """Returns the record with these two frames and all between; None where there is none.
-
-        Args:
-            length: returns how many frames a record has.
-        """
-        for number in [*range(self._number, len(self._records)), *range(self._number)]:
+    def with_frames(self, first: int, last: int) -> Record | None:
+        """Returns the record with these two frames and all between; None where there is none."""
+        begin = max(0, self._number)
+        for number in [*range(begin, len(self._records)), *range(begin)]:
             if number != self._number:
-                self._number, self.current = number, self._records[number]
-            start = int(self.current["first"])
-            if start <= first and last < start + length(self.current):
-                return self.current
+                self._number, self._current = number, self._records[number]
+            record = self._current
+            length = len(record["depth"]) if "depth" in record else record["points"].shape[1]
+            if record["first"] <= first and last < record["first"] + length:
+                return record
         return None

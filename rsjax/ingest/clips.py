@@ -12,13 +12,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from rsjax.config import content_key, require, to_dict
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.ingest.actions import ActionConfig, Layout, sampled_actions
-from rsjax.ingest.annotate import Annotated, StoredDepths, StoredTracks, camera_of
+from rsjax.ingest.annotate import Annotated, FrameRecords, StoredDepths, camera_of
 from rsjax.ingest.annotators.categories import UNKNOWN, CategoryConfig
 from rsjax.ingest.annotators.depth import FilledDepths
 from rsjax.ingest.annotators.protocols import Tracked
@@ -92,7 +92,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     layout = Layout.from_json(episode.meta.get("actions", {}))
     pictures = _Resized(episode.cameras[camera].read, config.image_size)
     depths, unit = _depths(annotated, camera, config)
-    stored = None if annotated.tracks is None else StoredTracks(annotated.tracks)
+    stored = None if annotated.tracks is None else FrameRecords(annotated.tracks)
     statistics: Statistics | None = None
     near, far, succeeded = np.inf, 0.0, 0
     for number in np.flatnonzero(np.array(reasons) == "").tolist():
@@ -108,7 +108,8 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         statistics = statistics.merged(rows) if statistics else rows
         if depth is not None:
             near, far = min(near, float(depth.min())), max(far, float(depth.max()))
-        success = _success(episode, frames)
+        success = np.asarray(episode.meta.get("success", False), bool)  # by frame, or for the whole
+        success = success[frames] if success.ndim else np.full(len(frames), bool(success))
         succeeded += bool(success[-1])
         yield {
             "rgb": rgb,
@@ -173,22 +174,18 @@ def clip_labels(record: Record) -> dict[str, str]:
     return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in columns}
 
 
-def _success(episode: Episode, frames: Int[np.ndarray, " T"]) -> Bool[np.ndarray, " T"]:
-    """Returns what the data set records, by frame or for the whole; False where it records nothing."""
-    success = np.asarray(episode.meta.get("success", False), bool)
-    return success[frames] if success.ndim else np.full(len(frames), bool(success))
-
-
-def _tracks(stored: StoredTracks | None, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
+def _tracks(stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
     """Returns ``count`` of the points that are visible in a window's first frame; None where there are none.
 
     Without a tracks step they are zeros that are never visible.
     """
     if stored is None:
         return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
-    tracked = stored.at(frames)
-    if tracked is None or not tracked.visible[:, 0].any():
+    record = stored.with_frames(int(frames[0]), int(frames[-1]))
+    columns = frames - record["first"] if record else frames
+    if record is None or not record["visible"][:, columns[0]].any():
         return None
+    tracked = Tracked(record["points"][:, columns].astype(np.float32), record["visible"][:, columns])
     return window_tracks(tracked, np.arange(len(frames)), count)
 
 

@@ -14,7 +14,7 @@ from rsjax.data.store import MANIFEST, StoreError, open_store
 from rsjax.files import disk_guard, lock
 from rsjax.ingest.clips import CLIPS
 from rsjax.ingest.episode import EpisodeRef
-from rsjax.ingest.packing import Contents, choose_contents, cut_episodes, pack, refuse_odd
+from rsjax.ingest.packing import choose_contents, cut_episodes, pack, refuse_odd
 from rsjax.ingest.summary import IngestSummary, no_clips, summarise, write_tables
 from rsjax.ingest.work_items import EpisodeWork, IngestPlan, mark_path, run_episode
 from rsjax.processes import WorkerDied, count_cores, run_items
@@ -80,7 +80,7 @@ def ingest(
     with lock(plan.folder / LOCK) as locked:
         if not locked:
             raise StoreError(f"{plan.out}: another process is making it; wait for that one or stop it")
-        if retry and not forget_failures(plan, refs) and up_to_date:
+        if retry and not _forget_failures(plan, refs) and up_to_date:
             return None
         this_run = _run(plan, refs, run, progress)
         return _pack(plan, refs, duplicates, this_run, progress, keep_clips)
@@ -127,7 +127,7 @@ def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
     return manifest.get("asked") == _plan_key(plan, refs)
 
 
-def forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
+def _forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
     """Removes the marks of what is quarantined, so that it is run again; returns how many there were."""
     failures = 0
     for work in (EpisodeWork(plan, ref) for ref in refs):
@@ -181,7 +181,9 @@ def _pack(
     if not summary.done:
         raise StoreError(no_clips(plan, summary))
     steps = count_steps(plan, refs)
-    keys = {"asked": _plan_key(plan, refs), "key": _store_key(plan, refs, contents)}
+    plan_key = _plan_key(plan, refs)
+    cut = [f"{cut.ref.id} {cut.records}" for cut in contents.episodes()]  # as some episodes may fail
+    keys = {"asked": plan_key, "key": content_key(plan_key, contents.depth_unit, *cut)}
     pack(plan, contents, summary, keys, lambda packed: progress(steps - summary.done + packed, steps))
     for path in plan.items.rglob("*.tmp"):  # killed workers left these
         path.unlink(missing_ok=True)
@@ -197,9 +199,3 @@ def _plan_key(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> str:
     for ref in refs:
         digest.update(plan.keys(ref)[CLIPS].encode())
     return content_key("ingest", digest.hexdigest(), plan.test_share)
-
-
-def _store_key(plan: IngestPlan, refs: Sequence[EpisodeRef], contents: Contents) -> str:
-    """Returns the content key of the store: as some episodes may fail, it also depends on how many clips each gave."""
-    cut = [f"{cut.ref.id} {cut.records}" for cut in contents.episodes()]
-    return content_key(_plan_key(plan, refs), contents.depth_unit, *cut)

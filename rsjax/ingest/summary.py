@@ -80,58 +80,43 @@ def summarise(
     }
     done = clips = 0
     for ref in refs:
-        marks = _marks(plan, ref)
-        for mark in marks:
-            row = steps[mark["stage"]]
+        work, last = EpisodeWork(plan, ref), Mark()
+        for step in plan.steps:
+            mark = work.mark(step.name)
+            if mark is None:
+                raise UserError(f"{work.output(step.name)}: missing; the ingest is not finished, run it again")
+            row = steps[step.name]
             row[mark["status"]] += 1
             row["seconds"] += mark["seconds"]
             row["cpu_seconds"] += mark["cpu_seconds"]
-        last = marks[-1]
-        if last["status"] == "failed":
-            quarantined.append({name: last.get(name, "") for name in _ROW})
-            continue
-        windows.update(last["summary"]["windows"])
-        clips += last["records"]
-        if last["records"]:
-            done += 1
-        elif left := _left_out(last["summary"]["windows"]):
-            filtered[ref.id] = f"windows left out: {', '.join(left)}"
-        else:
-            short[ref.id] = last["summary"]["short"]
+            last = mark
+            if mark["status"] == "failed":
+                quarantined.append({name: mark.get(name, "") for name in _ROW})
+                break
+        else:  # the last mark is that of the cut
+            windows.update(last["summary"]["windows"])
+            clips += last["records"]
+            if last["records"]:
+                done += 1
+            elif left := _left_out(last["summary"]["windows"]):
+                filtered[ref.id] = f"windows left out: {', '.join(left)}"
+            else:
+                short[ref.id] = last["summary"]["short"]
     for row in steps.values():
         row["clips_per_second"] = clips / row["seconds"] if row["seconds"] else None
-    filtered |= _too_short(short)
+    # The same words for all episodes with the same cure.
+    longest = Counter[tuple[str, str]]()
+    for why in short.values():
+        cause = why["window"], why["cure"]
+        longest[cause] = max(longest[cause], why["longest"])
+    for name, why in short.items():
+        most = longest[why["window"], why["cure"]]
+        filtered[name] = f"shorter than a window ({why['window']}; the longest has {most}): {why['cure']}"
     return IngestSummary(len(refs) + len(refused), done, filtered, quarantined, dict(windows), steps)
-
-
-def _marks(plan: IngestPlan, ref: EpisodeRef) -> list[Mark]:
-    """Reads an episode's marks, up to the first failed one."""
-    work, marks = EpisodeWork(plan, ref), list[Mark]()
-    for step in plan.steps:
-        mark = work.mark(step.name)
-        if mark is None:
-            raise UserError(f"{work.output(step.name)}: missing; the ingest is not finished, run it again")
-        marks.append(mark)
-        if mark["status"] == "failed":
-            break
-    return marks
 
 
 def _left_out(windows: dict[str, int]) -> list[str]:
     return [f"{number} {reason}" for reason, number in windows.items() if reason != "kept" and number]
-
-
-def _too_short(episodes: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Returns why these episodes gave no window, in the same words for those with the same cure."""
-    longest = Counter[tuple[str, str]]()
-    for short in episodes.values():
-        cause = short["window"], short["cure"]
-        longest[cause] = max(longest[cause], short["longest"])
-    return {
-        name: f"shorter than a window ({short['window']}; the longest has {longest[short['window'], short['cure']]}): "
-        f"{short['cure']}"
-        for name, short in episodes.items()
-    }
 
 
 def write_tables(plan: IngestPlan, refs: Sequence[EpisodeRef], summary: IngestSummary) -> None:

@@ -77,7 +77,7 @@ def run_episode(sim: LiftSim, config: SimConfig, episode: int) -> Clip:
             "camera": config.camera,
             "control_hz": 20,
             "expert": to_dict(manner),
-            "versions": _versions(),
+            "versions": {name: importlib.metadata.version(name) for name in ("robosuite", "mujoco")},
         },
     )
 
@@ -179,19 +179,17 @@ def _pack(config: SimConfig, partial: Path, out: Path) -> None:
     files = {split: [path for i in of if (path := _clip_file(partial, i)).exists()] for split, of in numbers.items()}
     meta = {"key": collection_key(config), "source": SOURCE, "config": to_dict(config), "quarantine": failures}
     meta |= _statistics(files["train"], files["test"])
-    splits = {split: _stamped(paths, {"depth_range": meta["depth_range"]}) for split, paths in files.items()}
+    stamp = {"depth_range": meta["depth_range"]}
+    splits = {
+        split: (clip | {"provenance": clip["provenance"] | stamp} for clip in _clips(paths))
+        for split, paths in files.items()
+    }
     write_store(out, "clips", splits, meta, labels)
 
 
 def labels(clip: Record) -> dict[str, str]:
     """Returns the labels by which a curriculum can choose a clip."""
     return {"task": clip["task"], "difficulty": difficulty(clip["provenance"])}
-
-
-def _stamped(paths: list[Path], stamp: dict[str, Any]) -> Iterator[Record]:
-    """Yields the clips in these files, with ``stamp`` added to their provenance."""
-    for record in _clips(paths):
-        yield record | {"provenance": record["provenance"] | stamp}
 
 
 def _clips(paths: list[Path]) -> Iterator[Record]:
@@ -224,7 +222,3 @@ def _statistics(train: list[Path], test: list[Path]) -> dict[str, Any]:
         "success_share": float(np.mean(final)),
         "success_ever_share": float(np.mean(ever)),
     }
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in ("robosuite", "mujoco")}

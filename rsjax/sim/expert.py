@@ -111,16 +111,13 @@ class Expert:
             action[5] = np.clip(self.TURN_GAIN * error, -0.5, 0.5)
         if self._step < self._manner.delay:
             action[:] = 0
-        action[:6] += self._next_noise()
-        action[6] = finger
-        self._step += 1
-        return np.clip(action, -1, 1)
-
-    def _next_noise(self) -> Float[np.ndarray, " 6"]:
         scale = np.repeat([self._manner.noise, self._manner.turn_noise], 3)
         fresh = np.sqrt(1 - NOISE_MEMORY**2) * scale * self._rng.standard_normal(6)
         self._noise = NOISE_MEMORY * self._noise + fresh
-        return self._noise
+        action[:6] += self._noise
+        action[6] = finger
+        self._step += 1
+        return np.clip(action, -1, 1)
 
     def _enter(self, phase: str) -> None:
         self._phase, self._phase_step = phase, 0

@@ -50,7 +50,7 @@ class LiftSim:
 
     Args:
         camera: name of one of robosuite's cameras.
-        image_size: S, pixels along each side; 0 builds no renderer.
+        image_size: S, pixels along each side.
 
     Raises:
         GLError: no OpenGL context can be made.
@@ -79,7 +79,7 @@ class LiftSim:
             raise ConfigError(f"sim.camera is {camera!r}; this scene has {', '.join(names)}")
         self._camera_id = names.index(camera)
         self._cube_id = self._model.body(CUBE_BODY).id
-        self._renderer = Renderer(self._model, self._camera_id, image_size) if image_size else None
+        self._renderer = Renderer(self._model, self._camera_id, image_size)
 
     def __enter__(self) -> "LiftSim":
         return self
@@ -89,9 +89,7 @@ class LiftSim:
 
     def close(self) -> None:
         """Frees the renderer and the simulation."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._renderer.close()
         self._env.close()
 
     def reset(self, seed: int) -> None:
@@ -139,12 +137,6 @@ class LiftSim:
         return self._cube_id
 
     @property
-    def cube_half_size(self) -> Float[np.ndarray, " 3"]:
-        """Returns half the cube's edges in metres."""
-        geom = int(self._model.body_geomadr[self._cube_id])
-        return self._model.geom_size[geom].copy()
-
-    @property
     def movable(self) -> Bool[np.ndarray, " bodies"]:
         """Returns whether each body can move at all (is not welded to the world)."""
         return self._model.body_weldid != 0
@@ -155,16 +147,11 @@ class LiftSim:
 
     def render(self) -> View:
         """Renders the current frame."""
-        return self._need_renderer().render(self._data)
+        return self._renderer.render(self._data)
 
     def segment(self) -> Int32[np.ndarray, "S S"]:
         """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
-        return self._need_renderer().segment(self._data)
-
-    def _need_renderer(self) -> Renderer:
-        if self._renderer is None:
-            raise ValueError("this LiftSim was made with image_size=0 or is closed; it cannot render")
-        return self._renderer
+        return self._renderer.segment(self._data)
 
 
 @contextmanager

@@ -88,7 +88,7 @@ def test_a_track_on_the_cube_agrees_with_an_independent_projection(sim: LiftSim,
     """The visible top face: a point of it placed by hand from the cube's pose, projected with the camera's matrix."""
     matrix = camera_matrix(sim)  # the camera stands still
     snapshots, (_, view, bodies) = [m[0] for m in moments], moments[0]
-    offset = np.array([0, 0, sim.cube_half_size[2]])
+    offset = np.array([0, 0, sim._model.geom_size[sim._model.body_geomadr[sim.cube_body]][2]])
 
     def by_hand(shot: Snapshot, local: np.ndarray) -> np.ndarray:
         world = shot.positions[sim.cube_body] + shot.rotations[sim.cube_body] @ local

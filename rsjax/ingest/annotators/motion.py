@@ -34,18 +34,12 @@ class DISFlow(Annotator):
         require(self.preset in (0, 1, 2), f"dis: preset is {self.preset}; choose 0, 1 or 2")
 
     def __call__(self, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
-        method = _dis(self.preset)
-        pairs = zip(_grey(before), _grey(after), strict=True)
-        return np.stack([method.calc(earlier, later, None) for earlier, later in pairs])
+        method: Any = _dis(self.preset)  # its stub knows no None
+        grey = [[cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures] for pictures in (before, after)]
+        return np.stack([method.calc(*pair, None) for pair in zip(*grey, strict=True)])
 
 
-@lru_cache(maxsize=1)
-def _dis(preset: int) -> Any:
-    return cv2.DISOpticalFlow.create(preset)
-
-
-def _grey(pictures: Pictures) -> list[UInt8[np.ndarray, "H W"]]:
-    return [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
+_dis = lru_cache(maxsize=1)(cv2.DISOpticalFlow.create)
 
 
 def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: FlowEstimator) -> Motion:
