@@ -65,13 +65,15 @@ class BairSource:
         for file in self.files:
             first, last = _trajectories(Path(file).name)
             ids = safe_id(file.removesuffix(".tfrecords").replace("/", "-")) + "-{:03d}"
-            expected = max(1, last - first + 1), "its name promises"
-            yield from record_refs(self.folder, file, ids, expected, self.fps)
+            yield from record_refs(self.folder, file, ids, (max(1, last - first + 1), "its name promises"), self.fps)
 
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one record."""
         example = read_record(self.folder, ref)
-        count = _count_steps(example)
+        steps = {int(name.partition("/")[0]) for name in example.names() if re.fullmatch(r"\d+/.+", name)}
+        count = len(steps)
+        if lacking := sorted(set(range(max(count, 1))) - steps):
+            raise EpisodeError.at(example.where, f"has no step {lacking[0]}")
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -90,15 +92,6 @@ def _trajectories(name: str) -> tuple[int, int]:
     """Returns the first and last trajectory that a file's name promises; -1 if it promises none."""
     match = re.match(r"traj_(\d+)_to_(\d+)", name)
     return (int(match[1]), int(match[2])) if match else (-1, -1)
-
-
-def _count_steps(example: Example) -> int:
-    """Returns the number of steps; :class:`EpisodeError` if there are none or one is missing."""
-    steps = {int(name.partition("/")[0]) for name in example.names() if re.fullmatch(r"\d+/.+", name)}
-    lacking = sorted(set(range(max(len(steps), 1))) - steps)
-    if lacking:
-        raise EpisodeError.at(example.where, f"has no step {lacking[0]}")
-    return len(steps)
 
 
 def _rows(example: Example, key: str, count: int) -> Float32[np.ndarray, "N n"]:

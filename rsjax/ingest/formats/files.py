@@ -129,24 +129,18 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
     """Reads a Parquet file: those of the columns that it has, and the rows that pass ``filters``.
 
     Raises:
-        EpisodeError: it is missing, damaged or too large.
+        EpisodeError: it is missing, damaged or too large: one number a thousand million times takes few bytes.
     """
     with reading(path):
         with pq.ParquetFile(regular(path)) as file:
             names = file.schema_arrow.names
             chosen = names if columns is None else [name for name in columns if name in names]
-            _check_size(file.metadata, MAX_CELLS if filters is None else _MOST_ROWS, path)
+            # The metadata of column chunks stay unread: if those are damaged, pyarrow ends the process.
+            count = file.metadata.num_rows
+            size = sum(file.metadata.row_group(number).total_byte_size for number in range(file.num_row_groups))
+            if count > (MAX_CELLS if filters is None else _MOST_ROWS) or size > _MOST_BYTES:
+                raise EpisodeError.at(path, f"{count} rows of {size} bytes, more than a table can have")
         return pq.read_table(path, columns=chosen, filters=filters, partitioning=None)
-
-
-def _check_size(metadata: pq.FileMetaData, most: int, path: Path) -> None:
-    """Raises :class:`EpisodeError` if a table is too large: one number a thousand million times takes few bytes.
-
-    Does not read the metadata of column chunks: if those are damaged, pyarrow ends the process.
-    """
-    size = sum(metadata.row_group(number).total_byte_size for number in range(metadata.num_row_groups))
-    if metadata.num_rows > most or size > _MOST_BYTES:
-        raise EpisodeError.at(path, f"{metadata.num_rows} rows of {size} bytes, more than a table can have")
 
 
 def matrix(table: pa.Table, column: str, where: Path | str) -> Float32[np.ndarray, "N A"]:

@@ -85,6 +85,10 @@ class StoreSource:
         camera = str(provenance.get("camera", "camera"))
         steps = int(self.store.manifest.get("config", {}).get("control_steps", 1))
         fps, timestamps = _times(provenance, len(record["rgb"]), steps)
+        width = record["actions"].shape[1]
+        grippers: tuple[int, ...] = ()
+        if "control_hz" in provenance and width % steps == 0:  # the last dimension of each control step of a simulator
+            grippers = tuple(range(width // steps - 1, width, width // steps))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
         return Episode(
             id=ref.id,
@@ -100,17 +104,10 @@ class StoreSource:
                 "source": self.store.manifest.get("source", "sim"),
                 "clip": place,
                 "provenance": provenance,
-                "actions": Layout(held=_grippers(provenance, record["actions"].shape[1], steps)).to_json(),
+                "actions": Layout(held=grippers).to_json(),
                 "success": np.asarray(record.get("success", []), bool).tolist(),
             },
         )
-
-
-def _grippers(provenance: dict[str, Any], width: int, steps: int) -> tuple[int, ...]:
-    """Returns the last dimension of each control step of a simulator; other clips do not say."""
-    if "control_hz" not in provenance or width % steps:
-        return ()
-    return tuple(range(width // steps - 1, width, width // steps))
 
 
 def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, Float[np.ndarray, " N"]]:

@@ -6,7 +6,6 @@ CRC-32C, rotated and offset ("masked"). The reader that Grain brings checks neit
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -50,23 +49,10 @@ message_type {
 """
 
 
-@dataclass(frozen=True)
-class Span:
-    """Where a record lies in its file.
+def spans(path: Path) -> Iterator[tuple[int, int, int]]:
+    """Yields each record's offset and payload length, both in bytes, and the masked checksum written behind it.
 
-    Attributes:
-        offset: bytes to its head.
-        length: bytes of its payload.
-        crc: the payload's masked checksum, as it is written in the file.
-    """
-
-    offset: int
-    length: int
-    crc: int
-
-
-def spans(path: Path) -> Iterator[Span]:
-    """Yields every record of a file, in order, from the heads alone.
+    Only heads and checksums are read.
 
     Raises:
         EpisodeError: the file cannot be read, or is damaged after the last record that was yielded.
@@ -86,7 +72,7 @@ def spans(path: Path) -> Iterator[Span]:
             if end > size:
                 raise EpisodeError.at(path, f"truncated: a record ends at byte {end}, the file at byte {size}")
             file.seek(end - _FOOT)
-            yield Span(offset, length, int.from_bytes(file.read(_FOOT), "little"))
+            yield offset, length, int.from_bytes(file.read(_FOOT), "little")
             offset = end
 
 
@@ -102,10 +88,9 @@ def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], sett
     """
     number = 0
     try:
-        for number, span in enumerate(spans(root / file), 1):
-            mark = fingerprint((), file, span.length, span.crc, "", settings)
-            location = {"file": file, "offset": span.offset, "length": span.length}
-            yield EpisodeRef(ids.format(number - 1), mark, location)
+        for number, (offset, length, crc) in enumerate(spans(root / file), 1):
+            mark = fingerprint((), file, length, crc, "", settings)
+            yield EpisodeRef(ids.format(number - 1), mark, {"file": file, "offset": offset, "length": length})
         if number < expected[0]:
             raise EpisodeError.at(root / file, f"has {number} of the {expected[0]} records that {expected[1]}")
     except EpisodeError as error:
