@@ -1,6 +1,7 @@
 """Replays a skipped training step to find the clips whose loss or gradient is not finite."""
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
@@ -67,13 +68,10 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
 def _newest(setup: Setup, directory: Path) -> TrainState:
     loop = replace(setup.loop, sharding="jit", fsdp=1)
     sharding = Sharding.create(loop)
-    checkpoints = Checkpoints(directory / "checkpoints", read_only=True)
-    try:
+    with closing(Checkpoints(directory / "checkpoints", read_only=True)) as checkpoints:
         if checkpoints.latest() is None:
             return sharding.init(setup.model, loop, setup.start)
         return checkpoints.restore(sharding.template(setup.model, loop))[0]
-    finally:
-        checkpoints.close()
 
 
 @partial(jax.jit, static_argnums=0)

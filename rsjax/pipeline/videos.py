@@ -86,7 +86,9 @@ def write_videos(
     for number in clips:
         clip = source[number]
         actions = _lasting(clip["actions"] if foreign is None else foreign, request, config)
-        made = _generate(trained, clip, actions, number)
+        prompt = Clips.stacked([clip], [number]).video.frames(0, config.prompt_frames)
+        inputs = (trained.params, trained.assets, prompt, actions[None])
+        made = trained.model.generate(*inputs, index=np.array([number]))
         alone = foreign is not None or len(actions) > len(clip["rgb"])
         name = f"{request.split}_{number:03d}{'' if foreign is None else '_other_actions'}"
         path = out / f"{name}{'' if request.frames is None else f'_{request.frames}_frames'}.{kind}"
@@ -137,12 +139,6 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
     model = dataclasses.replace(trained.config.model, sample=dataclasses.replace(settings, **sample))  # type: ignore[call-arg]
     config = dataclasses.replace(trained.config, model=model)
     return dataclasses.replace(trained, config=config, model=create_model(config))
-
-
-def _generate(trained: TrainedModel, clip: Record, actions: np.ndarray, number: int) -> Video:
-    prompt = Clips.stacked([clip], [number]).video.frames(0, trained.config.prompt_frames)
-    inputs = (trained.params, trained.assets, prompt, actions[None])
-    return trained.model.generate(*inputs, index=np.array([number]))
 
 
 def _side_by_side(clip: Record, made: Video, number: int) -> UInt8[np.ndarray, "T H W 3"]:

@@ -1,9 +1,8 @@
 """Encodes and decodes numpy images with a trained tokenizer: RGB frames and depth maps."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import Literal, cast
 
 import jax
 import numpy as np
@@ -52,7 +51,7 @@ class Codec:
 
     def encode_rgb(self, frames: UInt8[np.ndarray, "*B H W 3"]) -> Int[np.ndarray, "*B h w"]:
         """Encodes frames 0–255."""
-        return self._chunked(_encode, frames, 3)
+        return self._chunked("encode", frames)
 
     def encode_depth(self, depth: Float[np.ndarray, "*B H W"]) -> Int[np.ndarray, "*B h w"]:
         """Encodes the colour maps of depth in metres.
@@ -61,11 +60,11 @@ class Codec:
             UserError: no clip of the data has depth.
         """
         colors = depth_to_color(depth, *self._depth_range(), self.config.depth_scale)
-        return self._chunked(_encode, colors.astype(np.uint8), 3)
+        return self._chunked("encode", colors.astype(np.uint8))
 
     def decode_rgb(self, tokens: Int[np.ndarray, "*B h w"]) -> UInt8[np.ndarray, "*B H W 3"]:
         """Decodes tokens to frames 0–255."""
-        return np.round(self._chunked(_decode, np.asarray(tokens), 2)).astype(np.uint8)
+        return np.round(self._chunked("decode", np.asarray(tokens))).astype(np.uint8)
 
     def decode_depth(self, tokens: Int[np.ndarray, "*B h w"]) -> Float32[np.ndarray, "*B H W"]:
         """Decodes tokens of depth colour maps to metres.
@@ -74,7 +73,7 @@ class Codec:
             UserError: no clip of the data has depth.
         """
         near, far = self._depth_range()
-        colors = self._chunked(_decode, np.asarray(tokens), 2)
+        colors = self._chunked("decode", np.asarray(tokens))
         return color_to_depth(colors, near, far, self.config.depth_scale)
 
     def _depth_range(self) -> tuple[float, float]:
@@ -85,9 +84,8 @@ class Codec:
             )
         return self.normalization.depth_range
 
-    def _chunked(
-        self, function: Callable[[TokenizerConfig, Params, ArrayLike], ArrayLike], images: np.ndarray, item_axes: int
-    ) -> np.ndarray:
+    def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
+        item_axes = {"encode": 3, "decode": 2}[method]
         lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
         flat = images.reshape(-1, *item)
         size = min(CHUNK, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
@@ -95,16 +93,11 @@ class Codec:
         for start in range(0, len(flat), size):
             chunk = flat[start : start + size]
             padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
-            out.append(np.asarray(function(self.config, self.params, padded))[: len(chunk)])
+            out.append(np.asarray(_apply(self.config, method, self.params, padded))[: len(chunk)])
         joined = np.concatenate(out)
         return joined.reshape(*lead, *joined.shape[1:])
 
 
-@partial(jax.jit, static_argnums=0)
-def _encode(config: TokenizerConfig, params: Params, images: ArrayLike) -> ArrayLike:
-    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, images, method="encode"))
-
-
-@partial(jax.jit, static_argnums=0)
-def _decode(config: TokenizerConfig, params: Params, tokens: ArrayLike) -> ArrayLike:
-    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, tokens, method="decode"))
+@partial(jax.jit, static_argnums=(0, 1))
+def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:
+    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, x, method=method))

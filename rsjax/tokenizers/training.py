@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Key, UInt8
 
 from rsjax.config import Config, ConfigError, TokenizerConfig, TokenizerTrainConfig, from_dict, require
 from rsjax.config.fields import differences
@@ -86,7 +86,32 @@ class TokenizerTraining(Trainable[Images]):
         return extra or None
 
     def loss_terms(self, params: Params, batch: Images, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        return tokenizer_terms(self.tokenizer, self.train, params, batch, *context)
+        """Returns the active terms of one batch of images, named as their weights.
+
+        ``context.extra`` has "lpips", the metric's weights, and "lecam", the averages of logits, if their terms are
+        active.
+        """
+        train, (step, carried, axis_name) = self.train, context
+        extra = cast(dict[str, Any], carried)
+        target, variables = to_unit(batch), {"params": self.tokenizer_params(params)}
+        output, latents = cast(tuple[Images, Latents], Tokenizer(self.tokenizer).apply(variables, target))
+        count = jnp.float32(batch.shape[0])
+        error = (target - output).astype(jnp.float32)
+        total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
+        means = {
+            "l1": jnp.mean(jnp.abs(error)),
+            "l2": jnp.mean(jnp.square(error)),
+            "entropy": lfq.entropy_loss(latents, train.entropy_temperature, total),
+            "commitment": lfq.commitment_loss(latents),
+        }
+        if "perceptual" in train.loss_weights:
+            means["perceptual"] = jnp.mean(lpips(extra["lpips"], target, output))
+        terms = {name: (mean * count, count) for name, mean in means.items()}
+        if "adversarial" in train.loss_weights:
+            active = (step >= train.disc_start).astype(jnp.float32)
+            judge, averages = params["discriminator"], extra["lecam"]
+            terms |= adversarial_terms(train, judge, target, output, active, averages, axis_name)
+        return terms
 
     def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
         if extra is None or "lecam" not in self.loss_weights:
@@ -167,49 +192,3 @@ def image_batch(arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
     """Returns stacked outputs of :class:`TokenizerImages` as one batch of images."""
     images = arrays["images"]
     return images.reshape(-1, *images.shape[2:])
-
-
-def tokenizer_terms(
-    config: TokenizerConfig,
-    train: TokenizerTrainConfig,
-    params: Params,
-    images: Float[Array, "B H W 3"],
-    step: Int[Array, ""],
-    extra: Extra = None,
-    axis_name: str | None = None,
-) -> dict[str, Term]:
-    """Returns the active terms of one batch of images (0–255), named as their weights.
-
-    Args:
-        params: the tokenizer's; with an adversarial term, {"generator": the tokenizer's, "discriminator": …}.
-        step: the number of steps before this one.
-        extra: "lpips", the metric's weights, and "lecam", the averages of logits, if their terms are active.
-        axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
-    """
-    weights = train.loss_weights
-    generator = params["generator"] if "adversarial" in weights else params
-    target = to_unit(images)
-    output, latents = cast(tuple[Images, Latents], Tokenizer(config).apply({"params": generator}, target))
-    count = jnp.float32(images.shape[0])
-    error = (target - output).astype(jnp.float32)
-    total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
-    means = {
-        "l1": jnp.mean(jnp.abs(error)),
-        "l2": jnp.mean(jnp.square(error)),
-        "entropy": lfq.entropy_loss(latents, train.entropy_temperature, total),
-        "commitment": lfq.commitment_loss(latents),
-    }
-    if "perceptual" in weights:
-        means["perceptual"] = jnp.mean(lpips(_carried(extra, "lpips"), target, output))
-    terms = {name: (mean * count, count) for name, mean in means.items()}
-    if "adversarial" in weights:
-        active = (step >= train.disc_start).astype(jnp.float32)
-        terms |= adversarial_terms(
-            train, params["discriminator"], target, output, active, _carried(extra, "lecam"), axis_name
-        )
-    return terms
-
-
-def _carried(extra: Extra, name: str) -> Any:
-    assert extra is not None
-    return extra[name]

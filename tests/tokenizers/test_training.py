@@ -15,7 +15,7 @@ from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.tokenizers.training import TokenizerTraining, tokenizer_terms
+from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import StepContext
 from rsjax.training.checkpoint import load_weights
 from tests.tokenizers.test_lpips import narrow
@@ -74,8 +74,14 @@ def test_the_whole_loss_is_the_sum_of_its_parts() -> None:
         output, _ = Tokenizer(config).apply({"params": params["generator"]}, target)
         expected = {"perceptual": (2 * jnp.mean(lpips(extra["lpips"], target, output)), jnp.float32(2))}
         judged = (train, params["discriminator"], target, output, jnp.float32(1), extra["lecam"], None)
-        terms = tokenizer_terms(config, train, params, jnp.array(images), jnp.int32(3), extra)
-        plain = tokenizer_terms(config, TokenizerTrainConfig(), params["generator"], jnp.array(images), jnp.int32(0))
+
+        def terms_of(train: TokenizerTrainConfig, params: Any, step: int, extra: Any) -> Any:
+            context = StepContext(jnp.int32(step), extra, None)
+            model = TokenizerTraining(config, train, images.shape[1])
+            return model.loss_terms(params, jnp.array(images), jax.random.key(0), context)
+
+        terms = terms_of(train, params, 3, extra)
+        plain = terms_of(TokenizerTrainConfig(), params["generator"], 0, None)
         return terms, plain | expected | adversarial_terms(*judged)
 
     terms, expected = both(params)
