@@ -13,7 +13,7 @@ from rich.table import Table
 from rsjax.bench import parts
 from rsjax.bench.timing import peak_memory_bytes
 from rsjax.bench.torch_part import check_torch, torch_baseline
-from rsjax.config import Config, ConfigError
+from rsjax.config import Config, require
 from rsjax.errors import did_you_mean
 
 PARTS = ("matmul", "train", "sample", "tokenizer", "loader", "feed")
@@ -76,15 +76,12 @@ def bench(
 def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int], torch: bool) -> None:
     """Raises :class:`UserError` if a part cannot be measured, before any is."""
     for name in only:
-        if name not in PARTS:
-            raise ConfigError(f"--only has no part {name!r}{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})")
-    if batch < 1:
-        raise ConfigError(f"--batch is {batch}; at least 1 clip is needed")
+        known = f"{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})"
+        require(name in PARTS, f"--only has no part {name!r}{known}")
+    require(batch >= 1, f"--batch is {batch}; at least 1 clip is needed")
     for frames in horizons:
-        if frames <= parts.PROMPT_FRAMES:
-            raise ConfigError(
-                f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
-            )
+        problem = f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
+        require(frames > parts.PROMPT_FRAMES, problem)
     if torch:
         check_torch(config)
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from rsjax.bench.timing import median_seconds
-from rsjax.config import Config, ConfigError, TokenModelConfig
+from rsjax.config import Config, ConfigError, TokenModelConfig, require
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 
@@ -33,17 +33,11 @@ def check_torch(config: Config) -> Architecture:
 
 def check_plain(model: Architecture) -> None:
     """Raises :class:`ConfigError` if the model has an option that the baseline lacks."""
+    plain, cure = "and the PyTorch baseline is the plain Genie", "or leave the baseline out"
     for name in ADDED:
-        if getattr(model, name):
-            raise ConfigError(
-                f"model.{name} is on, and the PyTorch baseline is the plain Genie, without it; "
-                f"set it to False, or leave the baseline out"
-            )
-    if model.positions != "learned":
-        raise ConfigError(
-            f"model.positions is {model.positions!r}, and the PyTorch baseline is the plain Genie, which learns them; "
-            f"set it to 'learned', or leave the baseline out"
-        )
+        require(not getattr(model, name), f"model.{name} is on, {plain}, without it; set it to False, {cure}")
+    problem = f"model.positions is {model.positions!r}, {plain}, which learns them; set it to 'learned', {cure}"
+    require(model.positions == "learned", problem)
 
 
 def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:

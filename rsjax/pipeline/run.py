@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_s
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
-from rsjax.files import write_json
+from rsjax.files import FileError, read_json, write_json
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
@@ -167,10 +167,9 @@ class Run:
 
     def mark(self, stage: str) -> dict[str, Any]:
         """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started."""
-        try:
-            return json.loads((self.directory / stage / MARK).read_text())
-        except (OSError, ValueError):
-            return {}
+        with suppress(FileError):
+            return read_json(self.directory / stage / MARK)
+        return {}
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Path]:

@@ -67,8 +67,15 @@ def write_report(path: Path, report: Report) -> None:
         ValueError: a log without numbers.
         OSError: the disk is full or the directory is not writable.
     """
-    template = _environment().get_template("page.html.j2")
-    html = template.render(
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rsjax.report", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["duration"] = duration
+    html = environment.get_template("page.html.j2").render(
         report=report,
         headline=_HEADLINE_CLIPS,
         clips=[_clip_pictures(clip) for clip in report.clips],
@@ -81,18 +88,6 @@ def write_report(path: Path, report: Report) -> None:
         settings=_settings(report.config),
     )
     write_file(path, html.encode())
-
-
-def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rsjax.report", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters["duration"] = duration
-    return environment
 
 
 def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import importlib
 import json
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import write_atomically
+from rsjax.files import FileError, read_json, write_json
 from rsjax.progress import note
 
 ID_FILE = "wandb.json"
@@ -101,12 +102,10 @@ class WandbRun:
 
 def _run_id(path: Path, project: str, resume: bool) -> str:
     """Returns the id in the file if it belongs to this project; otherwise a new one, which it writes there."""
-    try:
-        kept = json.loads(path.read_text())
-    except (OSError, ValueError):
-        kept = {}
-    if resume and kept.get("project") == project:
-        return kept["id"]
+    with suppress(FileError):
+        kept = read_json(path)
+        if resume and kept.get("project") == project:
+            return kept["id"]
     run_id = uuid.uuid4().hex[:12]
-    write_atomically(path, json.dumps({"project": project, "id": run_id}).encode())
+    write_json(path, {"project": project, "id": run_id})
     return run_id
