@@ -29,7 +29,7 @@ def tapir(tmp_path):
 
 def test_spatial_trackers_pixels_become_shares_of_the_picture(spatial):
     points = np.array([[0.25, 0.5], [0.5, 0.75]], np.float32)
-    places, seen = spatial.follow(FRAMES.pictures, points, DEPTH.maps)
+    places, seen = spatial.follow(FRAMES.pictures, points, DEPTH.pictures)
     np.testing.assert_allclose(places, points[:, None] + np.arange(9)[:, None] * STEP, atol=1e-6)
     assert seen.all() and places.dtype == np.float32
 
@@ -62,7 +62,7 @@ def test_places_that_are_not_finite_are_refused(spatial, tmp_path):
 
 def test_spatial_tracker_follows_through_fewer_frames_than_its_window(spatial):
     points = np.array([[0.25, 0.5]], np.float32)
-    places, seen = spatial.follow(FRAMES.pictures[:2], points, DEPTH.maps[:2])
+    places, seen = spatial.follow(FRAMES.pictures[:2], points, DEPTH.pictures[:2])
     np.testing.assert_allclose(places, points[:, None] + np.arange(2)[:, None] * STEP, atol=1e-6)
     assert seen.all() and places.shape == (1, 2, 2)
 
