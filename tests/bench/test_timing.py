@@ -35,5 +35,5 @@ def test_the_median_leaves_out_warm_up_and_one_slow_run(monkeypatch: pytest.Monk
 def test_peak_memory_grows_by_what_is_touched_and_stays() -> None:
     before = peak_memory_bytes()
     resident = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    np.ones((before - resident + 2**25) // 8)
-    assert before + 2**24 <= peak_memory_bytes() < before + 2**27
+    np.ones((before - resident + 2**28) // 8)  # much more, as other threads may free some meanwhile
+    assert before + 2**24 <= peak_memory_bytes() < before + 2**29
