@@ -42,7 +42,7 @@ class TrainedModel:
             depth: z-depth of the frames in metres; None if unknown.
 
         Returns:
-            All T frames with their depth (None if the model or the clips have none); without a leading axis for one
+            All T frames with their depth (None without a depth branch or ``depth``); without a leading axis for one
             clip. The first P frames are the prompt as the model sees it.
 
         Raises:
