@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -14,6 +14,7 @@ from rsjax.ingest.episode import LEAVE_OUT, MAX_PIXELS, EpisodeError, regular
 from rsjax.ingest.formats.files import MAX_CELLS
 
 _MOST_CHUNK = 2**30  # bytes that HDF5 unpacks at once, however few of them are read
+Stored = Literal["upright", "bottom first", "half turn"]  # how a file has its pictures
 
 
 @contextmanager
@@ -74,15 +75,15 @@ class H5Frames:
     Args:
         path: the file.
         key: of the data set: pictures, uint8 [N, H, W, 3]; depth maps, floats [N, H, W] or [N, H, W, 1] in metres.
-        turned: whether they are upside down, by half a turn.
+        stored: how the file has them: upright, with the bottom row first, or turned by half a turn.
         depth: whether they are depth maps.
 
     Raises:
         EpisodeError: the data set has another shape or type.
     """
 
-    def __init__(self, path: Path, key: str, turned: bool = False, depth: bool = False) -> None:
-        self._path, self._key, self._turned, self._depth = path, key, turned, depth
+    def __init__(self, path: Path, key: str, stored: Stored = "upright", depth: bool = False) -> None:
+        self._path, self._key, self._stored, self._depth = path, key, stored, depth
         with open_file(path) as file:
             data = member(file, key, path)
             if not isinstance(data, h5py.Dataset) or data.shape is None:
@@ -106,7 +107,10 @@ class H5Frames:
             pictures = file[self._key][wanted][order]
         if self._depth:
             pictures = pictures.reshape(pictures.shape[:3]).astype(np.float32)
-        return np.ascontiguousarray(pictures[:, ::-1, ::-1]) if self._turned else pictures
+        if self._stored == "upright":
+            return pictures
+        columns = slice(None, None, -1 if self._stored == "half turn" else 1)
+        return np.ascontiguousarray(pictures[:, ::-1, columns])
 
 
 def attribute(group: Any, name: str) -> Any:

@@ -29,7 +29,7 @@ from rsjax.ingest.episode import (
     fingerprint,
 )
 from rsjax.ingest.formats.files import broken, inside, location_of
-from rsjax.ingest.formats.hdf5 import H5Frames, attribute, member, open_file, rows
+from rsjax.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
 
 _RENDER = "render them with robomimic's dataset_states_to_obs.py --camera_names …"
 
@@ -44,7 +44,7 @@ class Convention:
         states: keys below ``obs`` that make up the state, as far as a file has them.
         quaternions: those of them that are one; their sign is made continuous.
         after: whether ``obs[t]`` was recorded after ``actions[t]``.
-        turned: whether pictures are upside down, by half a turn.
+        stored: as in :class:`rsjax.ingest.formats.hdf5.H5Frames`.
         fps: if the file does not say.
     """
 
@@ -53,7 +53,7 @@ class Convention:
     states: tuple[str, ...]
     quaternions: tuple[str, ...] = ()
     after: bool = False
-    turned: bool = False
+    stored: Stored = "upright"
     fps: float = 20.0
 
 
@@ -167,9 +167,9 @@ class DemoSource:
             timestamps=np.arange(len(commands)) / fps,
             actions=align_actions(commands, how.after),
             states=states,
-            cameras={camera: H5Frames(path, f"{observed.name}/{key}", how.turned) for camera, key in cameras.items()},
+            cameras={camera: H5Frames(path, f"{observed.name}/{key}", how.stored) for camera, key in cameras.items()},
             depth={
-                camera: H5Frames(path, f"{observed.name}/{camera}_depth", how.turned, depth=True)
+                camera: H5Frames(path, f"{observed.name}/{camera}_depth", how.stored, depth=True)
                 for camera in cameras
                 if self.depth and f"{camera}_depth" in observed
             },

@@ -10,13 +10,19 @@ from tests.ingest.formats.toy_demos import SIDE, demo, write_demos
 
 
 def libero_demo(count: int = 4) -> dict[str, np.ndarray]:
-    return demo(count, turned=True, ending="_rgb")
+    return demo(count, bottom_first=True, ending="_rgb")
 
 
-def test_pictures_are_turned_upright(tmp_path: Path) -> None:
-    write_demos(tmp_path / "libero_goal" / "open_the_drawer_demo.hdf5", {"demo_0": libero_demo()})
-    frames = read_first("libero", tmp_path).cameras["agentview"].read([1])
-    assert frames[0, 0, 0, 0] == 255 and frames[0, SIDE - 1, SIDE - 1, 0] == 11
+def test_pictures_and_depth_are_flipped_upright_and_mirrored_only_if_asked(tmp_path: Path) -> None:
+    maps = np.ones((4, SIDE, SIDE, 1), np.float32)
+    maps[:, -1, 0] = 3  # upper left: the bottom row comes first
+    path = tmp_path / "libero_goal" / "open_the_drawer_demo.hdf5"
+    write_demos(path, {"demo_0": libero_demo() | {"obs/agentview_depth": maps}})
+    for half_turn, corner in ((False, (0, 0)), (True, (0, SIDE - 1))):
+        episode = read_first("libero", tmp_path, depth=True, half_turn=half_turn)
+        picture = episode.cameras["agentview"].read([1])[0, ..., 0]
+        assert np.argwhere(picture == 255).tolist() == [list(corner)]
+        assert np.argwhere(episode.depth["agentview"].read([1])[0] == 3).tolist() == [list(corner)]
 
 
 def test_an_action_stands_with_the_frame_that_was_recorded_after_it(tmp_path: Path) -> None:

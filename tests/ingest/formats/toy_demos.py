@@ -11,18 +11,18 @@ import numpy as np
 SIDE = 6
 
 
-def pictures(count: int, turned: bool = False) -> np.ndarray:
+def pictures(count: int, bottom_first: bool = False) -> np.ndarray:
     """Frame t is ``10 + t``, with a bright pixel in the upper left corner of the upright picture."""
     frames = np.broadcast_to(10 + np.arange(count, dtype=np.uint8)[:, None, None, None], (count, SIDE, SIDE, 3)).copy()
     frames[:, 0, 0] = 255
-    return frames[:, ::-1, ::-1] if turned else frames
+    return frames[:, ::-1] if bottom_first else frames
 
 
-def demo(count: int = 4, turned: bool = False, ending: str = "_image") -> dict[str, np.ndarray]:
+def demo(count: int = 4, bottom_first: bool = False, ending: str = "_image") -> dict[str, np.ndarray]:
     """Action t is t + 1 in every dimension; the state t is 10 t."""
     return {
         "actions": np.repeat(np.arange(count) + 1.0, 7).reshape(count, 7),
-        f"obs/agentview{ending}": pictures(count, turned),
+        f"obs/agentview{ending}": pictures(count, bottom_first),
         "obs/robot0_eef_pos": np.repeat(np.arange(count) * 10.0, 3).reshape(count, 3),
         "obs/ee_states": np.repeat(np.arange(count) * 10.0, 6).reshape(count, 6),
     }
