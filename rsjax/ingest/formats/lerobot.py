@@ -5,13 +5,12 @@ camera; in v3 many episodes share a file, and an episode's pictures are looked u
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Kind, Layout, align_actions, check_layout
@@ -35,12 +34,11 @@ from rsjax.ingest.formats.files import (
     location_of,
     matrix,
     media,
-    parquet_columns,
     parquet_rows,
     seconds,
 )
 from rsjax.ingest.formats.lerobot_info import Info, read_info
-from rsjax.ingest.pictures import decode_pictures
+from rsjax.ingest.formats.lerobot_tables import TablePictures, read_rows
 from rsjax.ingest.video import at_times
 
 TOLERANCE = 1e-4  # seconds, LeRobot's own
@@ -113,9 +111,8 @@ class LeRobot:
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one episode; its pictures are not decoded, but their times are checked."""
         location = location_of(ref)
-        path = inside(self._root, location["data"])
         names = ("timestamp", "frame_index", "episode_index", "index", "task_index", self._action, self._state)
-        table = parquet_columns(path, names, _only(location))
+        path, table = read_rows(self._root, self._info.data_path, location, names)
         times = seconds(table, "timestamp", path)
         self._check_rows(table, times, location, path)
         actions = matrix(table, self._action, path)
@@ -188,8 +185,6 @@ class LeRobot:
         if count != location["length"]:
             problem = f"{count} rows of episode {number}, metadata say {location['length']}"
             raise EpisodeError.at(path, problem, kind="length")
-        if count == 0:
-            raise EpisodeError.at(path, f"episode {number} has no frames", "leave it out", "length")
         expected = {"episode_index": np.full(count, number), "frame_index": np.arange(count)}
         if "rows" in location:
             first, end = location["rows"]
@@ -225,41 +220,6 @@ class LeRobot:
         return cameras
 
 
-@dataclass(frozen=True, eq=False)
-class TablePictures:
-    """Encoded pictures in an episode's table, as :class:`rsjax.ingest.episode.Frames`.
-
-    Attributes:
-        path: the table.
-        column: of ``{bytes, path}``.
-        location: the episode's.
-    """
-
-    path: Path
-    column: str
-    location: dict[str, Any]
-
-    def __len__(self) -> int:
-        return self.location["length"]
-
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """Returns these pictures; :class:`EpisodeError` names one that is missing or damaged."""
-        table = parquet_columns(self.path, [self.column], _only(self.location))
-        if self.column not in table.column_names:
-            raise EpisodeError.at(self.path, f"has no column {self.column!r}")
-        if table.num_rows != len(self):
-            raise EpisodeError.at(self.path, f"{table.num_rows} rows of {self.column}, not {len(self)}")
-        cells = table[self.column].take(list(indices)).to_pylist()
-        payloads: list[tuple[str, bytes]] = []
-        for index, cell in zip(indices, cells, strict=True):
-            where = f"{self.path}: {self.column} of row {index}"
-            payload = cell.get("bytes") if isinstance(cell, dict) else cell
-            if not isinstance(payload, bytes):
-                raise EpisodeError.at(where, "has no encoded picture", kind="undecodable")
-            payloads.append((where, payload))
-        return decode_pictures(payloads)
-
-
 def _tasks(meta: Path, shared: bool) -> dict[int, str]:
     try:
         if not shared:
@@ -274,11 +234,6 @@ def _tasks(meta: Path, shared: bool) -> dict[int, str]:
 def _tolerance(times: Float[np.ndarray, " N"]) -> float:
     """Returns the seconds that a time may be off: LeRobot's, and what float32, which stores times, rounds away."""
     return TOLERANCE + float(np.spacing(np.float32(np.abs(times).max(initial=0))))
-
-
-def _only(location: dict[str, Any]) -> list[tuple[str, str, int]] | None:
-    """Returns the filter that leaves one episode of a shared table; None if the table is the episode's own."""
-    return [("episode_index", "==", location["episode"])] if "rows" in location else None
 
 
 def _camera(key: str) -> str:

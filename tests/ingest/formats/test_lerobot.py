@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.formats import open_source
 from tests.ingest.formats.reading import read_all
 from tests.ingest.formats.videos import numbers_of, picture, write_video
@@ -132,6 +133,32 @@ def test_every_picture_action_and_state_is_where_it_belongs(tmp_path: Path, vers
 def test_av1(tmp_path: Path, version: str) -> None:
     episode = read_all("lerobot", WRITERS[version](tmp_path, "libsvtav1"))[1]
     assert numbers_of(episode.cameras["top"].read([8, 0, 3])) == [14, 6, 9]
+
+
+def misname(root: Path) -> Path:
+    """Names the first table for the first episode of the second, as LeRobot's converter to v3 does."""
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    place = table.column_names.index("data/file_index")
+    pq.write_table(table.set_column(place, "data/file_index", pa.array([0, 0, 0])), path)
+    return root
+
+
+def test_rows_are_searched_where_the_metadata_name_the_file_before(tmp_path: Path) -> None:
+    ours = read_all("lerobot", misname(write_v3(tmp_path / "misnamed")))
+    for episode, other in zip(ours, read_all("lerobot", write_v3(tmp_path / "v3")), strict=True):
+        np.testing.assert_array_equal(episode.actions, other.actions)
+        numbers = [numbers_of(each.cameras["top"].read(range(len(each.actions)))) for each in (episode, other)]
+        assert numbers[0] == numbers[1]
+
+
+def test_rows_that_no_table_has_are_reported_for_the_named_file(tmp_path: Path) -> None:
+    misname(write_v3(tmp_path))
+    (tmp_path / "data/chunk-000/file-001.parquet").write_bytes(b"damaged")
+    source = open_source("lerobot", tmp_path)
+    *_, last = source.episodes()
+    with pytest.raises(EpisodeError, match="file-000.parquet: has no row of episode 2, nor has any other file"):
+        source.read(last)
 
 
 def test_both_versions_give_the_same(tmp_path: Path) -> None:
