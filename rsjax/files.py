@@ -17,6 +17,7 @@ from filelock import lock_descriptor
 from rsjax.errors import UserError
 from rsjax.progress import note
 
+_HEAD = 512  # bytes in which a file shows that it is something else
 LOCK_SECONDS = 0.25  # for which a free lock may look taken, while other processes look at it
 
 
@@ -41,10 +42,32 @@ def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete 
     except OSError as error:
         raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
     except (ValueError, RecursionError) as error:
-        raise FileError(f"{path}: not JSON ({error}); {cure}") from error
+        raise FileError(f"{path}: {placeholder(path) or f'not JSON ({error}); {cure}'}") from error
     if not isinstance(content, kind):
         raise FileError(f"{path}: a JSON {kind.__name__} is expected, not {content!r:.80}; {cure}")
     return content
+
+
+def placeholder(content: Path | bytes) -> str:
+    """Says what lies in place of a data file, such as a Git-LFS pointer, and the cure; "" if nothing shows it.
+
+    Args:
+        content: the file, or its content. A file that cannot be read shows nothing.
+    """
+    if isinstance(content, Path):
+        try:
+            with content.open("rb") as file:
+                content = file.read(_HEAD)
+        except OSError:
+            return ""
+    head = content[:_HEAD].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if head.startswith(b"version https://git-lfs"):
+        return "a Git-LFS pointer in place of the file: fetch it with git lfs pull"
+    if head.startswith((b"/annex/objects/", b"../.git/annex", b".git/annex")):
+        return "a git-annex pointer in place of the file: fetch it with git annex get"
+    if head.startswith((b"<!doctype html", b"<html")) or (head.startswith(b"<?xml") and b"<error>" in head):
+        return "a web page in place of the file: open its link in a browser and download the file itself"
+    return ""
 
 
 def safe_id(text: str) -> str:

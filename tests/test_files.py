@@ -5,9 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from rsjax.convert.files import read_tensors
 from rsjax.errors import UserError
-from rsjax.files import is_held, lock, read_json
+from rsjax.files import is_held, lock, placeholder, read_json
+from rsjax.ingest.annotators.networks.local import require_weights
+from rsjax.tokenizers.lpips import load_lpips
 
 
 @pytest.mark.parametrize(
@@ -78,3 +83,29 @@ def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(tmp_path: Path)
         process.kill()
         with lock(path, wait="waiting for another process") as free:
             assert free
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("config.json", read_json),
+        ("net.safetensors", read_tensors),
+        ("net.ckpt", read_tensors),
+        ("lpips.safetensors", load_lpips),
+        ("depth.pth", lambda path: require_weights(path, "depth")),
+    ],
+)
+def test_what_a_download_left_in_place_of_a_file_is_named(tmp_path: Path, name: str, read: Any) -> None:
+    path = tmp_path / name
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n")
+    with pytest.raises(UserError, match=f"{name}: a Git-LFS pointer in place of the file: fetch it with git lfs pull"):
+        read(path)
+    path.write_text("<html><body>Not found</body></html>")
+    with pytest.raises(UserError, match=f"{name}: a web page in place of the file"):
+        read(path)
+
+
+@given(st.binary(max_size=600))
+def test_data_are_no_placeholders(content: bytes) -> None:
+    assert placeholder(b"\x89" + content) == placeholder(b"{" + content) == ""
+    assert placeholder(b"\xef\xbb\xbf <!DOCTYPE HTML>" + content)

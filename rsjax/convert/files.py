@@ -9,7 +9,7 @@ import safetensors
 import safetensors.numpy
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import write_file
+from rsjax.files import placeholder, write_file
 
 Tensors = dict[str, np.ndarray]
 
@@ -33,6 +33,8 @@ def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
     """
     if not path.is_file():
         raise ConvertError(f"{path}: no such file")
+    if instead := placeholder(path):
+        raise ConvertError(f"{path}: {instead}")
     if path.suffix == SAFE:
         return _read_safetensors(path)
     if path.suffix in PICKLED:

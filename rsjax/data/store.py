@@ -19,7 +19,7 @@ from rsjax.clip import Clip
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.labels import Label, Labels, LabelWriter
 from rsjax.data.manifest import FORMAT, ManifestError, check_manifest
-from rsjax.files import FileError, disk_guard, read_json, replace_directory
+from rsjax.files import FileError, disk_guard, placeholder, read_json, replace_directory
 
 MANIFEST = "manifest.json"
 WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
@@ -194,7 +194,8 @@ def open_store(path: Path | str) -> Store:
             except OSError as error:
                 raise StoreError(f"{shard}: cannot be read ({error.strerror}); mend the link or permission") from error
             if size != file["bytes"]:
-                raise StoreError(f"{shard}: {size} bytes, should be {file['bytes']}; {again}")
+                instead = placeholder(shard) or f"{size} bytes, should be {file['bytes']}; {again}"
+                raise StoreError(f"{shard}: {instead}")
     return Store(path, manifest)
 
 

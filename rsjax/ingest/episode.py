@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.errors import UserError
+from rsjax.files import placeholder
 
 _WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints take files up to the first whole, and both ends of larger ones
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
@@ -231,6 +232,17 @@ def regular(path: Path) -> Path:
     mode = path.stat().st_mode
     if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
         raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
+    return path
+
+
+def data_file(path: Path) -> Path:
+    """Returns the same path, but refuses what :func:`regular` does and files with something else in place of data.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device, a Git-LFS pointer or a web page.
+    """
+    if instead := placeholder(regular(path)):
+        raise OSError(errno.EINVAL, instead, str(path))
     return path
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from rsjax.files import placeholder
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, reason
 
 _NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # JPEG markers of tables, between the markers of frame headers
@@ -118,7 +119,8 @@ def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
     else:
         sides = _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
     if sides is None:
-        raise EpisodeError.at(where, f"{problem}: neither a whole PNG nor a JPEG", kind="undecodable")
+        instead = placeholder(payload) or "neither a whole PNG nor a JPEG"
+        raise EpisodeError.at(where, f"{problem}: {instead}", kind="undecodable")
     if not 0 < sides[0] * sides[1] <= MAX_PIXELS:
         raise EpisodeError.at(where, f"its header says {sides[0]} × {sides[1]} pixels")
     try:

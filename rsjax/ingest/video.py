@@ -20,7 +20,7 @@ import av
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
 
-from rsjax.ingest.episode import MAX_PIXELS, EpisodeError
+from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, data_file
 from rsjax.ingest.pictures import stack_pictures
 
 OPEN_FILES = 8  # decoders that one process keeps; each has a few decoded pictures in memory
@@ -157,7 +157,7 @@ def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
 def _container(path: Path, **options: str) -> Any:
     """Opens a file; one that is named like a protocol of FFmpeg's is still only that file."""
     try:
-        with path.open("rb"):
+        with data_file(path).open("rb"):
             container = av.open(
                 f"file:{path}",
                 metadata_errors="replace",

@@ -14,6 +14,7 @@ from rsjax.config import Config
 from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
+from rsjax.files import placeholder
 from rsjax.models.base import create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
@@ -105,7 +106,8 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
     try:
         actions = np.load(request.actions, allow_pickle=False)
     except (OSError, ValueError) as error:
-        raise UserError(f"{request.actions}: not a readable .npy file of numbers ({error})") from error
+        instead = placeholder(request.actions) or f"not a readable .npy file of numbers ({error})"
+        raise UserError(f"{request.actions}: {instead}") from error
     width, shortest = config.clips.action_dim, config.prompt_frames + 1
     if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
         fits = f"(T, {width}) with T at least {shortest}"

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from safetensors import SafetensorError, safe_open
 
 from rsjax.errors import UserError
+from rsjax.files import placeholder
 
 
 class LpipsError(UserError):
@@ -100,7 +101,8 @@ def load_lpips(path: str | Path) -> dict[str, Any]:
             net = (file.metadata() or {}).get("net")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no dict
     except SafetensorError as error:
-        raise LpipsError(f"{path}: not a safetensors file, or damaged ({error}); make it again") from error
+        instead = placeholder(Path(path)) or f"not a safetensors file, or damaged ({error}); make it again"
+        raise LpipsError(f"{path}: {instead}") from error
     if net not in NETS:
         raise LpipsError(f"{path}: its metadata name the net {net!r}, not one of {', '.join(NETS)}; make it again")
     wanted = lpips_shapes(net)

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, Float64, Int64
 
-from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, fingerprint, reason, regular
+from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, data_file, fingerprint, reason, regular
 
 MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
 _MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share
@@ -94,7 +94,7 @@ def media(path: Path) -> Path:
 def read_json(path: Path) -> Any:
     """Reads a JSON file; :class:`SourceError` if it is missing or damaged."""
     with reading(path, whole_source=True):
-        return json.loads(regular(path).read_text("utf-8"))
+        return json.loads(data_file(path).read_text("utf-8"))
 
 
 def json_lines(path: Path) -> Iterator[tuple[int, Any]]:
@@ -103,7 +103,7 @@ def json_lines(path: Path) -> Iterator[tuple[int, Any]]:
     Raises:
         SourceError: the file cannot be opened.
     """
-    with reading(path, whole_source=True), regular(path).open("rb") as file:
+    with reading(path, whole_source=True), data_file(path).open("rb") as file:
         for number, line in enumerate(file, 1):
             if line.strip():
                 try:
@@ -119,7 +119,7 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
     Raises:
         SourceError: it is missing or damaged.
     """
-    with reading(path, whole_source=True), pq.ParquetFile(regular(path)) as file:
+    with reading(path, whole_source=True), pq.ParquetFile(data_file(path)) as file:
         names = set(file.schema_arrow.names)
         for batch in file.iter_batches(4096, columns=[name for name in columns if name in names]):
             yield from batch.to_pylist()
@@ -132,7 +132,7 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
         EpisodeError: it is missing, damaged or too large: one number a thousand million times takes few bytes.
     """
     with reading(path):
-        with pq.ParquetFile(regular(path)) as file:
+        with pq.ParquetFile(data_file(path)) as file:
             names = file.schema_arrow.names
             chosen = names if columns is None else [name for name in columns if name in names]
             # The metadata of column chunks stay unread: if those are damaged, pyarrow ends the process.
@@ -197,7 +197,7 @@ def load_npy(path: Path) -> np.ndarray:
         EpisodeError: it is missing, damaged, too large or of another kind.
     """
     with reading(path):
-        mapped = np.load(regular(path), mmap_mode="r", allow_pickle=False)
+        mapped = np.load(data_file(path), mmap_mode="r", allow_pickle=False)
         if not isinstance(mapped, np.ndarray) or mapped.dtype.kind not in "fiub" or mapped.size > MAX_CELLS:
             raise ValueError(f"no table of numbers but {getattr(mapped, 'dtype', type(mapped).__name__)}")
         return np.array(mapped)

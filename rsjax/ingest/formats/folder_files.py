@@ -9,7 +9,17 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from jaxtyping import Float32
 
-from rsjax.ingest.episode import LEAVE_OUT, MAX_FPS, Depths, EpisodeError, Frames, Segment, SourceError, reason, regular
+from rsjax.ingest.episode import (
+    LEAVE_OUT,
+    MAX_FPS,
+    Depths,
+    EpisodeError,
+    Frames,
+    Segment,
+    SourceError,
+    data_file,
+    reason,
+)
 from rsjax.ingest.formats.files import exists, load_npy, matrix, media, parquet_columns, read_json
 from rsjax.ingest.pictures import PictureFiles
 from rsjax.ingest.video import VideoFrames
@@ -104,7 +114,7 @@ def read_table(path: Path) -> pa.Table:
     try:
         if (size := path.stat().st_size) > _MOST_BYTES:
             raise ValueError(f"{size} bytes are more than an episode's table can have")
-        with regular(path).open("rb") as file:
+        with data_file(path).open("rb") as file:
             table = pa_csv.read_csv(file)
         names = table.column_names  # decoded here, not before
     except (pa.ArrowException, OSError, ValueError) as error:

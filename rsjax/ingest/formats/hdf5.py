@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float32
 
-from rsjax.ingest.episode import LEAVE_OUT, MAX_PIXELS, EpisodeError, regular
+from rsjax.ingest.episode import LEAVE_OUT, MAX_PIXELS, EpisodeError, data_file, reason
 from rsjax.ingest.formats.files import MAX_CELLS
 
 _MOST_CHUNK = 2**30  # bytes that HDF5 unpacks at once, however few of them are read
@@ -25,10 +25,12 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         EpisodeError: it is missing, truncated or no HDF5.
     """
     try:
-        with h5py.File(regular(path), "r", locking=False) as file:
+        data_file(path)
+    except OSError as error:
+        raise EpisodeError.at(path, reason(error)) from error
+    try:
+        with h5py.File(path, "r", locking=False) as file:
             yield file
-    except FileNotFoundError as error:
-        raise EpisodeError.at(path, "missing") from error
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # how h5py reports damage
         raise EpisodeError.at(path, f"not a readable HDF5 file ({' '.join(str(error).split())[:200]})") from error
 

@@ -16,7 +16,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, te
 from google.protobuf.message import DecodeError
 from jaxtyping import Float32
 
-from rsjax.ingest.episode import EpisodeError, EpisodeRef, fingerprint, regular
+from rsjax.ingest.episode import EpisodeError, EpisodeRef, data_file, fingerprint
 from rsjax.ingest.formats.files import broken, inside, location_of, reading
 
 _HEAD, _FOOT = 12, 4  # bytes around a payload
@@ -58,7 +58,7 @@ def spans(path: Path) -> Iterator[tuple[int, int, int]]:
         EpisodeError: the file cannot be read, or is damaged after the last record that was yielded.
     """
     offset = 0
-    with reading(path), regular(path).open("rb") as file:
+    with reading(path), data_file(path).open("rb") as file:
         size = path.stat().st_size
         while offset < size:
             file.seek(offset)
@@ -110,7 +110,7 @@ def read_payload(path: Path, offset: int, length: int) -> bytes:
     Raises:
         EpisodeError: the file cannot be read, has changed, or its checksum is wrong.
     """
-    with reading(path), regular(path).open("rb") as file:
+    with reading(path), data_file(path).open("rb") as file:
         file.seek(offset)
         record = file.read(_HEAD + length + _FOOT)
     if len(record) < _HEAD + length + _FOOT or int.from_bytes(record[:8], "little") != length:

@@ -125,3 +125,27 @@ def test_a_folder_in_place_of_a_file(whole: tuple[str, Path], tmp_path: Path) ->
     _, messages = read_everything(name, root)
     assert messages
     assert all("\n" not in message for message in messages)
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+PAGE = b'\n<!DOCTYPE html>\n<html lang="en"><head><title>Sign in</title></head></html>\n'
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(POINTER, "fetch it with git lfs pull"), (PAGE, "a web page in place of the file")],
+    ids=["pointer", "page"],
+)
+def test_what_a_download_left_in_place_of_a_file_is_named(
+    whole: tuple[str, Path], tmp_path: Path, content: bytes, words: str
+) -> None:
+    name, root = whole[0], shutil.copytree(whole[1], tmp_path / "set")
+    for path in [path for path in sorted(root.rglob("*")) if path.is_file()]:
+        payload = path.read_bytes()
+        path.write_bytes(content)
+        close_videos()
+        _, messages = read_everything(name, root)
+        named = any(f"{path.name}: " in message and words in message for message in messages)
+        assert named or "depth" in path.parts, (path, messages)
+        assert all("\n" not in message for message in messages)
+        path.write_bytes(payload)

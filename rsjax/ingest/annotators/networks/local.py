@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rsjax.errors import first_line
+from rsjax.files import placeholder
 from rsjax.ingest.annotators.protocols import AnnotationError, Annotator
 
 EXTRA = "pip install 'rsjax[annotate]'"
@@ -84,9 +85,11 @@ def checkout_module(checkout: Path, name: str, what: str) -> Any:
 
 
 def require_weights(path: Path, what: str) -> None:
-    """Raises :class:`AnnotationError` where a file of weights is missing."""
+    """Raises :class:`AnnotationError` where a file of weights is missing, or something else is in its place."""
     if not path.is_file():
         raise AnnotationError(f"{path}: no such file; {what} needs its weights (nothing is downloaded)")
+    if instead := placeholder(path):
+        raise AnnotationError(f"{path}: {instead}")
 
 
 def load_weights(model: Any, path: Path, device: str, what: str) -> Any:
@@ -113,6 +116,9 @@ def pretrained(kinds: tuple[str, str], path: Path, device: str, what: str, **opt
         AnnotationError: the folder is missing or does not contain them, or the device is missing.
     """
     transformers = library("transformers", what)
+    for file in sorted(path.glob("*")):
+        if instead := placeholder(file):
+            raise AnnotationError(f"{file}: {instead}")
     if not (path / "config.json").is_file() and not (path / "preprocessor_config.json").is_file():
         raise AnnotationError(f"{path}: no model (config.json) in it; {what} needs one (nothing is downloaded)")
     if importlib.util.find_spec("torchvision"):  # processors use it if installed, and report a broken one badly
