@@ -16,11 +16,13 @@ from jaxtyping import Float, Float32, UInt8
 from rsjax.config import require
 from rsjax.ingest.actions import Layout
 from rsjax.ingest.episode import Depths, Episode, EpisodeError, Frames
+from rsjax.ingest.video import VideoFrames, misread
 
 KINDS = {
     "unreadable": "the reader refuses the episode for another reason",
     "camera": "pictures are missing that other episodes have, or are blank, or never change",
     "undecodable": "a video, picture or depth map is missing or cannot be decoded",
+    "seeking": "a video gives other pictures by seeking than by decoding it in order",
     "length": "actions, states or pictures are not as many as the timestamps",
     "not-finite": "values are NaN or infinite",
     "time": "time stands still, jumps, or does not match fps",
@@ -33,6 +35,7 @@ KINDS = {
     "duplicate": "the same content or the same id as another episode",
 }
 _CHUNK = 16  # pictures decoded at once
+_REWRITE = "rewrite the video, such as with ffmpeg -i OLD NEW.mp4"
 _TOLERANCE = 1e-3  # of a unit quaternion's length
 
 Problem = tuple[str, str]  # one of KINDS, and what is wrong where
@@ -184,6 +187,8 @@ def _pictures(
     """
     chosen, first, blank, changes = _sample(len(frames), wanted), None, [], False
     try:
+        if isinstance(frames, VideoFrames) and (wrong := misread(frames.path)) is not None:
+            return [("seeking", f"{name}: frame {wrong} is not that of decoding in order; {_REWRITE}")], first
         for start in range(0, len(chosen), _CHUNK):
             numbers = chosen[start : start + _CHUNK]
             pictures = frames.read(numbers)

@@ -1,50 +1,28 @@
 """Reads pictures of video files by number or by time, through PyAV (H.264, AV1 and whatever else FFmpeg decodes).
 
-A file is scanned once for the times of its frames, without decoding. Reading seeks to the key frame before the picture
-and decodes on from there, or just decodes on if that is nearer. Each process keeps a few files open and closes the
-least recently used one first.
+Reading seeks to the key frame before the picture (:mod:`rsjax.ingest.video_index` knows where it is) and decodes on
+from there, or just decodes on if that is nearer. Each process keeps a few files open and closes the least recently used
+one first.
 """
 
 import contextlib
+import itertools
 import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Float, Int64, UInt8
 
-from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, data_file
+from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.pictures import stack_pictures
+from rsjax.ingest.video_index import OPEN_FILES, VideoIndex, decoded, open_decoder, scan
 
-OPEN_FILES = 8  # decoders that one process keeps; each has a few decoded pictures in memory
-# A playlist that calls itself .mp4 would otherwise make FFmpeg open the files that it names.
-_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
-
-
-@dataclass(frozen=True)
-class VideoIndex:
-    """The frames of a video, from a scan of its packets.
-
-    Attributes:
-        stamps: each frame's presentation time in units of ``time_base``, increasing.
-        keys: whether decoding can begin at the frame.
-        time_base: seconds.
-    """
-
-    stamps: Int64[np.ndarray, " N"]
-    keys: Bool[np.ndarray, " N"]
-    time_base: Fraction
-
-    def times(self) -> Float[np.ndarray, " N"]:
-        """Returns the seconds of each frame on the file's own clock."""
-        return self.stamps * float(self.time_base)
+_COMPARED = 64  # first frames of a file among which seeking is checked
 
 
 class VideoFrames:
@@ -77,6 +55,31 @@ class VideoFrames:
             ]
 
 
+def misread(path: Path, count: int = 5) -> int | None:
+    """Returns the first frame that decoding in order gives and seeking does not; None if all checked are alike.
+
+    Args:
+        count: frames to check, spread over the first few dozen of the file.
+
+    Raises:
+        EpisodeError: the file cannot be read.
+    """
+    index = scan(path)
+    last = min(len(index.labels), _COMPARED) - 1
+    chosen, known = np.unique(np.linspace(0, last, count).astype(int)).tolist(), set(index.labels.tolist())
+    sought = dict[int, UInt8[np.ndarray, "H W 3"]]()
+    with contextlib.closing(_Decoder(path, index)) as decoder:
+        for number in reversed(chosen):  # so that each is sought
+            with contextlib.suppress(EpisodeError):
+                sought[number] = decoder.picture(number)
+    with open_decoder(path) as container, contextlib.suppress(av.FFmpegError):  # damage is found where frames are read
+        frames = (frame for frame in decoded(container) if frame.pts in known)
+        for number, frame in enumerate(itertools.islice(frames, last + 1)):
+            if number in chosen and not (number in sought and np.array_equal(sought[number], _upright(frame))):
+                return number
+    return None
+
+
 def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> VideoFrames:
     """Returns the frames of a video that are shown at these times on the file's own clock.
 
@@ -103,78 +106,6 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
     if (twice := np.flatnonzero(np.diff(numbers) <= 0)).size:
         raise EpisodeError.at(path, f"rows {twice[0]} and {twice[0] + 1} of the table show the same frame", kind="time")
     return VideoFrames(path, numbers.astype(np.int64))
-
-
-def scan(path: Path) -> VideoIndex:
-    """Returns the index of a video file, which is kept while the file stays the same.
-
-    Raises:
-        EpisodeError: the file is missing, no video, truncated, or has pictures of an impossible size.
-    """
-    try:
-        status = path.stat()
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    return _scan(path, status.st_size, status.st_mtime_ns)
-
-
-@lru_cache(maxsize=4 * OPEN_FILES)
-def _scan(path: Path, size: int, modified: int) -> VideoIndex:
-    """Scans a file; size and date are there so that a changed file is scanned again."""
-    with _container(path) as container:
-        stream = container.streams.video[0]
-        height, width = stream.codec_context.height, stream.codec_context.width
-        if not 0 < height * width <= MAX_PIXELS:
-            raise EpisodeError.at(path, f"its header says pictures of {width} × {height}", kind="undecodable")
-        promised, time_base = stream.frames, stream.time_base
-        packets = _packets(path, container)
-    if not packets or time_base is None:
-        raise EpisodeError.at(path, "has no pictures", kind="undecodable")
-    if len(packets) < promised:
-        with _container(path, ignore_editlist="1") as container:  # an edit list may hide frames that are there
-            present = len(_packets(path, container))
-        if present < promised:
-            problem = f"truncated: {present} of the {promised} frames that its header names"
-            raise EpisodeError.at(path, problem, kind="undecodable")
-    if any(stamp is None for stamp, _ in packets):
-        raise EpisodeError.at(path, "has frames without a time, so they cannot be found", "rewrite it as MP4")
-    packets.sort()
-    stamps = np.array([stamp for stamp, _ in packets], np.int64)
-    if (np.diff(stamps) <= 0).any():
-        raise EpisodeError.at(path, "two frames have the same time", "rewrite the file with increasing times")
-    return VideoIndex(stamps, np.array([key for _, key in packets]), time_base)
-
-
-def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
-    """Returns the time of each packet that becomes a visible picture, and whether decoding can begin there."""
-    try:
-        packets = container.demux(container.streams.video[0])
-        return [(packet.pts, packet.is_keyframe) for packet in packets if packet.size and not packet.is_discard]
-    except av.FFmpegError as error:
-        raise _unreadable(path, error) from error
-
-
-def _container(path: Path, **options: str) -> Any:
-    """Opens a file; one that is named like a protocol of FFmpeg's is still only that file."""
-    try:
-        with data_file(path).open("rb"):
-            container = av.open(
-                f"file:{path}",
-                metadata_errors="replace",
-                options={"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"} | options,
-            )
-    except (OSError, av.FFmpegError) as error:
-        raise _unreadable(path, error) from error
-    if not container.streams.video or container.streams.video[0].codec_context is None:
-        container.close()
-        raise EpisodeError.at(path, "has no video stream that can be decoded", kind="undecodable")
-    return container
-
-
-def _unreadable(path: Path, error: Exception) -> EpisodeError:
-    missing = isinstance(error, FileNotFoundError)
-    problem = "missing" if missing else f"not a readable video ({getattr(error, 'strerror', None) or error})"
-    return EpisodeError.at(path, problem, kind="undecodable")
 
 
 _decoders: "OrderedDict[str, _Decoder]" = OrderedDict()
@@ -224,16 +155,12 @@ class _Decoder:
 
     def __init__(self, path: Path, index: VideoIndex) -> None:
         self.path, self.index = path, index
-        self._container = _container(path)
+        self._container = open_decoder(path)
         self._stream = self._container.streams.video[0]
-        self._stream.codec_context.thread_count = 1  # many processes decode at once, one a core
-        self._stream.codec_context.options = {
-            "err_detect": "explode",  # H.264 would paint over damage and say nothing
-            "max_pixels": str(MAX_PIXELS),  # pictures may be of another size than the header says
-        }
         self._starts = np.flatnonzero(index.keys)
+        self._numbers = {label: number for number, label in enumerate(index.labels.tolist())}
         self._frames: Iterator[Any] = iter(())
-        self._next = len(index.stamps)  # number of the frame that comes next; at the end, so the first read seeks
+        self._next = len(index.labels)  # number of the frame that comes next; at the end, so the first read seeks
 
     def close(self) -> None:
         self._frames = iter(())
@@ -241,9 +168,7 @@ class _Decoder:
 
     def picture(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
         """Decodes one frame of the file."""
-        frame = self._decode(number)
-        picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
-        return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
+        return _upright(self._decode(number))
 
     def _decode(self, number: int) -> Any:
         """Decodes a frame: on from here if that is nearest, from the key frame before it, or from farther back.
@@ -256,8 +181,8 @@ class _Decoder:
         for start in dict.fromkeys([None, *attempts] if near <= self._next <= number else attempts):
             try:
                 if start is not None:
-                    self._container.seek(int(self.index.stamps[start]), stream=self._stream, backward=True)
-                    self._frames = self._container.decode(self._stream)
+                    self._container.seek(int(self.index.labels[start]), stream=self._stream, backward=True)
+                    self._frames = decoded(self._container)
                 if (frame := self._decode_until(number)) is not None:
                     return frame
             except (av.FFmpegError, OSError) as error:
@@ -272,12 +197,16 @@ class _Decoder:
 
     def _decode_until(self, number: int) -> Any:
         """Decodes on up to this frame; None if the decoder passes it by."""
-        stamps = self.index.stamps
         for frame in self._frames:
-            if frame.pts is None or frame.pts > stamps[-1]:
+            if (place := self._numbers.get(frame.pts)) is None:
                 continue
-            place = int(np.searchsorted(stamps, frame.pts))
             self._next = place + 1
             if place >= number:
-                return frame if stamps[number] == frame.pts and not frame.is_corrupt else None
+                return frame if place == number and not frame.is_corrupt else None
         return None
+
+
+def _upright(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+    """Returns a decoded frame as RGB, turned as the file's display matrix says."""
+    picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
+    return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
