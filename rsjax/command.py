@@ -4,11 +4,12 @@ import contextlib
 import errno
 import io
 import os
+import signal
 import sys
 from collections.abc import Iterator
 
 from rsjax.errors import Preempted, UserError
-from rsjax.runtime import sigterm_stops
+from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
 
 
 @contextlib.contextmanager
@@ -21,23 +22,32 @@ def main_errors() -> Iterator[None]:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
-    try:
-        with sigterm_stops():
+    with stop_signals() as received:
+        try:
             yield
-    except KeyboardInterrupt:
-        _exit("interrupted; the same command resumes", 130)
-    except Preempted as stop:
-        _exit(str(stop), os.EX_TEMPFAIL)
-    except UserError as error:
-        _exit(f"error: {error}", error.status)
-    except Exception as error:
-        cure = _cure(error)
-        if cure is None:
-            raise
-        _exit(f"error: {cure}", 2)
+        except (Exception, KeyboardInterrupt, Preempted) as error:
+            line, status = _answer(error, received)
+            if line is None:
+                raise
+            _exit(line, status)
 
 
-def _cure(error: Exception) -> str | None:
+def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]:
+    """Returns the line that reports an error, None for a bug, and the exit status."""
+    # A signal may come out as another error, such as an ImportError where it hit an import.
+    if isinstance(error, KeyboardInterrupt) or signal.SIGINT in received:
+        return INTERRUPTED, 130
+    if isinstance(error, Preempted):
+        return str(error), os.EX_TEMPFAIL
+    if signal.SIGTERM in received:
+        return TERMINATED, os.EX_TEMPFAIL
+    if isinstance(error, UserError):
+        return f"error: {error}", error.status
+    cure = _cure(error)
+    return None if cure is None else f"error: {cure}", 2
+
+
+def _cure(error: BaseException) -> str | None:
     where = f" at {error.filename}" if isinstance(error, OSError) and error.filename else ""
     # Orbax, TensorStore and ArrayRecord report a full disk in errors of their own.
     if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left on device" in str(error):
@@ -49,10 +59,15 @@ def _cure(error: Exception) -> str | None:
 
 def _exit(line: str, status: int) -> None:
     print(" ".join(line.split()), file=sys.stderr)
-    jax = sys.modules.get("jax")
-    if status == UserError.status and jax is not None and jax.distributed.is_initialized():
-        # At exit, jax would wait in vain for the other processes and then abort with a status of its own.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+    # At exit, processes that stop wait for each other. One that failed would wait in vain for the others, and jax would
+    # then abort with a status of its own.
+    orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
+    if status not in orderly:
+        exit_now(status)
     raise SystemExit(status)
+
+
+def _has_peers() -> bool:
+    jax = sys.modules.get("jax")
+    # A signal may have hit its import.
+    return jax is not None and hasattr(jax, "distributed") and jax.distributed.is_initialized()

@@ -1,17 +1,26 @@
-"""Settings of the process that come before JAX is imported."""
+"""Settings of the process that come before JAX is imported, and the signals that stop it."""
 
 import faulthandler
 import os
+import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any, NoReturn
 
 from rsjax.errors import Preempted
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
+STOP_SECONDS = 20.0  # for which SIGTERM may go unanswered; Kubernetes and Slurm kill after 30
+REPEAT_SECONDS = 0.5  # within which two Ctrl-C are one: wrappers such as make pass on what the terminal sent already
+INTERRUPTED = "interrupted; the same command resumes"
+TERMINATED = "stopped by SIGTERM; the same command resumes"
+
+patient = threading.Event()  # set while SIGTERM may take longer, because steps are to be saved
 
 
 def tune_process() -> None:
@@ -30,23 +39,101 @@ def tune_process() -> None:
 
 
 @contextmanager
-def sigterm_stops() -> Iterator[None]:
-    """Wraps a command: SIGTERM, by which schedulers end a process, raises :class:`Preempted`.
+def stop_signals() -> Iterator[list[int]]:
+    """Wraps a command; yields a list, to which each signal that asks it to stop is added.
 
-    The command then exits with status 75 (EX_TEMPFAIL), at which a scheduler starts it again. Training loops save first
-    (:mod:`rsjax.training.preemption`). SIGUSR1 prints the stack of every thread. Does nothing off the main thread, the
-    only one that may handle signals.
+    SIGTERM, by which schedulers end a process, raises :class:`Preempted`, and Ctrl-C raises :class:`KeyboardInterrupt`,
+    each once, and once more where Python ignores it: in finalizers and in jax's callback of garbage collections.
+    Training loops save first (:mod:`rsjax.training.preemption`). SIGUSR1 prints the stack of every thread.
+
+    Python raises in the main thread alone, and not while that is in C code, such as XLA's compiler. So a thread ends
+    the process at a second Ctrl-C, and :data:`STOP_SECONDS` after SIGTERM unless :data:`patient` is set. Nothing is
+    lost: all files are written atomically.
+
+    Does nothing off the main thread, the only one that may handle signals.
     """
+    received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        raise Preempted("stopped by SIGTERM; the same command resumes")
+        if number in received:  # cleaning up goes on
+            return
+        received.append(number)
+        raise KeyboardInterrupt if number == signal.SIGINT else Preempted(TERMINATED)
+
+    def raise_again(unraisable: Any) -> None:
+        for number, kind in ((signal.SIGTERM, Preempted), (signal.SIGINT, KeyboardInterrupt)):
+            if number in received and isinstance(unraisable.exc_value, kind):
+                received.remove(number)
+                threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+                return
+        report(unraisable)
 
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield received
         return
     faulthandler.register(signal.SIGUSR1, file=2)
-    before = signal.signal(signal.SIGTERM, stop)
+    # A command that a shell started in the background, or nohup, ignores Ctrl-C.
+    numbers = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN]
+    readable, writable = os.pipe()
+    os.set_blocking(writable, False)
+    watch = threading.Thread(target=_watch, args=(readable,), daemon=True)
+    watch.start()
+    descriptor = signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
+    report, sys.unraisablehook = sys.unraisablehook, raise_again
+    before = {number: signal.signal(number, stop) for number in numbers}
     try:
-        yield
+        yield received
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = report
+        signal.set_wakeup_fd(descriptor)
+        os.close(writable)
+        watch.join()
+        os.close(readable)
+
+
+def _watch(pipe: int) -> None:
+    """Reads the numbers of signals, which the operating system's handler writes whatever the main thread is doing."""
+    interrupted = deadline = float("inf")
+    while True:
+        now = time.monotonic()
+        wait = None if deadline == float("inf") else max(0.0, deadline - now)
+        if not select.select([pipe], [], [], wait)[0]:
+            if not patient.is_set():
+                _end(TERMINATED, os.EX_TEMPFAIL)
+            os.kill(os.getpid(), signal.SIGTERM)  # the exception may have been swallowed before training began
+            deadline = time.monotonic() + STOP_SECONDS
+            continue
+        numbers, now = os.read(pipe, 64), time.monotonic()
+        if not numbers:  # the other end is closed
+            return
+        if signal.SIGINT in numbers:
+            interrupted = min(interrupted, now)
+            if now - interrupted > REPEAT_SECONDS:
+                _end(INTERRUPTED, 130)
+        if signal.SIGTERM in numbers:
+            deadline = min(deadline, now + STOP_SECONDS)
+
+
+def _end(line: str, status: int) -> NoReturn:
+    os.write(2, f"{line}\n".encode())
+    exit_now(status)
+
+
+def exit_now(status: int) -> NoReturn:
+    """Ends the process after flushing its output, without the interpreter's exit, which crashes beside XLA's threads.
+
+    Worker processes end with it.
+    """
+    flush = threading.Thread(target=_flush, daemon=True)
+    flush.start()
+    flush.join(1.0)  # whoever reads the output may have stopped reading
+    os._exit(status)
+
+
+def _flush() -> None:
+    if sys.stdout.isatty():
+        sys.stdout.write("\x1b[?25h")  # a progress bar may have hidden the cursor
+    sys.stdout.flush()
+    sys.stderr.flush()

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -157,11 +158,13 @@ def test_help_lists_presets_then_first_fields_then_all_fields(capsys: pytest.Cap
     ],
 )
 def test_curable_errors_are_one_line_and_a_status(
-    error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str]
+    error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @main_errors()
     def main() -> None:
         raise error
+
+    monkeypatch.setattr(os, "_exit", sys.exit)
 
     with pytest.raises(SystemExit) as caught:
         main()

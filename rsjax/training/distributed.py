@@ -17,6 +17,7 @@ from jax.experimental import multihost_utils
 from orbax.checkpoint import multihost
 
 from rsjax.errors import Preempted, UserError, first_line
+from rsjax.runtime import patient
 
 BARRIER_SECONDS = 7 * 24 * 3600  # the others wait while the lead simulates, tokenizes and evaluates
 JOIN_SECONDS = 1800  # replacing a lost node can take long
@@ -96,6 +97,7 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
             f"process {'of a cluster' if alone else process_id} cannot join the others ({first_line(error)}); start "
             f"all of them, with the same --coordinator and --processes, and a --coordinator that all of them can reach"
         ) from error
+    patient.set()  # one that ended alone would take the others along
 
 
 def _address(coordinator: str, processes: int | None, process_id: int | None) -> dict[str, Any]:

@@ -167,7 +167,7 @@ class _Training:
                         log.write(step, self.sharding.scalars(metrics) | measured)
                     scored = None
                     if due["validation"]:
-                        with clock.stopped():
+                        with clock.stopped(), stop.impatient():
                             scored = self._validate(state, step, log)
                     if due["checkpoint"] or stopping or (scored is not None and loop.keep_best):
                         metric = None if scored is None else scored.metric

@@ -1,12 +1,15 @@
-"""SIGTERM during training; :func:`rsjax.runtime.sigterm_stops` handles it elsewhere."""
+"""SIGTERM during training; :func:`rsjax.runtime.stop_signals` handles it elsewhere."""
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Self
 
 import jax
 
+from rsjax.runtime import patient
 from rsjax.training.distributed import anywhere
 
 HOSTS_EVERY = 5  # steps between two exchanges among several processes of whether one has to stop
@@ -15,11 +18,12 @@ HOSTS_EVERY = 5  # steps between two exchanges among several processes of whethe
 class StopRequest:
     """Wraps a training loop: SIGTERM is only recorded, so that the current step can finish and be saved.
 
-    Off the main thread, the only one that may handle signals, nothing is recorded.
+    Before the first step, while that compiles, there is nothing to save, and the handler before answers. Off the main
+    thread, the only one that may handle signals, nothing is recorded.
     """
 
     def __init__(self) -> None:
-        self._received = False
+        self._received = self._stepped = False
 
     def __enter__(self) -> Self:
         self._handles = threading.current_thread() is threading.main_thread()
@@ -30,14 +34,37 @@ class StopRequest:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._handles:
             signal.signal(signal.SIGTERM, self._before)
+            if jax.process_count() == 1:
+                patient.clear()
             if self._received and kind is None:  # after the last step: leave it to the handler before
                 signal.raise_signal(signal.SIGTERM)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self._received = True
+        if not self._stepped and jax.process_count() == 1 and callable(self._before):
+            self._before(number, frame)
 
     def asked(self, step: int) -> bool:
         """Returns whether to stop after this step, the same on all processes. Each has to call it at every step."""
         if jax.process_count() == 1:
+            if self._handles and not self._stepped:
+                self._stepped = True
+                patient.set()
             return self._received
         return step % HOSTS_EVERY == 0 and anywhere(self._received)
+
+    @contextmanager
+    def impatient(self) -> Iterator[None]:
+        """Wraps work between steps that may take longer than a scheduler waits, such as compiling the validation.
+
+        If it outlasts SIGTERM by :data:`rsjax.runtime.STOP_SECONDS`, the process ends, and the run resumes from the
+        newest checkpoint.
+        """
+        was_set = patient.is_set() and jax.process_count() == 1
+        if was_set:
+            patient.clear()
+        try:
+            yield
+        finally:
+            if was_set:
+                patient.set()

@@ -18,6 +18,7 @@ from tests.soak.disk import small_disk
 REQUEUE = os.EX_TEMPFAIL  # the exit status after SIGTERM: start me again
 FAILED = 2  # the exit status after an error that the user can cure
 PATIENCE = 120.0  # seconds that the command may take to save and exit
+DUMP_EVERY = 30.0  # seconds without an answer, at which the command prints what each of its threads is doing
 
 KILL_STARTING = "SIGKILL at the start"
 KILL_COMPILING = "SIGKILL while compiling"
@@ -124,16 +125,21 @@ def _terminate(attempt: Attempt, rng: random.Random, interval: float) -> Fault |
     if not waited:
         return None
     attempt.process.send_signal(signal.SIGTERM)
-    try:
-        status = str(attempt.process.wait(PATIENCE))
-    except subprocess.TimeoutExpired:
-        attempt.process.send_signal(signal.SIGUSR1)  # makes it print what each thread is doing
+    began, status = time.monotonic(), None
+    while status is None and time.monotonic() < began + PATIENCE:
+        try:
+            status = attempt.process.wait(DUMP_EVERY)
+        except subprocess.TimeoutExpired:
+            attempt.process.send_signal(signal.SIGUSR1)  # makes it print what each thread is doing
+    took = f"{time.monotonic() - began:.1f} s"
+    if status is None:
         time.sleep(1.0)
         attempt.kill()
-        status = "never came"
-    if status == "0":
+        return Fault(TERMINATE, problem=f"no answer within {took}; the output has the stacks of its threads")
+    if status == 0:
         return None  # it was about to finish
-    return Fault(TERMINATE, problem="" if status == str(REQUEUE) else f"exit status {status}, not {REQUEUE}")
+    problem = "" if status == REQUEUE else f"exit status {status}, not {REQUEUE}"
+    return Fault(TERMINATE, f"answered after {took}", problem)
 
 
 def _damage(attempt: Attempt, rng: random.Random, interval: float) -> Fault | None:

@@ -12,6 +12,7 @@ import pytest
 
 from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.errors import Preempted
+from rsjax.runtime import patient, stop_signals
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.log import read_curve, read_log
 from rsjax.training.loop import DivergedError, Monitor
@@ -155,6 +156,17 @@ def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
     checkpoints.close()
     assert_same(train(LOOP, tmp_path), whole[0])
     assert [row for row in read_curve(tmp_path) if "loss" in row] == whole[1]
+
+
+def test_sigterm_before_the_first_step_has_nothing_to_save(tmp_path: Path) -> None:
+    class Stopped(Regression):
+        def loss_terms(self, params: Any, batch: Any, key: Any, context: Any) -> Any:
+            signal.raise_signal(signal.SIGTERM)  # while the first step is compiled
+            return super().loss_terms(params, batch, key, context)
+
+    with stop_signals() as received, pytest.raises(Preempted, match="stopped by SIGTERM; the same command resumes"):
+        train(LOOP, tmp_path, model=Stopped())
+    assert received == [signal.SIGTERM] and not patient.is_set()
 
 
 def test_validation_scores_are_logged_drawn_and_decide_which_checkpoints_are_kept(

@@ -1,0 +1,87 @@
+"""Commands that are stopped: one line and an exit status, whatever the main thread is doing."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rsjax.runtime import INTERRUPTED, TERMINATED
+
+ROOT = Path(__file__).parents[1]
+# Prints "ready" and then runs the lines of its argument, within a command.
+PROGRAM = """
+import ctypes, os, signal, sys, time
+from rsjax import runtime
+from rsjax.command import main_errors
+runtime.STOP_SECONDS = runtime.REPEAT_SECONDS = 0.2
+def blocked():
+    mutex, lock = ctypes.create_string_buffer(256), ctypes.CDLL(None).pthread_mutex_lock
+    lock(mutex)
+    print("ready", flush=True)
+    lock(mutex)  # for ever, in C code
+def said(work):
+    print("ready", flush=True)
+    work()
+with main_errors():
+    exec(sys.argv[1])
+"""
+ASLEEP = "said(lambda: time.sleep(600))"
+IN_C = "blocked()"
+IN_A_GARBAGE_COLLECTION = """
+import gc
+runtime.STOP_SECONDS = 600
+def callback(phase, info):  # as jax has one
+    if phase == "start":
+        gc.callbacks.remove(callback)
+        said(lambda: time.sleep(600))
+gc.callbacks.append(callback)
+gc.collect()
+time.sleep(600)
+"""
+IN_AN_IMPORT = """
+try:
+    said(lambda: time.sleep(600))
+except BaseException as error:
+    raise ImportError("numpy failed to import") from error
+"""
+CLEANING_UP = """
+try:
+    said(lambda: time.sleep(600))
+finally:
+    time.sleep(600)
+"""
+
+
+def stopped(lines: str, number: int, again: bool = False) -> tuple[int, str]:
+    """Sends a signal to the program, or several until it ends; returns its exit status and last line of errors."""
+    line = [sys.executable, "-c", PROGRAM, lines]
+    with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        while again and process.poll() is None:
+            time.sleep(0.1)
+            process.send_signal(number)
+        _, errors = process.communicate()
+    assert "Traceback (most" not in errors, errors
+    return process.returncode, errors.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "lines", ["said(lambda: time.sleep(600))", IN_C, IN_AN_IMPORT, CLEANING_UP, IN_A_GARBAGE_COLLECTION]
+)
+def test_sigterm_ends_a_command_whatever_it_does(lines: str) -> None:
+    assert stopped(lines, signal.SIGTERM) == (75, TERMINATED)
+
+
+@pytest.mark.parametrize("lines", [IN_C, CLEANING_UP, IN_A_GARBAGE_COLLECTION])
+def test_a_second_interrupt_ends_a_command_at_once_in_one_line(lines: str) -> None:
+    assert stopped(lines, signal.SIGINT, again=True) == (130, INTERRUPTED)
+
+
+@pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION])
+def test_one_interrupt_is_one_line(lines: str) -> None:
+    assert stopped(lines, signal.SIGINT) == (130, INTERRUPTED)
