@@ -25,6 +25,21 @@ class FileError(UserError):
     """A file cannot be read or written. The message names it and the cure."""
 
 
+def parse_json(text: str | bytes, kind: type = dict) -> Any:
+    """Parses JSON that came from a file.
+
+    Raises:
+        ValueError: it is not JSON in UTF-8, is nested too deeply, or is of another type than ``kind``.
+    """
+    try:
+        content = json.loads(text if isinstance(text, str) else text.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"not JSON ({error})") from error
+    if not isinstance(content, kind):
+        raise ValueError(f"a JSON {kind.__name__} is expected, not {content!r:.80}")
+    return content
+
+
 def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete it") -> Any:
     """Reads a JSON file.
 
@@ -36,16 +51,13 @@ def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete 
         FileError: the file is missing, cannot be read, is not JSON in UTF-8, or holds another type.
     """
     try:
-        content = json.loads(path.read_text("utf-8"))
+        return parse_json(path.read_bytes(), kind)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileError(f"{path}: missing; {cure}") from error
     except OSError as error:
         raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
-    except (ValueError, RecursionError) as error:
-        raise FileError(f"{path}: {placeholder(path) or f'not JSON ({error}); {cure}'}") from error
-    if not isinstance(content, kind):
-        raise FileError(f"{path}: a JSON {kind.__name__} is expected, not {content!r:.80}; {cure}")
-    return content
+    except ValueError as error:
+        raise FileError(f"{path}: {placeholder(path) or f'{error}; {cure}'}") from error
 
 
 def placeholder(content: Path | bytes) -> str:

@@ -26,7 +26,7 @@ def check_torch(config: Config) -> Architecture:
     check_plain(arch)
     if find_spec("torch") is None:
         raise UserError(
-            "--torch needs PyTorch, which is not installed; pip install 'rsjax[torch]', or leave --torch out"
+            "--torch needs PyTorch, which is not installed; pip install -e '.[torch]', or leave --torch out"
         )
     return arch
 

@@ -7,8 +7,9 @@ from rsjax.config import ConfigError, TokenizerConfig, from_dict, to_dict
 from rsjax.convert import directory, genie, lpips, tokenizer
 from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
-from rsjax.files import write_file
+from rsjax.files import parse_json, read_json, write_json
 
+_REPLACES = "; it replaces the one that was there"
 METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported tokenizer
 
 
@@ -19,17 +20,18 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
     if source.is_dir():
-        _check_suffix(out)
+        replaces = _check_file(out)
         config, params = directory.load_tokenizer(source)
         tensors = to_tensors(params, tokenizer.table(config))
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
-        return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names"]
-    tensors, metadata = read_tensors(source)
-    config, params, ignored = tokenizer.from_public(source, tensors, weights, _exported_config(source, metadata))
-    directory.save(out, config, params)
+        return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]
+    tensors, metadata, names = read_tensors(source)
+    own = _exported_config(source, metadata)
+    config, params, ignored = tokenizer.from_public(source, tensors, weights, own, names)
+    replaces = _REPLACES * directory.save(out, config, params)
     used = len(tensors) - ignored.total()
     lines = [f"ignored: {count} tensors of {group}" for group, count in sorted(ignored.items())]
-    return [f"{out}: a tokenizer of {used} {weights} tensors, {config}", *lines]
+    return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *lines]
 
 
 def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
@@ -39,20 +41,22 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
         UserError: as :func:`convert_tokenizer`.
     """
     if source.is_dir():
-        _check_suffix(out)
+        replaces = _check_file(out)
         config, params = directory.load_world_model(source)
         tensors = to_tensors(params, genie.table(config))
-        beside, text = out.parent / genie.CONFIG, json.dumps(genie.settings_of(config), indent=1)
-        if beside.exists() and beside.read_text() != text:
-            raise ConvertError(f"{beside}: exists with other settings; write to an empty directory")
-        write_file(beside, text.encode())
+        beside, settings = out.parent / genie.CONFIG, genie.settings_of(config)
+        cure = "write to an empty directory"
+        if beside.exists() and read_json(beside, cure=cure) != settings:
+            raise ConvertError(f"{beside}: exists with other settings; {cure}")
         write_safetensors(out, tensors, {})
-        return [f"{out}: {len(tensors)} tensors of a Genie, under their public names; settings in {genie.CONFIG}"]
-    tensors, _ = read_tensors(source)
+        write_json(beside, settings)
+        text = f"under their public names; settings in {genie.CONFIG}{replaces}"
+        return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]
+    tensors, _, names = read_tensors(source)
     settings = genie.read_settings(source)
-    config, params = genie.from_public(source, tensors, settings, heads)
-    directory.save(out, config, params)
-    lines = [f"{out}: a world model of {len(tensors)} tensors, {config}"]
+    config, params = genie.from_public(source, tensors, settings, heads, names)
+    replaces = _REPLACES * directory.save(out, config, params)
+    lines = [f"{out}: a world model of {len(tensors)} tensors, {config}{replaces}"]
     if settings.get("use_mup") is None:
         lines.append(f"no use_mup in a {genie.CONFIG} beside {source.name}: converted as a model without muP")
     return lines
@@ -64,27 +68,31 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
     Raises:
         UserError: as :func:`convert_tokenizer`.
     """
-    _check_suffix(out)
+    replaces = _check_file(out)
     merged: Tensors = {}
+    names: dict[str, str] = {}
     for source in sources:
-        tensors, _ = read_tensors(source)
+        tensors, _, own = read_tensors(source)
         if twice := merged.keys() & tensors.keys():
-            raise ConvertError(f"{source}: {min(twice)} is also in an earlier file; pass each part once")
+            raise ConvertError(f"{source}: {own[min(twice)]} is also in an earlier file; pass each part once")
         merged |= tensors
-    net, weights = lpips.from_public(", ".join(map(str, sources)), merged)
+        names |= own
+    net, weights = lpips.from_public(", ".join(map(str, sources)), merged, names)
     write_safetensors(out, weights, {"net": net})
-    return [f"{out}: LPIPS with {net}, {len(weights)} tensors; {len(merged) - len(weights)} ignored"]
+    return [f"{out}: LPIPS with {net}, {len(weights)} tensors; {len(merged) - len(weights)} ignored{replaces}"]
 
 
-def _check_suffix(out: Path) -> None:
+def _check_file(out: Path) -> str:
+    """Checks the name of the file to write; returns what to add to the message about it."""
     if out.suffix != SAFE:
         raise ConvertError(f"{out}: the output is a {SAFE} file; name OUT accordingly")
+    return _REPLACES * out.exists()
 
 
 def _exported_config(source: Path, metadata: dict[str, str]) -> TokenizerConfig | None:
     if METADATA not in metadata:
         return None
     try:
-        return from_dict(TokenizerConfig, json.loads(metadata[METADATA]))
+        return from_dict(TokenizerConfig, parse_json(metadata[METADATA]))
     except (ValueError, TypeError, ConfigError) as error:
         raise ConvertError(f"{source}: its metadata {METADATA} are of another version or damaged ({error})") from error

@@ -24,8 +24,11 @@ SECTIONS: dict[type, tuple[str, str]] = {  # section of config.json, and directo
 }
 
 
-def save(directory: Path, config: TokenizerConfig | Architecture, params: Params) -> None:
+def save(directory: Path, config: TokenizerConfig | Architecture, params: Params) -> bool:
     """Writes a tokenizer or a world model; the directory's other network is kept, the same one replaced.
+
+    Returns:
+        Whether there was one, which it replaced.
 
     Raises:
         ConvertError: the directory is a run's, whose weights were trained there.
@@ -38,10 +41,11 @@ def save(directory: Path, config: TokenizerConfig | Architecture, params: Params
     with disk_guard(directory):
         (directory / place).parent.mkdir(parents=True, exist_ok=True)
         # Stopped in between, there is no such network rather than one's settings beside another's weights.
-        if settings.pop(section, None) is not None:
+        if replaces := settings.pop(section, None) is not None:
             write_json(path, settings)
         save_weights(directory / place, params)
         write_json(path, settings | {section: to_dict(config)})
+    return replaces
 
 
 def load_tokenizer(directory: Path) -> tuple[TokenizerConfig, Params]:

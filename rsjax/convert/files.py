@@ -1,8 +1,9 @@
 """Reads and writes tensor files as dictionaries of numpy arrays, without executing anything from them."""
 
 import importlib
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors
@@ -15,31 +16,69 @@ Tensors = dict[str, np.ndarray]
 
 SAFE = ".safetensors"
 PICKLED = (".ckpt", ".pt", ".pth", ".bin")  # PyTorch's own; a pickle inside
+HOLDERS = ("state_dict", "model_state_dict", "model")  # keys under which training scripts save a network's tensors
+# What DistributedDataParallel and torch.compile add to names.
+_WRAPPED = re.compile(r"^module\.|(?<![^.])_orig_mod\.")
+# Types that training scripts save beside tensors. A placeholder is made for each, so that nothing of them is called.
+_HARMLESS = (
+    "argparse.Namespace",
+    "typing.Any",
+    *(f"pathlib{module}.{kind}Path" for module in ("", "._local") for kind in ("", "Posix", "Windows")),
+    *(f"pathlib{module}.Pure{kind}Path" for module in ("", "._local") for kind in ("", "Posix", "Windows")),
+    "numpy.dtype",
+    "numpy.ndarray",
+    *(f"numpy.{core}.multiarray.{name}" for core in ("core", "_core") for name in ("scalar", "_reconstruct")),
+    *(f"numpy.dtypes.{name}DType" for name in ("Bool", "Int32", "Int64", "Float16", "Float32", "Float64")),
+    *(f"omegaconf.{name}" for name in ("dictconfig.DictConfig", "listconfig.ListConfig", "nodes.AnyNode")),
+    *(f"omegaconf.base.{name}" for name in ("ContainerMetadata", "Metadata")),
+)
 
 
 class ConvertError(UserError):
     """A file cannot be converted. The message names it and the cure."""
 
 
-def read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
-    """Returns the tensors of a file by name, and its metadata (always empty for PyTorch's files).
+class TensorFile(NamedTuple):
+    """The content of a file of tensors.
+
+    Attributes:
+        tensors: by name, without what DistributedDataParallel (``module.``) and torch.compile (``_orig_mod.``) add.
+        metadata: of a safetensors file; empty for PyTorch's.
+        names: each tensor's name in the file, by the name in ``tensors``.
+    """
+
+    tensors: Tensors
+    metadata: dict[str, str]
+    names: dict[str, str]
+
+
+def read_tensors(path: Path) -> TensorFile:
+    """Reads the tensors of a file.
 
     Args:
-        path: a ``.safetensors`` file, or one of PyTorch's; of the latter, the ``state_dict`` if it has one.
+        path: a ``.safetensors`` file, or one of PyTorch's; also with a network under one of ``HOLDERS``.
 
     Raises:
-        ConvertError: the file does not exist, is of another kind, is damaged, or holds more than tensors; or PyTorch
-            is not installed.
+        ConvertError: the file does not exist, is of another kind, is damaged, or holds what could run code; a tensor's
+            type is unknown to numpy; or PyTorch is not installed.
     """
     if not path.is_file():
-        raise ConvertError(f"{path}: no such file")
+        raise ConvertError(f"{path}: {'is a directory; name a file in it' if path.is_dir() else 'no such file'}")
     if instead := placeholder(path):
         raise ConvertError(f"{path}: {instead}")
     if path.suffix == SAFE:
-        return _read_safetensors(path)
-    if path.suffix in PICKLED:
-        return _read_torch(path), {}
-    raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
+        read, metadata = _read_safetensors(path)
+    elif path.suffix in PICKLED:
+        read, metadata = _read_torch(path), {}
+    else:
+        raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
+    names: dict[str, str] = {}
+    for name in read:
+        own = _WRAPPED.sub("", name)
+        if own in names:
+            raise ConvertError(f"{path}: {own} occurs twice, as {names[own]} and as {name}; keep one of them")
+        names[own] = name
+    return TensorFile({own: read[name] for own, name in names.items()}, metadata, names)
 
 
 def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
@@ -50,11 +89,25 @@ def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) ->
 
 
 def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+    tensors: Tensors = {}
     try:
         with safetensors.safe_open(path, "np") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except safetensors.SafetensorError as error:
-        raise ConvertError(f"{path}: not a safetensors file, or damaged ({error})") from error
+            for name in file.keys():  # noqa: SIM118 - it is no dict
+                try:
+                    tensors[name] = file.get_tensor(name)
+                except (AttributeError, TypeError) as error:  # numpy has no such type
+                    raise _unreadable(path, name, file.get_slice(name).get_dtype()) from error
+            return tensors, file.metadata() or {}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise ConvertError(f"{path}: not a safetensors file, or damaged ({first_line(error)})") from error
+
+
+class _Placeholder:
+    """Stands for an object that is no tensor; made instead of it, whatever the file says."""
+
+    def __init__(self, *_: object, **__: object) -> None: ...
+
+    def __setstate__(self, state: object) -> None: ...
 
 
 def _read_torch(path: Path) -> Tensors:
@@ -62,19 +115,49 @@ def _read_torch(path: Path) -> Tensors:
         torch: Any = importlib.import_module("torch")
     except ImportError:
         raise ConvertError(
-            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install 'rsjax[torch]'), or pass the "
+            f"{path}: reading {path.suffix} files needs PyTorch; install it (pip install -e '.[torch]'), or pass the "
             f"same weights as a {SAFE} file"
         ) from None
+    content = _unpickled(path, torch)
+    state = content
+    for holder in HOLDERS:
+        if isinstance(content, dict) and _tensors(content.get(holder), torch):
+            state = content[holder]
+            break
+    tensors = _tensors(state, torch)
+    if not tensors:
+        raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(HOLDERS)}")
+    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}
+
+
+def _unpickled(path: Path, torch: Any) -> Any:
+    """Loads a file of PyTorch's with ``weights_only``, so tensors and plain values alone, and placeholders."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with torch.serialization.safe_globals([(_Placeholder, name) for name in _HARMLESS]):
+            return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many types for damage and for content that it refuses
-        raise ConvertError(
-            f"{path}: refused: it is damaged, or holds more than tensors, which could run any code when loaded "
-            f"({first_line(error)}); pass the same weights as a {SAFE} file"
-        ) from error
-    state = content.get("state_dict", content) if isinstance(content, dict) else content
-    if not isinstance(state, dict) or not all(isinstance(x, torch.Tensor) for x in state.values()):
-        raise ConvertError(f"{path}: holds no tensors by name, and no state_dict with them")
-    # numpy has no bfloat16; float32 represents each of its numbers.
-    values = {name: x.detach() for name, x in state.items()}  # parameters that require a gradient refuse numpy()
-    return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy() for name, x in values.items()}
+        # Its messages advise to load the file without this protection, so they are not shown.
+        unknown = re.search(r"GLOBAL (\S+)", str(error))
+        why = (
+            f"it holds {unknown[1]:.80}, which could run code when loaded" if unknown else "it is damaged or no weights"
+        )
+        raise ConvertError(f"{path}: refused: {why}; pass the same weights as a {SAFE} file") from error
+
+
+def _tensors(state: Any, torch: Any) -> dict[str, Any]:
+    """Returns the tensors of a state dict; the rest, such as counters, is left out."""
+    items = state.items() if isinstance(state, dict) else ()
+    return {name: x for name, x in items if isinstance(name, str) and isinstance(x, torch.Tensor)}
+
+
+def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
+    try:
+        x = tensor.detach()  # parameters that require a gradient refuse numpy()
+        # numpy has no bfloat16; float32 represents each of its numbers.
+        return (x.float() if x.dtype == torch.bfloat16 else x).numpy()
+    except Exception as error:  # sparse, quantized or on no device: torch raises several types
+        raise _unreadable(path, name, str(tensor.dtype).removeprefix("torch.")) from error
+
+
+def _unreadable(path: Path, name: str, dtype: str) -> ConvertError:
+    return ConvertError(f"{path}: {name} is of type {dtype} or a form that cannot be read; save it as dense float32")

@@ -10,8 +10,9 @@ from typing import Any
 
 import jax
 
+from rsjax.config import ConfigError
 from rsjax.convert.files import ConvertError, Tensors
-from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
+from rsjax.convert.table import SAME_NAMES, Entry, Names, Table, norm, shape_of, to_params, weight_and_bias
 from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -72,51 +73,77 @@ def read_settings(weights: Path) -> dict[str, Any]:
     return settings
 
 
-def infer_config(source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None) -> Architecture:
+def infer_config(
+    source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None, names: Names = SAME_NAMES
+) -> Architecture:
     """Infers the network from the names and shapes of its tensors and from its settings.
 
     Args:
         settings: a GenieConfig's fields; those about training are ignored.
         heads: overrides num_heads of the settings.
+        names: of the tensors in the file, for errors, where they differ.
 
     Raises:
         ConvertError: the tensors are not a Genie's, contradict the settings, or leave the number of heads unknown; or
-            the settings describe a network that this project does not have.
+            the settings are of wrong types, or describe a network that this project does not have.
     """
-    position, first = tensors.get("pos_embed_TSC"), tensors.get("token_embed.factored_embeds.0.weight")
-    hidden = tensors.get("decoder.layers.0.mlp.fc1.weight")
-    if position is None or position.ndim != 4 or first is None or hidden is None:
+
+    def shape(key: str, axes: int) -> tuple[int, ...]:
+        return shape_of(source, tensors, key, axes, names)
+
+    _check_types(source.parent / CONFIG, settings)
+    position, first, hidden = (
+        "pos_embed_TSC",
+        "token_embed.factored_embeds.0.weight",
+        "decoder.layers.0.mlp.fc1.weight",
+    )
+    if not {position, first, hidden} <= tensors.keys():
         raise ConvertError(f"{source}: holds no weights of a Genie (STMaskGIT), such as pos_embed_TSC")
-    _, frames, cells, width = position.shape
+    _, frames, cells, width = shape(position, 4)
     blocks, vocabularies = (
         sum(name.startswith(start) and name.endswith(end) for name in tensors)
         for start, end in (("decoder.layers.", ".mlp.fc1.weight"), ("token_embed.factored_embeds.", ".weight"))
     )
-    shared = tensors.get("decoder.layers.0.spatial_attn.norm.weight")  # of qk-norm: one value per channel of a head
+    shared = "decoder.layers.0.spatial_attn.norm.weight"  # of qk-norm: one value per channel of a head
     if heads is None:
-        heads = settings.get("num_heads", None if shared is None else width // len(shared))
-    if not isinstance(heads, int) or heads < 1:
+        heads = settings.get("num_heads")
+    if heads is None and shared in tensors:
+        heads = width // shape(shared, 1)[0]
+    if heads is None or heads < 1:
         raise ConvertError(
-            f"{source}: the number of attention heads is {heads or 'unknown'} and cannot be inferred from the weights; "
+            f"{source}: the number of attention heads is {'unknown' if heads is None else heads}; "
             f"put the published {CONFIG} beside the file, or set --heads (8 in the public models)"
         )
-    config = Architecture(
-        frames=frames,
-        grid=math.isqrt(cells),
-        code_bits=vocabularies * round(math.log2(len(first))),
-        vocabularies=vocabularies,
-        action_encoder="none",
-        action_inputs=0,
-        width=width,
-        blocks=blocks,
-        heads=heads,
-        mlp_ratio=len(hidden) // width,
-        use_depth=False,
-        qk_norm=shared is not None,
-        mup=bool(settings.get("use_mup", False)),
-    )
+    try:
+        config = Architecture(
+            frames=frames,
+            grid=math.isqrt(cells),
+            code_bits=vocabularies * round(math.log2(shape(first, 2)[0])),
+            vocabularies=vocabularies,
+            action_encoder="none",
+            action_inputs=0,
+            width=width,
+            blocks=blocks,
+            heads=heads,
+            mlp_ratio=max(1, shape(hidden, 2)[0] // width),
+            use_depth=False,
+            qk_norm=shared in tensors,
+            mup=settings.get("use_mup") or False,
+        )
+    except ConfigError as error:
+        raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
     _check_settings(source.parent / CONFIG, settings, settings_of(config) | {"S": cells})
     return config
+
+
+def _check_types(path: Path, settings: dict[str, Any]) -> None:
+    """Raises :class:`ConvertError` unless each known field is null or of its type; a whole number is a float, too."""
+    for name, example in settings_of(Architecture()).items():
+        value = settings.get(name)
+        kinds = (int, float) if type(example) is float else (type(example),)
+        if value is not None and type(value) not in kinds:
+            kind = {bool: "true or false", int: "a whole number", float: "a number"}[type(example)]
+            raise ConvertError(f"{path}: {name} is {json.dumps(value):.80}, not {kind}")
 
 
 def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, Any]) -> None:
@@ -153,13 +180,13 @@ def settings_of(config: Architecture) -> dict[str, Any]:
 
 
 def from_public(
-    source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None
+    source: Path, tensors: Tensors, settings: dict[str, Any], heads: int | None = None, names: Names = SAME_NAMES
 ) -> tuple[Architecture, Params]:
     """Returns a model's configuration and parameters, converted from a public file's tensors.
 
-    Arguments and errors as in :func:`infer_config`; also raises ConvertError if tensors are missing, unexpected or of
-    another shape.
+    Arguments and errors as in :func:`infer_config`; also raises ConvertError if tensors are missing, unexpected, of
+    another shape or no finite floats.
     """
-    config = infer_config(source, tensors, settings, heads)
+    config = infer_config(source, tensors, settings, heads, names)
     shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
-    return config, to_params(source, tensors, table(config), shapes)
+    return config, to_params(source, tensors, table(config), shapes, names)

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 
 from rsjax.convert.files import ConvertError, Tensors
-from rsjax.convert.table import check
+from rsjax.convert.table import SAME_NAMES, Names, check
 from rsjax.tokenizers.lpips import NETS, lpips_shapes
 
 _WITHIN = r"(?:loss\.perceptual_loss\.)?"  # the prefix in a tokenizer's checkpoint
@@ -22,23 +22,27 @@ IGNORED = re.compile(
 )
 
 
-def from_public(source: object, tensors: Tensors) -> tuple[str, Tensors]:
+def from_public(source: object, tensors: Tensors, names: Names = SAME_NAMES) -> tuple[str, Tensors]:
     """Returns the network's name and its weights, named as in the project's file.
 
     Args:
         source: the files of the tensors, for errors.
         tensors: those of all files together.
+        names: of the tensors in the files, for errors, where they differ.
 
     Raises:
-        ConvertError: the network is unknown; or tensors are missing, unexpected or of another shape.
+        ConvertError: the network is unknown; or tensors are missing, unexpected, of another shape or no finite floats.
     """
     weights: Tensors = {}
+    public: dict[str, str] = {}
     for name, x in tensors.items():
         own = next((pattern.sub(to, name) for pattern, to in NAMES if pattern.fullmatch(name)), None)
         if own is not None and own in weights:
-            raise ConvertError(f"{source}: {own} occurs twice, the second time as {name}; pass each part once")
+            second = names.get(name, name)
+            raise ConvertError(f"{source}: {own} occurs twice, as {public[own]} and as {second}; pass each part once")
         if own is not None or not IGNORED.fullmatch(name):
             weights[own or name] = x
+            public[own or name] = names.get(name, name)
     nets = [net for net in NETS if _backbone(lpips_shapes(net)) == _backbone(weights)]
     if not nets:
         raise ConvertError(
@@ -47,7 +51,7 @@ def from_public(source: object, tensors: Tensors) -> tuple[str, Tensors]:
         )
     if not any(name.startswith("head.") for name in weights):
         raise ConvertError(f"{source}: only the backbone, {nets[0]}; pass the published heads with --heads-file")
-    check(source, weights, lpips_shapes(nets[0]))
+    check(source, weights, lpips_shapes(nets[0]), public)
     return nets[0], weights
 
 

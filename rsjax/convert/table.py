@@ -4,17 +4,22 @@ A table has one :class:`Entry` per public tensor. Reading uses every tensor exac
 exactly once; one error names everything that does not fit.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from jax import dtypes
 
 from rsjax.convert.files import ConvertError, Tensors
 
 Layout = Literal["same", "linear", "conv", "lead"]
 Shape = tuple[int, ...]
+Names = Mapping[str, str]  # a tensor's name in its file, by its name here
+
+SAME_NAMES: Names = MappingProxyType({})
 
 # (torch → flax, flax → torch)
 LAYOUTS: dict[Layout, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
@@ -67,18 +72,19 @@ def public_shapes(table: Table, shapes: Any) -> dict[str, Shape]:
     return public
 
 
-def to_params(source: object, tensors: Tensors, table: Table, shapes: Any) -> dict[str, Any]:
+def to_params(source: object, tensors: Tensors, table: Table, shapes: Any, names: Names = SAME_NAMES) -> dict[str, Any]:
     """Converts public tensors to float32 parameters.
 
     Args:
         source: the file of the tensors, for errors.
         tensors: exactly those of the table, of any floating type.
         shapes: ``jax.eval_shape`` of the parameters.
+        names: of the tensors in the file, for errors, where they differ.
 
     Raises:
-        ConvertError: tensors are missing, unexpected or of another shape; the message names them all.
+        ConvertError: as :func:`check`.
     """
-    check(source, tensors, public_shapes(table, shapes))
+    check(source, tensors, public_shapes(table, shapes), names)
     flat = {path: np.empty(leaf.shape, np.float32) for path, leaf in flatten_dict(shapes, sep="/").items()}
     for entry in table:
         value = LAYOUTS[entry.layout][0](tensors[entry.key])
@@ -100,24 +106,51 @@ def to_tensors(params: Any, table: Table) -> Tensors:
     }
 
 
-def check(source: object, tensors: Tensors, expected: dict[str, Shape]) -> None:
-    """Compares names and shapes of tensors.
+def shape_of(source: object, tensors: Tensors, key: str, axes: int, names: Names = SAME_NAMES) -> Shape:
+    """Returns the shape of a tensor from which a network is inferred.
 
     Raises:
-        ConvertError: tensors are missing, unexpected or of another shape; the message names them all.
+        ConvertError: there is no such tensor, or it has another number of axes, or no values.
     """
+    name = names.get(key, key)
+    if key not in tensors:
+        raise ConvertError(f"{source}: {name} is missing")
+    shape = tensors[key].shape
+    if len(shape) != axes or not all(shape):
+        raise ConvertError(f"{source}: {name} is of shape {shape}; it has {axes} axes, and values")
+    return shape
+
+
+def check(source: object, tensors: Tensors, expected: dict[str, Shape], names: Names = SAME_NAMES) -> None:
+    """Compares names and shapes of tensors, and checks that their values are finite floats.
+
+    Args:
+        names: of the tensors in the file, for errors, where they differ.
+
+    Raises:
+        ConvertError: tensors are missing, unexpected, of another shape or type, or not finite in float32; the message
+            names them all.
+    """
+    both = {key: (names.get(key, key), tensors[key], shape) for key, shape in expected.items() if key in tensors}
     misfits: dict[str, Collection[str]] = {
-        "missing": expected.keys() - tensors.keys(),
-        "unexpected": tensors.keys() - expected.keys(),
-        "of another shape": [
-            f"{key} is {tensors[key].shape}, not {shape}"
-            for key, shape in expected.items()
-            if key in tensors and tensors[key].shape != shape
-        ],
+        "missing": [names.get(key, key) for key in expected.keys() - tensors.keys()],
+        "unexpected": [names.get(key, key) for key in tensors.keys() - expected.keys()],
+        "of another shape": [f"{n} is {x.shape}, not {shape}" for n, x, shape in both.values() if x.shape != shape],
+        "not floats": [f"{n} is {x.dtype}" for n, x, _ in both.values() if not _is_float(x)],
+        "with NaN or infinite values": [n for n, x, _ in both.values() if _is_float(x) and not _is_finite(x)],
     }
-    listed = "; ".join(f"{kind}: {_some(names)}" for kind, names in misfits.items() if names)
+    listed = "; ".join(f"{kind}: {_some(found)}" for kind, found in misfits.items() if found)
     if listed:
         raise ConvertError(f"{source}: its tensors do not fit the network inferred from them; {listed}")
+
+
+def _is_float(x: np.ndarray) -> bool:
+    return bool(dtypes.issubdtype(x.dtype, np.floating))  # bfloat16 included
+
+
+def _is_finite(x: np.ndarray) -> bool:
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(x.astype(np.float32)).all())
 
 
 def _check_complete(table: Table, shapes: dict[str, Shape]) -> None:

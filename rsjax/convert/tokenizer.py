@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import jax
 
-from rsjax.config import TokenizerConfig
+from rsjax.config import ConfigError, TokenizerConfig
 from rsjax.convert.files import ConvertError, Tensors
-from rsjax.convert.table import Entry, Table, norm, to_params, weight_and_bias
+from rsjax.convert.table import SAME_NAMES, Entry, Names, Table, norm, shape_of, to_params, weight_and_bias
 from rsjax.tokenizers.magvit2 import Tokenizer
 
 Weights = Literal["raw", "ema"]
@@ -70,48 +70,56 @@ def _blocks(key: str, path: str, count: int, width_in: int, width_out: int) -> l
     return entries
 
 
-def infer_config(source: object, tensors: Tensors, weights: Weights) -> TokenizerConfig:
+def infer_config(source: object, tensors: Tensors, weights: Weights, names: Names = SAME_NAMES) -> TokenizerConfig:
     """Infers the network from the names and shapes of its tensors.
 
     Raises:
-        ConvertError: the tensors are not a tokenizer's, or include no moving average where ``weights`` is "ema".
-        ConfigError: this project cannot build the network.
+        ConvertError: the tensors are not a tokenizer's, include no moving average where ``weights`` is "ema", or are
+            of a network that this project cannot build.
     """
 
-    def get(key: str) -> Any:
-        return tensors.get(public_name(key, weights))
+    def has(key: str) -> bool:
+        return public_name(key, weights) in tensors
+
+    def shape(key: str) -> tuple[int, ...]:
+        return shape_of(source, tensors, public_name(key, weights), 4, names)
 
     def count(key: str) -> int:
         n = 0
-        while get(key.format(n)) is not None:
+        while has(key.format(n)):
             n += 1
         return n
 
-    ends = [get(key) for key in ("encoder.conv_in.weight", "encoder.conv_out.weight")]
     levels, blocks = count("encoder.down.{}.block.0.conv1.weight"), count("encoder.down.0.block.{}.conv1.weight")
-    if any(x is None or x.ndim != 4 for x in ends) or not levels:
+    if not (has("encoder.conv_in.weight") and has("encoder.conv_out.weight") and levels):
         kind, cure = ("averaged (ema) ", "; try --weights raw") if weights == "ema" else ("", "")
         raise ConvertError(
             f"{source}: holds no {kind}weights of a MAGVIT-2 tokenizer, such as "
             f"{public_name('encoder.conv_in.weight', weights)}{cure}"
         )
-    (channels, colors), bits = ends[0].shape[:2], ends[1].shape[0]
+    (channels, colors), bits = shape("encoder.conv_in.weight")[:2], shape("encoder.conv_out.weight")[0]
     patch = round((colors / 3) ** 0.5)
-    return TokenizerConfig(
-        patch_size=patch,
-        channels=channels,
-        channel_multipliers=tuple(
-            get(f"encoder.down.{level}.block.0.conv1.weight").shape[0] // channels for level in range(levels)
-        ),
-        res_blocks=blocks,
-        adaptive_norm=get("decoder.adaptive.0.gamma.weight") is not None,
-        code_bits=bits,
-        vocabularies=2 if bits % 2 == 0 else 1,
-    )
+    widths = [shape(f"encoder.down.{level}.block.0.conv1.weight")[0] for level in range(levels)]
+    try:
+        return TokenizerConfig(
+            patch_size=max(1, patch),
+            channels=channels,
+            channel_multipliers=tuple(max(1, width // channels) for width in widths),
+            res_blocks=blocks,
+            adaptive_norm=has("decoder.adaptive.0.gamma.weight"),
+            code_bits=bits,
+            vocabularies=2 if bits % 2 == 0 else 1,
+        )
+    except ConfigError as error:
+        raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
 
 
 def from_public(
-    source: object, tensors: Tensors, weights: Weights = "raw", config: TokenizerConfig | None = None
+    source: object,
+    tensors: Tensors,
+    weights: Weights = "raw",
+    config: TokenizerConfig | None = None,
+    names: Names = SAME_NAMES,
 ) -> tuple[TokenizerConfig, Any, Counter[str]]:
     """Converts a public file's tensors to a tokenizer.
 
@@ -119,14 +127,15 @@ def from_public(
         source: the file of the tensors, for errors.
         weights: those of the last step, or their moving average.
         config: the network; None infers it.
+        names: of the tensors in the file, for errors, where they differ.
 
     Returns:
         The configuration, the parameters, and how many tensors were ignored, by the first words of their names.
 
     Raises:
-        ConvertError: tensors are missing, unexpected or of another shape, or are not a tokenizer's.
+        ConvertError: tensors are missing, unexpected, of another shape or no finite floats, or not a tokenizer's.
     """
-    config = config or infer_config(source, tensors, weights)
+    config = config or infer_config(source, tensors, weights, names)
     entries = table(config)
     keys = {public_name(entry.key, weights): entry.key for entry in entries}
     kept: Tensors = {}
@@ -137,4 +146,5 @@ def from_public(
         else:
             kept[keys.get(name, name)] = x
     shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
-    return config, to_params(source, kept, entries, shapes), ignored
+    public = {own: names.get(key, key) for key, own in keys.items()}
+    return config, to_params(source, kept, entries, shapes, dict(names) | public), ignored

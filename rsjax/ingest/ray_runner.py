@@ -1,7 +1,7 @@
 """Runs the work items of an ingest on a Ray cluster: a pool of actors for each step, with its CPUs and shares of GPUs.
 
 Messages are ids, places and marks; pictures stay where they are. Every node has to see the data set and the plan's
-folder under the same paths. Ray is an extra (``pip install 'rsjax[ray]'``).
+folder under the same paths. Ray is an extra (``pip install -e '.[ray]'``).
 """
 
 import asyncio
@@ -49,7 +49,7 @@ def run_on_ray(
     try:
         import ray
     except ImportError as error:
-        raise RayError("--runner ray needs Ray: pip install 'rsjax[ray]'") from error
+        raise RayError("--runner ray needs Ray: pip install -e '.[ray]'") from error
     here = not ray.is_initialized()
     if here:
         _connect(ray, plan, address, cpus)

@@ -1,4 +1,4 @@
-"""Clips for the Rerun viewer: pictures, depth, tracks and actions by frame. Needs the extra ``rsjax[rerun]``."""
+"""Clips for the Rerun viewer: pictures, depth, tracks and actions by frame. Needs the extra ``rerun``."""
 
 import os
 import sys
@@ -38,7 +38,7 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
     try:
         import rerun
     except ImportError as error:
-        raise UserError("--rerun and --rerun-file need the viewer: pip install 'rsjax[rerun]'") from error
+        raise UserError("--rerun and --rerun-file need the viewer: pip install -e '.[rerun]'") from error
     damaged, shown = list[str](), 0
     recording = rerun.RecordingStream("rsjax")
     with _reported(file):

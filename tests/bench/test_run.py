@@ -170,7 +170,7 @@ def test_torch_for_a_model_that_it_cannot_be_is_refused_before_anything_is_measu
 
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rsjax.bench.torch_part.find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"pip install 'rsjax\[torch\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[torch\]'"):
         bench(toy(), torch=True)
 
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 
+from rsjax.convert import commands
 from rsjax.convert.__main__ import main
 from rsjax.convert.directory import load_tokenizer, load_world_model, save
 from rsjax.convert.files import read_tensors, write_safetensors
@@ -35,7 +36,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 def assert_same(path: Path, expected: Tensors) -> None:
-    tensors, _ = read_tensors(path)
+    tensors = read_tensors(path).tensors
     assert tensors.keys() == expected.keys()
     for name, x in expected.items():
         assert tensors[name].tobytes() == x.tobytes(), name
@@ -99,6 +100,33 @@ def test_the_command_says_when_it_assumes_no_mup(
     assert ("no use_mup in a config.json beside in.safetensors" in capsys.readouterr().out) == expected
 
 
+def test_replacing_an_output_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_safetensors(tmp_path / "in.safetensors", GENIE, {})
+    for expected in (False, True):
+        convert("genie", tmp_path / "in.safetensors", tmp_path / "own", "--heads", 2)
+        convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")
+        convert("tokenizer", _written(tmp_path / "t.safetensors", TOKENIZER), tmp_path / "own")
+        assert capsys.readouterr().out.count("it replaces the one that was there") == 3 * expected
+
+
+def test_an_export_that_stops_leaves_no_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    convert("genie", _written(tmp_path / "in.safetensors", GENIE), tmp_path / "own", "--heads", 2)
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "write_safetensors", stop)
+    with pytest.raises(SystemExit) as stopped:
+        convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")
+    assert stopped.value.code == 130
+    assert not (tmp_path / "out" / "config.json").exists()
+
+
+def _written(path: Path, tensors: Tensors) -> Path:
+    write_safetensors(path, tensors, {})
+    return path
+
+
 def test_load_lpips_reads_what_two_files_are_converted_to(tmp_path: Path) -> None:
     write_safetensors(tmp_path / "net.safetensors", backbone("alexnet"), {})
     write_safetensors(tmp_path / "heads.safetensors", heads("alexnet"), {})
@@ -117,6 +145,9 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert ".safetensors" in refused(capsys, "genie", tmp_path / "own", tmp_path / "other")
     assert "holds no tokenizer/weights" in refused(capsys, "tokenizer", tmp_path / "own", tmp_path / "x.safetensors")
     assert "settings" in refused(capsys, "genie", tmp_path / "own", tmp_path / "own" / "x.safetensors")
+    (tmp_path / "x" / "config.json").mkdir(parents=True)
+    assert "config.json: cannot be read" in refused(capsys, "genie", tmp_path / "own", tmp_path / "x" / "x.safetensors")
+    assert "is a directory" in refused(capsys, "lpips", tmp_path / "own", tmp_path / "x.safetensors")
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text(json.dumps({"name": "tiny", "model": {}}))

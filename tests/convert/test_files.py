@@ -1,8 +1,10 @@
+import json
 import os
 import pickle
+import struct
 import sys
-from pathlib import Path
-from types import ModuleType
+from argparse import Namespace
+from pathlib import Path, PurePath
 from typing import Any
 
 import ml_dtypes
@@ -28,7 +30,7 @@ def test_reading_inverts_writing(tmp_path: Path) -> None:
     tensors: Tensors = {"a.weight": whole.transpose(2, 0, 1), "b": whole[:, 1:3, ::2], "n": np.array(7, np.int64)}
     tensors["c"] = rng.normal(size=6).astype(ml_dtypes.bfloat16)
     write_safetensors(path, tensors, {"net": "x"})
-    read, metadata = read_tensors(path)
+    read, metadata, _ = read_tensors(path)
     assert metadata == {"net": "x"}
     assert read.keys() == tensors.keys()
     for name in tensors:
@@ -36,65 +38,81 @@ def test_reading_inverts_writing(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read[name], tensors[name])
 
 
-class FakeTensor:
-    """Behaves like torch's: a tensor that requires a gradient refuses numpy()."""
-
-    dtype = "float32"
-
-    def __init__(self, values: np.ndarray, wants_gradient: bool = True) -> None:
-        self.values, self.wants_gradient = values, wants_gradient
-
-    def detach(self) -> "FakeTensor":
-        return FakeTensor(self.values, wants_gradient=False)
-
-    def numpy(self) -> np.ndarray:
-        if self.wants_gradient:
-            raise RuntimeError("Can't call numpy() on Tensor that requires grad")
-        return self.values
-
-
-@pytest.fixture
-def fake_torch(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Replaces PyTorch, so that its calls are tested without it. Tests set ``load``."""
-    fake = ModuleType("torch")
-    monkeypatch.setattr(fake, "Tensor", FakeTensor, raising=False)
-    monkeypatch.setattr(fake, "bfloat16", "bfloat16", raising=False)
-    monkeypatch.setitem(sys.modules, "torch", fake)
-    return fake
-
-
 @pytest.mark.parametrize("suffix", PICKLED)
-def test_pytorch_loads_weights_only(
-    tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch, suffix: str
-) -> None:
-    asked: list[tuple[Any, dict[str, Any]]] = []
+def test_pytorch_loads_weights_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    torch = pytest.importorskip("torch")
+    load, asked = torch.load, []
 
-    def load(file: Any, **options: Any) -> Any:
-        asked.append((file, options))
-        return {"state_dict": {"a": FakeTensor(np.arange(3.0))}}
+    def spy(file: Any, **options: Any) -> Any:
+        asked.append(options["weights_only"])
+        return load(file, **options)
 
-    monkeypatch.setattr(fake_torch, "load", load, raising=False)
     path = tmp_path / f"x{suffix}"
-    path.write_bytes(b"anything")
-    tensors, _ = read_tensors(path)
-    [(file, options)] = asked
-    assert file == path
-    assert options["weights_only"] is True
-    np.testing.assert_array_equal(tensors["a"], np.arange(3.0))
+    torch.save({"state_dict": {"a": torch.arange(3.0)}}, path)
+    monkeypatch.setattr(torch, "load", spy)
+    np.testing.assert_array_equal(read_tensors(path).tensors["a"], np.arange(3.0))
+    assert asked == [True]
 
 
-def test_an_error_of_pytorch_becomes_one_line_with_a_cure(
-    tmp_path: Path, fake_torch: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def load(*_: Any, **__: Any) -> Any:
-        raise pickle.UnpicklingError("Weights only load failed.\nmany more lines")
-
-    monkeypatch.setattr(fake_torch, "load", load, raising=False)
+def test_what_pytorch_refuses_is_named_without_its_advice(tmp_path: Path) -> None:
+    """PyTorch's own message advises to load such a file without protection."""
+    torch = pytest.importorskip("torch")
     path = tmp_path / "x.pt"
-    path.write_bytes(b"anything")
-    with pytest.raises(ConvertError, match=r"refused.*\(Weights only load failed\.\).*\.safetensors") as caught:
+    torch.save({"state_dict": {"a": torch.zeros(2)}, "run": eval}, path)
+    with pytest.raises(ConvertError, match=r"refused: it holds eval, which could run code.*\.safetensors") as caught:
         read_tensors(path)
-    assert str(path) in str(caught.value)
+    path.write_bytes(b"anything")
+    with pytest.raises(ConvertError, match=r"refused: it is damaged.*\.safetensors") as again:
+        read_tensors(path)
+    for message in map(str, (caught.value, again.value)):
+        assert message.startswith(f"{path}: ")
+        assert "weights_only" not in message
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
+def test_what_training_scripts_save_beside_tensors_is_left_out(tmp_path: Path, zipped: bool) -> None:
+    torch = pytest.importorskip("torch")
+    beside = {
+        "hyper_parameters": {"out": Path("runs/a"), "args": Namespace(lr=1e-4, path=PurePath("x"))},
+        "best": np.float64(0.25),
+        "numbers": [np.int64(3), np.bool_(True), np.random.get_state()],
+    }
+    state = {"module._orig_mod.a": torch.arange(2.0), "block._orig_mod.b": torch.tensor(3.0), "epoch": 3}
+    for holder in ("state_dict", "model_state_dict", "model"):
+        path = tmp_path / "x.ckpt"
+        torch.save({holder: state | {"count": np.int64(1)}} | beside, path, _use_new_zipfile_serialization=zipped)
+        read = read_tensors(path)
+        assert read.names == {"a": "module._orig_mod.a", "block.b": "block._orig_mod.b"}
+        np.testing.assert_array_equal(read.tensors["a"], [0.0, 1.0])
+        assert read.tensors["block.b"] == 3
+
+
+def test_a_name_that_is_left_twice_is_refused(tmp_path: Path) -> None:
+    write_safetensors(tmp_path / "x.safetensors", {"a": np.zeros(1), "module.a": np.zeros(1)}, {})
+    with pytest.raises(ConvertError, match="x.safetensors: a occurs twice, as a and as module.a"):
+        read_tensors(tmp_path / "x.safetensors")
+
+
+def test_types_that_numpy_lacks_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "x.safetensors"
+    header = json.dumps({"a.w": {"dtype": "F8_E4M3", "shape": [2], "data_offsets": [0, 2]}}).encode()
+    path.write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
+    with pytest.raises(ConvertError, match=r"x\.safetensors: a\.w is of type F8_E4M3"):
+        read_tensors(path)
+
+
+@pytest.mark.parametrize("kind", ["float8_e4m3fn", "conjugate", "sparse", "meta"])
+def test_pytorchs_tensors_that_numpy_lacks_are_named(tmp_path: Path, kind: str) -> None:
+    torch = pytest.importorskip("torch")
+    tensors = {
+        "float8_e4m3fn": lambda: torch.zeros(2).to(torch.float8_e4m3fn),
+        "conjugate": lambda: torch.zeros(2, dtype=torch.complex64).conj(),
+        "sparse": lambda: torch.zeros(2, 2).to_sparse(),
+        "meta": lambda: torch.zeros(2, device="meta"),
+    }
+    torch.save({"model": {"module.a": tensors[kind]()}}, tmp_path / "x.pt")
+    with pytest.raises(ConvertError, match=r"x\.pt: module\.a is of type"):
+        read_tensors(tmp_path / "x.pt")
 
 
 @pytest.mark.parametrize("suffix", PICKLED)
@@ -122,7 +140,7 @@ def test_without_pytorch_its_files_are_refused_with_a_cure(tmp_path: Path, monke
     path = tmp_path / "x.ckpt"
     path.write_bytes(b"anything")
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ConvertError, match=r"rsjax\[torch\].*\.safetensors"):
+    with pytest.raises(ConvertError, match=r"pip install -e .*torch.*\.safetensors"):
         read_tensors(path)
 
 
@@ -144,7 +162,7 @@ def test_pytorchs_tensors_are_read_bare_or_as_a_state_dict(tmp_path: Path) -> No
     }
     for name, content in (("bare.pt", state), ("whole.ckpt", {"state_dict": state, "epoch": 3})):
         torch.save(content, tmp_path / name)
-        read, metadata = read_tensors(tmp_path / name)
+        read, metadata, _ = read_tensors(tmp_path / name)
         assert metadata == {}
         np.testing.assert_array_equal(read["a.weight"], np.arange(6.0, dtype=np.float32).reshape(2, 3).T)
         np.testing.assert_array_equal(read["p"], [0.0, 1.0])

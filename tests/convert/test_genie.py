@@ -1,8 +1,10 @@
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import jax
+import ml_dtypes
 import numpy as np
 import pytest
 
@@ -83,6 +85,55 @@ def test_settings_that_contradict_the_weights_are_named(field: str, value: Any) 
 def test_unsupported_settings_are_refused(field: str, value: bool) -> None:
     with pytest.raises(ConvertError, match=f"config.json: {field} {str(value).lower()} is not supported"):
         infer_config(Path("file"), tensors(), SETTINGS | {field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "kind"),
+    [
+        ("use_mup", "false", "true or false"),
+        ("use_mup", 0, "true or false"),
+        ("qk_norm", "no", "true or false"),
+        ("num_heads", True, "a whole number"),
+        ("num_heads", "2", "a whole number"),
+        ("num_layers", 3.0, "a whole number"),
+        ("T", [3], "a whole number"),
+        ("mlp_ratio", "4", "a number"),
+        ("attn_drop", False, "a number"),
+    ],
+)
+def test_settings_of_another_type_are_refused(field: str, value: Any, kind: str) -> None:
+    with pytest.raises(ConvertError, match=rf"config.json: {field} is {re.escape(json.dumps(value))}, not {kind}"):
+        infer_config(Path("file"), tensors(), SETTINGS | {field: value})
+
+
+@pytest.mark.parametrize("key", ["pos_embed_TSC", "token_embed.factored_embeds.0.weight", "out_x_proj.bias"])
+@pytest.mark.parametrize("shape", [(), (0,), (0, 0, 0, 0), (2, 2, 2, 2, 2)], ids=str)
+def test_tensors_of_unexpected_shapes_are_named(key: str, shape: tuple[int, ...]) -> None:
+    names = {name: f"module.{name}" for name in tensors()}
+    with pytest.raises(ConvertError, match=f"file: .*module.{re.escape(key)} is"):
+        from_public(Path("file"), tensors() | {key: np.zeros(shape, np.float32)}, SETTINGS, names=names)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros(16, np.int64), "not floats: module.out_x_proj.bias is int64"),
+        (np.zeros(16, bool), "not floats: module.out_x_proj.bias is bool"),
+        (np.zeros(16, np.complex64), "not floats: module.out_x_proj.bias is complex64"),
+        (np.full(16, np.nan, np.float16), "with NaN or infinite values: module.out_x_proj.bias"),
+        (np.full(16, -np.inf, ml_dtypes.bfloat16), "with NaN or infinite values: module.out_x_proj.bias"),
+        (np.full(16, 1e300), "with NaN or infinite values: module.out_x_proj.bias"),
+    ],
+    ids=["integers", "booleans", "complex", "NaN", "infinite bfloat16", "beyond float32"],
+)
+def test_weights_that_are_no_finite_floats_are_refused(value: np.ndarray, message: str) -> None:
+    with pytest.raises(ConvertError, match=f"^file: .*{message}$"):
+        from_public(
+            Path("file"),
+            tensors() | {"out_x_proj.bias": value},
+            SETTINGS,
+            names={"out_x_proj.bias": "module.out_x_proj.bias"},
+        )
 
 
 def test_settings_of_training_are_ignored() -> None:

@@ -28,7 +28,10 @@ def backbone(net: str, name: str = "features.{}") -> Tensors:
 
 
 def heads(net: str, prefix: str = "") -> Tensors:
-    return {f"{prefix}lin{k}.model.1.weight": np.full((1, width, 1, 1), k) for k, width in enumerate(NETS[net][1])}
+    return {
+        f"{prefix}lin{k}.model.1.weight": np.full((1, width, 1, 1), k, np.float32)
+        for k, width in enumerate(NETS[net][1])
+    }
 
 
 def expected(net: str) -> set[str]:
@@ -72,7 +75,7 @@ def test_a_missing_head_is_named() -> None:
 
 
 def test_heads_of_the_other_network_are_refused() -> None:
-    with pytest.raises(ConvertError, match=r"head.1.weight is \(1, 192, 1, 1\), not \(1, 128, 1, 1\)"):
+    with pytest.raises(ConvertError, match=r"lin1.model.1.weight is \(1, 192, 1, 1\), not \(1, 128, 1, 1\)"):
         from_public("file", backbone("vgg16") | heads("alexnet"))
 
 
@@ -86,3 +89,10 @@ def test_duplicate_and_unknown_tensors_are_refused() -> None:
         from_public("file", backbone("alexnet") | heads("alexnet") | {"net.slice1.0.weight": zeros(64, 3, 11, 11)})
     with pytest.raises(ConvertError, match="unexpected: odd.weight"):
         from_public("file", backbone("alexnet") | heads("alexnet") | {"odd.weight": zeros(1)})
+
+
+@pytest.mark.parametrize("value", [np.nan, 1, 1j])
+def test_weights_that_are_no_finite_floats_are_named_as_in_the_file(value: complex) -> None:
+    wrong = {"lin3.model.1.weight": np.full((1, 256, 1, 1), value)}
+    with pytest.raises(ConvertError, match=r"(NaN or infinite values|not floats): lin3\.model\.1\.weight"):
+        from_public("file", backbone("alexnet") | heads("alexnet") | wrong)

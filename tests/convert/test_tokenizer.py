@@ -110,9 +110,31 @@ def test_all_misfits_are_named_in_one_error(weights: Weights) -> None:
         from_public("some.ckpt", everything, weights)
     message = str(caught.value)
     assert message.startswith("some.ckpt: ")
-    assert "missing: decoder.norm_out.bias" in message
+    assert f"missing: {spell('decoder.norm_out.bias')}" in message
     assert f"unexpected: {spell('decoder.extra.weight')}" in message
-    assert "of another shape: encoder.mid_block.0.conv1.weight is (64, 64, 1, 1), not (64, 64, 3, 3)" in message
+    wrong = spell("encoder.mid_block.0.conv1.weight")
+    assert f"of another shape: {wrong} is (64, 64, 1, 1), not (64, 64, 3, 3)" in message
+
+
+@pytest.mark.parametrize("weights", ["raw", "ema"])
+@pytest.mark.parametrize("shape", [(), (0, 3, 3, 3), (4, 0, 3, 3), (33, 3, 3, 3), (32, 3)], ids=str)
+def test_tensors_of_unexpected_shapes_are_named(weights: Weights, shape: tuple[int, ...]) -> None:
+    everything, _, _ = training_file("older")
+    for key in ("encoder.conv_in.weight", "encoder.down.1.block.0.conv1.weight", "encoder.conv_out.weight"):
+        name = public_name(key, weights)
+        with pytest.raises(ConvertError, match=r"^some\.ckpt: ") as caught:
+            from_public("some.ckpt", everything | {name: np.zeros(shape, np.float32)}, weights)
+        assert f"{name} is" in str(caught.value) or "cannot be built" in str(caught.value)
+
+
+@pytest.mark.parametrize("weights", ["raw", "ema"])
+@pytest.mark.parametrize("value", [np.nan, 3, True, 1j])
+def test_weights_that_are_no_finite_floats_are_refused(weights: Weights, value: Any) -> None:
+    everything, _, _ = training_file("older")
+    name = public_name("decoder.norm_out.bias", weights)
+    names = {name: f"module.{name}"}
+    with pytest.raises(ConvertError, match=f"(NaN or infinite values|not floats): module.{name}"):
+        from_public("some.ckpt", everything | {name: np.full(32, value)}, weights, names=names)
 
 
 def test_a_file_without_an_average_says_so() -> None:

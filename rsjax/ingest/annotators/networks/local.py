@@ -12,7 +12,7 @@ from rsjax.errors import first_line
 from rsjax.files import placeholder
 from rsjax.ingest.annotators.protocols import AnnotationError, Annotator
 
-EXTRA = "pip install 'rsjax[annotate]'"
+EXTRA = "pip install -e '.[annotate]'"
 
 
 @dataclass(frozen=True)
