@@ -11,7 +11,7 @@ import tyro
 from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
 from rsjax.command import main_errors as main_errors  # every command imports both from here
-from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets
+from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets, require
 from rsjax.config.curriculum import format_stage, parse_stage
 from rsjax.config.leaves import leaves
 from rsjax.errors import did_you_mean
@@ -31,7 +31,7 @@ FIRST_FIELDS = {
     "model.use-depth": "Whether the model has a depth branch.",
     "model.action-encoder": "How the model reads actions.",
     "train.steps": "Training steps of the world model.",
-    "train.curriculum": "A curriculum, one word per stage: simple:2 difficult:3:restart (see docs/training.md).",
+    "train.curriculum": "A curriculum, one word per stage: simple:2 difficult:3 (docs/training.md); no word: none.",
     "train.batch-size": "Clips of a batch, over all devices.",
     "train.optimizer.learning-rate": "Peak learning rate of the world model.",
     "train.seed": "Seed of the world model's training.",
@@ -51,7 +51,7 @@ REGISTRY = tyro.constructors.ConstructorRegistry()
 
 @REGISTRY.primitive_rule
 def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
-    """Reads a stage of a curriculum from one word, such as ``difficult:3:restart``."""
+    """Reads a stage of a curriculum from one word, such as ``difficult:3``."""
     if info.type is not CurriculumStageConfig:
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
@@ -115,7 +115,15 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
     elif "--help-all" in argv:
         argv = ["--help"]
     parsed = _parse({"options": options, "preset": preset_options, "fields": fields}, argv, prog, description)
-    return parsed.fields, parsed.options
+    config: Config = parsed.fields
+    for name in ("train", "tokenizer_train"):
+        loop, flag = getattr(config, name), f"--{name.replace('_', '-')}"
+        require(
+            not loop.curriculum or loop.steps == getattr(preset, name).steps,
+            f"{flag}.steps changes nothing, as the epochs of {flag}.curriculum determine the steps; {flag}.curriculum "
+            f"without a word trains on all clips for that many steps",
+        )
+    return config, parsed.options
 
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:

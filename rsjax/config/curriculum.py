@@ -1,10 +1,11 @@
-"""Reads and writes one stage of a curriculum as a word of a command line: ``simple:2``, ``difficult:3:restart``.
+"""Reads and writes one stage of a curriculum as a word of a command line: ``simple:2``, ``difficult:3``.
 
 A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; ``+`` joins its parts. A part is
-``DIFFICULTIES[/TASKS][=WEIGHT][@STORE]``: shell patterns joined by commas (``all`` matches everything), a weight, and
-the directory of another store. So ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two picking or placing
-clips of the run's own for each difficult clip of run b. Names that contain one of ``: + @ = / ,`` cannot be written
-this way; in Python, :class:`CurriculumStageConfig` takes them.
+``DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][@STORE]``: shell patterns joined by commas (``all`` matches everything), a
+weight, and the directory of another store. So ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two
+picking or placing clips of the run's own for each difficult clip of run b, and ``all/all/kitchen*:1`` the clips in
+kitchens. Names that contain one of ``: + @ = / ,`` cannot be written this way; in Python,
+:class:`CurriculumStageConfig` takes them.
 """
 
 import math
@@ -12,8 +13,9 @@ import math
 from rsjax.config.fields import ConfigError
 from rsjax.config.train import ComponentConfig, CurriculumStageConfig
 
-GRAMMAR = "DIFFICULTIES[/TASKS][=WEIGHT][@STORE][+…]:EPOCHS[:restart]"
-EXAMPLE = "simple:2 or difficult:3:restart"
+GRAMMAR = "DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][@STORE][+…]:EPOCHS[:restart]"
+EXAMPLE = "simple:2 or difficult:3"
+_COLUMNS = (("difficulties", "difficulty"), ("tasks", "task"), ("scenes", "scene"))  # field, and one of its words
 
 
 def parse_stage(text: str) -> CurriculumStageConfig:
@@ -44,20 +46,23 @@ def _parse_part(text: str, part: str) -> ComponentConfig:
     if at and not store:
         raise _error(text, "nothing follows its @")
     labels, equals, weight = body.partition("=")
-    difficulties, slash, tasks = labels.partition("/")
+    words = labels.split("/")
+    if len(words) > len(_COLUMNS):
+        raise _error(text, f"{'/'.join(words[len(_COLUMNS) :])!r} follows its scenes")
+    patterns = {field: _patterns(text, name, word) for (field, name), word in zip(_COLUMNS, words, strict=False)}
     return ComponentConfig(
-        difficulties=_patterns(text, "difficulty", difficulties),
-        tasks=_patterns(text, "task", tasks) if slash else ("*",),
+        **patterns,
         store=store,
         weight=_number(text, "weight", weight) if equals else 1.0,
     )
 
 
 def _format_part(part: ComponentConfig) -> str:
-    difficulties, tasks = (",".join(patterns) for patterns in (part.difficulties, part.tasks))
-    tasks = "" if part.tasks == ("*",) else f"/{tasks}"
+    words = [",".join(getattr(part, field)) for field, _ in _COLUMNS]
+    while len(words) > 1 and words[-1] == "*":
+        words.pop()
     weight = "" if part.weight == 1 else f"={_plain(part.weight)}"
-    return f"{difficulties}{tasks}{weight}{'@' if part.store else ''}{part.store}"
+    return f"{'/'.join(words)}{weight}{'@' if part.store else ''}{part.store}"
 
 
 def _patterns(text: str, name: str, joined: str) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from rsjax.config import (
     TokenizerConfig,
     TokenizerTrainConfig,
 )
+from rsjax.config.curriculum import parse_stage
 from rsjax.errors import did_you_mean
 
 
@@ -132,9 +133,11 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
 
     The paper gives neither heads nor optimizer nor batch size. Heads: 8 as in the public code, 16 if a head would be
-    wider than 64. Optimizer: AdamW with linear decay, as in the public code. Steps: the paper's 5 epochs of 6.5 million
-    clips, at a batch of 256.
+    wider than 64. Optimizer: AdamW with linear decay, as in the public code. Curriculum: the authors' 2 epochs of
+    simple tasks, then 3 of difficult ones, for their own model. Steps without one: 5 epochs of 6.5 million clips, at a
+    batch of 256.
     """
+    curriculum = ("simple:2", "difficult:3") if isinstance(model, RoboScapeConfig) else ()
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
@@ -159,6 +162,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
         train=LoopConfig(
             steps=127_000,
+            curriculum=tuple(map(parse_stage, curriculum)),
             batch_size=256,
             optimizer=OptimizerConfig(beta2=0.999, schedule="linear", final_share=0.0),
             log_every=100,

@@ -43,11 +43,13 @@ class OptimizerConfig:
 class ComponentConfig:
     """A component of a data mixture: the clips of one store that match a filter.
 
-    Patterns are shell patterns (``pick*``); a clip matches if one of ``tasks`` and one of ``difficulties`` match.
+    Patterns are shell patterns (``pick*``); a clip matches if one of ``tasks``, one of ``difficulties`` and one of
+    ``scenes`` match.
     """
 
     tasks: tuple[str, ...] = ("*",)
     difficulties: tuple[str, ...] = ("*",)  # labels of the store, such as simple and difficult
+    scenes: tuple[str, ...] = ("*",)  # likewise, such as kitchen
     store: str = ""  # a token store of the same tokenizer; empty: this run's own
     weight: float = 1.0  # share of the clips drawn, relative to the other components
 
@@ -57,7 +59,10 @@ class ComponentConfig:
 
 @dataclass(frozen=True)
 class CurriculumStageConfig:
-    """One stage of a curriculum (paper §3.1: 2 epochs of simple tasks, then 3 of difficult ones)."""
+    """One stage of a curriculum.
+
+    The paper's authors: 2 epochs of simple tasks, then 3 of difficult ones. They state no restart of the learning rate.
+    """
 
     components: tuple[ComponentConfig, ...] = (ComponentConfig(),)
     epochs: float = 1.0  # the stage draws as many clips as its components have, times this

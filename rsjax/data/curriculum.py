@@ -101,18 +101,26 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     Raises:
         StoreError: none passes; the message lists the store's tasks and difficulties.
     """
-    patterns = {"task": part.tasks, "difficulty": part.difficulties}
-    if all("*" in allowed for allowed in patterns.values()):
+    patterns = {"difficulty": part.difficulties, "task": part.tasks, "scene": part.scenes}
+    patterns = {name: allowed for name, allowed in patterns.items() if "*" not in allowed}
+    if not patterns:
         return None
     labels = store.labels(SPLIT)
+    if missing := [name for name in patterns if name not in labels.words]:
+        raise StoreError(
+            f"{store.path}: its records name no {' and no '.join(missing)}, only {', '.join(labels.words)}; make it "
+            f"again, or change the stage's patterns"
+        )
     chosen = np.flatnonzero(labels.matching(patterns))
     if not len(chosen):
         counts = labels.counts()
         words = {name: ", ".join(f"{word!r} {n}×" for word, n in sorted(counts[name].items())) for name in patterns}
         listed = "; ".join(f"{name} {counted}" for name, counted in words.items())
+        wanted = " and ".join(f"a {name} like {' or '.join(allowed)}" for name, allowed in patterns.items())
         raise StoreError(
-            f"{store.path}: no {SPLIT} record has a difficulty like {' or '.join(part.difficulties)} and a task like "
-            f"{' or '.join(part.tasks)}; it has {listed}: change the stage's patterns"
+            f"{store.path}: no {SPLIT} record has {wanted}; it has {listed}: change the stage's patterns "
+            f"(--train.curriculum all:5 reads everything), or label the clips when you ingest them "
+            f"(--difficulty, --scene)"
         )
     return chosen
 

@@ -137,7 +137,8 @@ def token_record(codec: Codec, clip: Record) -> Record:
 
 def labels(record: Record) -> dict[str, str]:
     """Returns the labels by which a curriculum selects token records."""
-    return {name: record[name] for name in ("task", "difficulty")}
+    scene = record["provenance"].get("scene") or "unknown"
+    return {"task": record["task"], "difficulty": record["difficulty"], "scene": scene}
 
 
 def fingerprint(params: Params) -> str:

@@ -27,6 +27,7 @@ PARTS = st.builds(
     ComponentConfig,
     tasks=st.lists(WORDS, min_size=1).map(tuple),
     difficulties=st.lists(WORDS, min_size=1).map(tuple),
+    scenes=st.lists(WORDS, min_size=1).map(tuple),
     store=st.sampled_from(["", "runs/b/tokens/store", "/data/a=b"]),
     weight=POSITIVE,
 )
@@ -64,21 +65,31 @@ def test_stages_survive_json_and_change_the_content_key(stages: tuple[Curriculum
 
 
 def test_the_papers_curriculum_on_the_command_line() -> None:
-    config = read("tiny", "--train.curriculum", "simple:2", "difficult:3:restart", "--train.seed", "3")
+    config = read("tiny", "--train.curriculum", "simple:2", "difficult:3", "--train.seed", "3")
     assert config.train == dataclasses.replace(
         presets.get("tiny").train,
         seed=3,
         curriculum=(
             CurriculumStageConfig((ComponentConfig(difficulties=("simple",)),), 2.0),
-            CurriculumStageConfig((ComponentConfig(difficulties=("difficult",)),), 3.0, restart=True),
+            CurriculumStageConfig((ComponentConfig(difficulties=("difficult",)),), 3.0),
         ),
     )
 
 
 def test_a_word_can_set_every_field() -> None:
-    assert parse_stage("simple,hard/pick*,place=2.5@runs/b+all:0.5") == CurriculumStageConfig(
-        (ComponentConfig(("pick*", "place"), ("simple", "hard"), "runs/b", 2.5), ComponentConfig()), 0.5
+    kitchens = ComponentConfig(("pick*", "place"), ("simple", "hard"), ("kitchen*",), "runs/b", 2.5)
+    assert parse_stage("simple,hard/pick*,place/kitchen*=2.5@runs/b+all:0.5:restart") == CurriculumStageConfig(
+        (kitchens, ComponentConfig()), 0.5, restart=True
     )
+
+
+def test_full_size_presets_have_the_authors_curriculum_and_it_can_be_dropped() -> None:
+    for name in ("roboscape_s", "roboscape_m", "roboscape_l"):
+        assert [format_stage(stage) for stage in presets.get(name).train.curriculum] == ["simple:2", "difficult:3"]
+    train = read("roboscape_s", "--train.curriculum", "--train.steps", "9").train
+    assert (train.curriculum, train.steps) == ((), 9)
+    with pytest.raises(ConfigError, match=r"--train.steps changes nothing, as the epochs of --train.curriculum"):
+        read("roboscape_s", "--train.steps", "9")
 
 
 @pytest.mark.parametrize(
@@ -94,6 +105,8 @@ def test_a_word_can_set_every_field() -> None:
         ("simple@:2", "nothing follows its @"),
         (":2", "a difficulty is empty; write all to match every difficulty"),
         ("simple/:2", "a task is empty"),
+        ("simple/all/:2", "a scene is empty"),
+        ("simple/all/all/x:2", "'x' follows its scenes"),
         ("simple+:2", "a difficulty is empty"),
     ],
 )
@@ -101,7 +114,7 @@ def test_an_error_names_the_mistake_and_the_syntax(word: str, reason: str) -> No
     with pytest.raises(ConfigError) as caught:
         read("tiny", "--train.curriculum", word)
     assert f"stage '{word}': {reason}" in str(caught.value)
-    assert "write DIFFICULTIES[/TASKS]" in str(caught.value) and "such as simple:2" in str(caught.value)
+    assert "write DIFFICULTIES[/TASKS[/SCENES]]" in str(caught.value) and "such as simple:2" in str(caught.value)
 
 
 @pytest.mark.parametrize("stages", [3, "simple:2", [3], [{"parts": 3}], [{"epoch": 3}]])

@@ -53,14 +53,29 @@ def test_a_filter_by_labels_is_a_filter_by_reading_every_record(
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
     for check in (
         lambda: check_stages(loop("hard/pick*:1"), own),
-        lambda: plan(loop("hard:1"), own, transform, own.path),
+        lambda: plan(loop("hard/pick*:1"), own, transform, own.path),
     ):
         with pytest.raises(StoreError) as caught:
             check()
-        assert "difficulty like hard and a task like" in str(caught.value)
-        assert "task 'pick out' 10×, 'pick up' 10×, 'place' 10×; difficulty 'difficult' 15×, 'simple' 15×" in str(
+        assert "difficulty like hard and a task like pick*" in str(caught.value)
+        assert "difficulty 'difficult' 15×, 'simple' 15×; task 'pick out' 10×, 'pick up' 10×, 'place' 10×" in str(
             caught.value
         )
+
+
+def test_a_stage_can_choose_scenes_where_the_store_names_them(own: Store, tmp_path: Path) -> None:
+    write_store(
+        tmp_path / "scenes",
+        "numbers",
+        {"train": map(toy.record, range(9))},
+        {},
+        lambda r: {"scene": f"room {r['i'] % 3}"},
+    )
+    (part,) = parse_stage("all/all/room 1,room 2:1").components
+    chosen = choose(part, open_store(tmp_path / "scenes"))
+    assert chosen is not None and chosen.tolist() == [1, 2, 4, 5, 7, 8]
+    with pytest.raises(StoreError, match="its records name no scene, only task, difficulty; make it again"):
+        choose(part, own)
 
 
 @given(
@@ -84,8 +99,8 @@ def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
 
 
 def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_difficult_one_three_times(own: Store) -> None:
-    planned, feed = plan(replace(loop("simple:2", "difficult:3:restart"), batch_size=5), own, transform, own.path)
-    assert (planned.steps, planned.restarts) == (6 + 9, (6,))
+    planned, feed = plan(replace(loop("simple:2", "difficult:3"), batch_size=5), own, transform, own.path)
+    assert (planned.steps, planned.restarts) == (6 + 9, ())
     with feed(None) as loader:
         taken = take(loader, planned.steps)["i"]
     simple, difficult = np.arange(0, COUNT, 2), np.arange(1, COUNT, 2)
@@ -93,7 +108,7 @@ def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_diffic
     np.testing.assert_array_equal(np.sort(taken[6:].ravel()), np.repeat(difficult, 3))
     assert feed.summary() == [
         "stage simple:2: 15 clips, steps 1 to 6",
-        "stage difficult:3:restart: 15 clips, steps 7 to 15",
+        "stage difficult:3: 15 clips, steps 7 to 15",
     ]
 
 

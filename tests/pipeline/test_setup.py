@@ -36,10 +36,14 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
     assert tokens.manifest["tokenizer"] == fingerprint(toy.tokenizer_params())
     source = tokens.source("train")
     assert [source[i]["provenance"]["episode"] for i in range(len(source))] == [0, 2]
-    assert tokens.labels("train").counts() == {"task": {"drift": 2}, "difficulty": {"unknown": 2}}
+    assert tokens.labels("train").counts() == {
+        "task": {"drift": 2},
+        "difficulty": {"unknown": 2},
+        "scene": {"unknown": 2},
+    }
     (line,) = (run.directory / "tokens" / "quarantine.jsonl").read_text().splitlines()
     assert '"record": 1' in line
-    with pytest.raises(StoreError, match="task 'drift' 2×; difficulty 'unknown' 2×"):
+    with pytest.raises(StoreError, match="it has difficulty 'unknown' 2×"):
         world_model_setup(replace(run, config=with_stages(run.config, "simple:2")))
     setup = world_model_setup(replace(run, config=with_stages(run.config, "unknown/dri*:3")))
     assert setup.loop.steps == 3
