@@ -1,8 +1,9 @@
 """robomimic HDF5 files: ``data/demo_i`` with ``actions`` and ``obs/<key>``, ``mask/<filter>`` that lists demos.
 
-``obs[t]`` was recorded before ``actions[t]``, which led to ``obs[t + 1]``. The files that robomimic offers for download
-have no pictures: users render them with its ``dataset_states_to_obs.py``. LIBERO's files have the same layout with
-other conventions (:mod:`rsjax.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
+``obs[t]`` was recorded before ``actions[t]``, which led to ``obs[t + 1]``. robosuite's own demos have no ``obs``, and
+robomimic's downloads have no pictures in it: both are rendered from their simulator states, as far as the installed
+robosuite has the models (:mod:`rsjax.ingest.formats.rendered`). LIBERO's files have the same layout with other
+conventions (:mod:`rsjax.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
 """
 
 import json
@@ -30,8 +31,7 @@ from rsjax.ingest.episode import (
 )
 from rsjax.ingest.formats.files import broken, inside, location_of
 from rsjax.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
-
-_RENDER = "render them with robomimic's dataset_states_to_obs.py --camera_names …"
+from rsjax.ingest.formats.rendered import CURE, Pictures, rendered
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,24 @@ ROBOMIMIC = Convention(
 )
 
 
-def open_source(path: Path, filter: str = "", depth: bool = False) -> "DemoSource":
+def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 128) -> "DemoSource":
     """Opens a robomimic data set.
 
     Args:
         path: an HDF5 file, or a folder of such.
         filter: read only demos that ``mask/<filter>`` lists, such as ``train``.
-        depth: take ``obs/<camera>_depth`` as metres.
+        depth: take ``obs/<camera>_depth`` as metres. Demos that are rendered always have depth.
+        size: side in pixels of pictures that are rendered, 8 to 1024.
 
     Raises:
-        SourceError: there are no files, none has pictures, or the filter is unknown.
+        SourceError: there are no files, none has pictures or can be rendered, or an option is impossible.
     """
-    return open_demos(path, ROBOMIMIC, filter, depth)
+    if not 8 <= size <= 1024:
+        raise SourceError(f"robomimic: option size is {size}; choose one from 8 to 1024")
+    return open_demos(path, ROBOMIMIC, filter, depth, size)
 
 
-def open_demos(path: Path, convention: Convention, filter: str, depth: bool) -> "DemoSource":
+def open_demos(path: Path, convention: Convention, filter: str, depth: bool, size: int = 0) -> "DemoSource":
     """Opens a data set of this layout. Arguments and errors as in :func:`open_source`."""
     folder, files = path.parent, [path]
     if not path.is_file():
@@ -88,17 +91,26 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool) -> 
     if not files:
         raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
     names = tuple(str(file.relative_to(folder)) for file in files)
-    source = DemoSource(folder, names, convention, filter, depth, convention.name)
+    source = DemoSource(folder, names, convention, filter, depth, convention.name, size)
     for file in files:  # if the first demo that can be read has no pictures, none has
         try:
             demos = source.demos(file)
             with open_file(file) as content:
-                if demos and not _picture_keys(content[f"data/{demos[0]}/obs"], convention):
-                    raise SourceError(f"{file}: data/{demos[0]}/obs has no *{convention.endings[0]}; {_RENDER}")
+                if demos:
+                    _check_pictures(source, content[f"data/{demos[0]}"], file)
             break
         except (EpisodeError, KeyError):
             continue  # its episodes are listed, and refused one by one
     return source
+
+
+def _check_pictures(source: "DemoSource", group: Any, path: Path) -> None:
+    """Raises :class:`SourceError` if a demo neither has pictures nor can be rendered."""
+    if not _picture_keys(group.get("obs", {}), source.convention):
+        try:
+            source.pictures(group, path)
+        except EpisodeError as error:
+            raise SourceError(str(error)) from error
 
 
 @dataclass
@@ -112,6 +124,7 @@ class DemoSource:
         filter: of demos; "": all.
         depth: whether depth maps are read.
         name: the convention's.
+        size: side in pixels of pictures that are rendered.
     """
 
     folder: Path
@@ -120,6 +133,7 @@ class DemoSource:
     filter: str
     depth: bool
     name: str
+    size: int = 0
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses."""
@@ -140,8 +154,8 @@ class DemoSource:
         path, demo = inside(self.folder, location["file"]), location["demo"]
         with open_file(path) as file:
             group = member(file, f"data/{demo}", path)
-            if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group):
-                raise EpisodeError.at(path, f"has no data/{demo}/obs", LEAVE_OUT)
+            if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group | None):
+                raise EpisodeError.at(path, f"has no group data/{demo}", LEAVE_OUT)
             return checked(self._episode(ref, path, group, _settings(file["data"], path)), f"{path}: data/{demo}")
 
     def _episode(self, ref: EpisodeRef, path: Path, group: Any, settings: dict[str, Any]) -> Episode:
@@ -151,12 +165,9 @@ class DemoSource:
         if samples is not None and int(samples) != len(commands):
             problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
             raise EpisodeError.at(path, problem)
-        observed = group["obs"]
-        cameras = _picture_keys(observed, how)
-        if not cameras:
-            raise EpisodeError.at(path, f"{observed.name} has no pictures (*{how.endings[0]})", _RENDER)
+        cameras, depth = self.pictures(group, path)
         fps = _fps(settings, path) or how.fps
-        states, flipped = _states(observed, how, path)
+        states, flipped = _states(group.get("obs", {}), how, path)
         width = commands.shape[1]  # a gripper is the last dimension of each arm's seven, of other robots the last alone
         grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
         return Episode(
@@ -167,12 +178,8 @@ class DemoSource:
             timestamps=np.arange(len(commands)) / fps,
             actions=align_actions(commands, how.after),
             states=states,
-            cameras={camera: H5Frames(path, f"{observed.name}/{key}", how.stored) for camera, key in cameras.items()},
-            depth={
-                camera: H5Frames(path, f"{observed.name}/{camera}_depth", how.stored, depth=True)
-                for camera in cameras
-                if self.depth and f"{camera}_depth" in observed
-            },
+            cameras=cameras,
+            depth=depth,
             meta={
                 "source": how.name,
                 "file": ref.location["file"],
@@ -181,6 +188,24 @@ class DemoSource:
                 "notes": {"flipped": flipped} if flipped else {},
                 "actions": Layout("delta", held=grippers).to_json(),
             },
+        )
+
+    def pictures(self, group: Any, path: Path) -> Pictures:
+        """Returns the pictures and depth maps of a demo by camera, rendered if it has none.
+
+        Raises:
+            EpisodeError: they have another shape or type, or a demo without pictures cannot be rendered.
+        """
+        observed, stored = group.get("obs", {}), self.convention.stored
+        keys = _picture_keys(observed, self.convention)
+        if not keys and self.size:
+            return rendered(group, path, self.size)
+        if not keys:
+            raise EpisodeError.at(path, f"{group.name}/obs has no *{self.convention.endings[0]}", CURE)
+        maps = [f"{camera}_depth" for camera in keys if self.depth and f"{camera}_depth" in observed]
+        return (
+            {camera: H5Frames(path, f"{observed.name}/{key}", stored) for camera, key in keys.items()},
+            {key.removesuffix("_depth"): H5Frames(path, f"{observed.name}/{key}", stored, depth=True) for key in maps},
         )
 
     def demos(self, path: Path) -> list[str]:
@@ -235,9 +260,9 @@ def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndar
 
 
 def _settings(group: Any, path: Path) -> dict[str, Any]:
-    """Returns ``env_args`` and ``problem_info`` of a file, which are JSON."""
+    """Returns ``env_args``, ``env_info`` (robosuite's own) and ``problem_info`` of a file, which are JSON."""
     settings: dict[str, Any] = {}
-    for name in ("env_args", "problem_info"):
+    for name in ("env_info", "env_args", "problem_info"):
         text = attribute(group, name)
         try:
             values = json.loads(text) if text else {}
