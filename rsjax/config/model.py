@@ -110,7 +110,9 @@ class SampleConfig:
     """Settings of MaskGIT decoding within a frame, and of the memory from frame to frame."""
 
     steps: int = 2
-    temperature: float = 0.0  # logits are divided by it; 0 takes the most probable code
+    # Logits are divided by it; 0 takes the most probable code. The public Genie divides probabilities, which are then
+    # normalised again, so that every temperature above 0 samples as 1 does here.
+    temperature: float = 0.0
     top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
     unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
     # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
@@ -157,6 +159,11 @@ class LossConfig:
     gamma: float = 5.0  # γ of Eq. 6
     use_keypoints: bool = True  # False: without the keypoint and attention terms
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
+    # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
+    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame.
+    keypoint_target: Literal["observed", "predicted"] = "observed"
+    # Whether Eq. 5 compares masked cells only: from a third to half of ŝ_t lie on visible cells, where nobody samples.
+    keypoint_masked_only: bool = True
 
     def __post_init__(self) -> None:
         require(self.num_keypoints >= 1, f"model.loss.num_keypoints is {self.num_keypoints}; it must be at least 1")

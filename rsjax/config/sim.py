@@ -1,6 +1,7 @@
 """Settings of the simulator's episodes."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.fields import require, runtime
@@ -17,6 +18,9 @@ class SimConfig:
     image_size: int = 64
     camera: str = "agentview"
     tracks: int = 256  # N₀: dense keypoint tracks per clip
+    # Where tracks start. grid: evenly over the image, as in the paper, which avoids segmentation on purpose.
+    # objects: up to half on a grid, the others on the cube and the arm's moving links, found by segmentation.
+    track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0
     workers: int = runtime(0)  # 0: one process per core
 

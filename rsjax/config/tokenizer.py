@@ -86,6 +86,10 @@ class TokenizerTrainConfig(LoopConfig):
     lpips_weights: str = ""  # a safetensors file for rsjax.tokenizers.lpips.load_lpips
     entropy_weight: float = 0.1
     entropy_temperature: float = 0.01
+    # Added to the average code's probabilities p in log p, as in the reference; 0: the true entropy.
+    entropy_offset: float = 1e-5
+    # Images that share an average code; 0: all of the batch, on all devices. 8 in the reference: those of one device.
+    entropy_group: int = 0
     commitment_weight: float = 0.25
     adversarial_weight: float = 0.0  # the generator's term, 0.1 in the reference; 0: no discriminator
     hinge_weight: float = 0.5  # the discriminator's loss
@@ -97,6 +101,12 @@ class TokenizerTrainConfig(LoopConfig):
         super().__post_init__()
         value = self.adversarial_weight
         require(value >= 0, f"tokenizer_train.adversarial_weight is {value}; it cannot be negative")
+        images = self.batch_size // self.accumulate * self.frames_per_clip
+        require(
+            self.entropy_group >= 0 and (self.entropy_group == 0 or images % self.entropy_group == 0),
+            f"tokenizer_train.entropy_group is {self.entropy_group}; it must divide the {images} images of a batch "
+            f"(batch_size / accumulate × frames_per_clip), or be 0 for one average over all of them",
+        )
 
     @property
     def lpips_missing(self) -> bool:

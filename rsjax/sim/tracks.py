@@ -25,14 +25,27 @@ class Snapshot:
     fine_depth: Float32[np.ndarray, "R R"]
 
 
-def pick_pixels(
+def grid_pixels(size: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "count 2"]:
+    """Returns (row, column) of N₀ pixels of frame 0 to track, evenly over the image (paper §2.3).
+
+    The largest square grid that N₀ allows; the rest lie anywhere else, different as long as the image has pixels.
+
+    Args:
+        size: pixels along each side of the image.
+        count: N₀.
+        rng: generator of the rest.
+    """
+    return _unravel(_fill(_grid(size, count), count, size, rng), size)
+
+
+def object_pixels(
     bodies: Int32[np.ndarray, "S S"],
     movable: Bool[np.ndarray, " bodies"],
     cube: int,
     count: int,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, "count 2"]:
-    """Returns (row, column) of N₀ pixels of frame 0 to track, all different if the image has enough.
+    """Returns (row, column) of N₀ pixels of frame 0 to track, many of them on what moves.
 
     Up to half lie on a regular grid over the image. Of the others, half lie on the cube and half on moving links of the
     arm, as far as these cover pixels; the rest lie anywhere.
@@ -44,24 +57,32 @@ def pick_pixels(
         count: N₀.
         rng: generator of the choice.
     """
-    size = bodies.shape[0]
-    side = min(int(np.sqrt(count / 2)), size)
-    ticks = ((np.arange(side) + 0.5) * size / side).astype(int)
-    chosen = (ticks[:, None] * size + ticks[None, :]).ravel()
-    flat = bodies.ravel()
+    size, flat = bodies.shape[0], bodies.ravel()
+    chosen = _grid(size, count // 2)
     free = np.setdiff1d(np.arange(flat.size), chosen)
-    wanted = (
-        (free[flat[free] == cube], (count - chosen.size) // 2),
-        (free[movable[flat[free]] & (flat[free] != cube)], count - chosen.size),
-        (free, count),
-    )
-    for pool, most in wanted:
-        pool = np.setdiff1d(pool, chosen)
+    on_cube, on_arm = free[flat[free] == cube], free[movable[flat[free]] & (flat[free] != cube)]
+    for pool, most in ((on_cube, (count - chosen.size) // 2), (on_arm, count)):
         take = min(most, count - chosen.size, pool.size)
         chosen = np.concatenate([chosen, rng.choice(pool, take, replace=False)])
-    if chosen.size < count:  # more tracks than pixels
-        chosen = np.concatenate([chosen, rng.choice(flat.size, count - chosen.size)])
-    return np.stack(np.divmod(chosen, size), -1)
+    return _unravel(_fill(chosen, count, size, rng), size)
+
+
+def _grid(size: int, most: int) -> Int[np.ndarray, " N"]:
+    """Returns the flat indices of the largest square grid of at most ``most`` pixels."""
+    side = min(int(np.sqrt(most)), size)
+    ticks = ((np.arange(side) + 0.5) * size / side).astype(int) if side else np.zeros(0, int)
+    return (ticks[:, None] * size + ticks[None, :]).ravel()
+
+
+def _fill(chosen: Int[np.ndarray, " N"], count: int, size: int, rng: np.random.Generator) -> Int[np.ndarray, " count"]:
+    """Adds random pixels up to ``count``, different ones until the image has no more."""
+    rest = np.setdiff1d(np.arange(size * size), chosen)
+    chosen = np.concatenate([chosen, rng.choice(rest, min(count - chosen.size, rest.size), replace=False)])
+    return np.concatenate([chosen, rng.choice(size * size, count - chosen.size)])
+
+
+def _unravel(flat: Int[np.ndarray, " N"], size: int) -> Int[np.ndarray, "N 2"]:
+    return np.stack(np.divmod(flat, size), -1)
 
 
 def track(

@@ -61,7 +61,10 @@ def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
 
 
 def entropy_loss(
-    latents: Float[Array, "*batch D"], temperature: float, total: Callable[[Any], Any] = lambda x: x
+    latents: Float[Array, "*batch D"],
+    temperature: float,
+    offset: float = 1e-5,
+    total: Callable[[Any], Any] = lambda x: x,
 ) -> Scalar:
     """Returns the mean entropy of a token's code minus the entropy of the batch's average code, in nats.
 
@@ -70,6 +73,9 @@ def entropy_loss(
     product of two tables of 2^(D/2) half-codes. Everything is float32, products included.
 
     Args:
+        offset: added to the average code's probabilities p in log p, 1e-5 in the reference; 0 gives the true entropy.
+            It matters at 18 bits, where most of the 262,144 codes are rarer than 1e-5: the gradient's cosine to that
+            of the true entropy is 0.8 to 0.95 for 16,384 tokens (latents of scale 0.05 to 1), for 64 even negative.
         total: adds arrays over devices. The average code covers all devices' tokens, the mean entropy this device's.
     """
     logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
@@ -79,7 +85,8 @@ def entropy_loss(
     half = logits.shape[-1] // 2
     low, high = (_code_probabilities(log_one[:, s], log_zero[:, s]) for s in (slice(half), slice(half, None)))
     average = total(_product(high.T, low)) / total(jnp.float32(logits.shape[0]))  # (2^(D-half), 2^half)
-    of_average = -jnp.sum(average * jnp.log(jnp.maximum(average, 1e-20)))
+    # Without the floor the gradient of 0·log 0 is undefined.
+    of_average = -jnp.sum(average * jnp.log(jnp.maximum(average + offset, 1e-20)))
     return jnp.mean(per_token) - of_average
 
 

@@ -3,6 +3,7 @@
 Axes: B images, H×W pixels, h×w token cells, D code bits.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
@@ -101,7 +102,7 @@ class TokenizerTraining(Trainable[Images]):
         means = {
             "l1": jnp.mean(jnp.abs(error)),
             "l2": jnp.mean(jnp.square(error)),
-            "entropy": lfq.entropy_loss(latents, train.entropy_temperature, total),
+            "entropy": self.entropy(latents, total),
             "commitment": lfq.commitment_loss(latents),
         }
         if "perceptual" in train.loss_weights:
@@ -112,6 +113,29 @@ class TokenizerTraining(Trainable[Images]):
             judge, averages = params["discriminator"], extra["lecam"]
             terms |= adversarial_terms(train, judge, target, output, active, averages, axis_name)
         return terms
+
+    def entropy(self, latents: Latents, total: Callable[[Any], Any]) -> Scalar:
+        """Returns LFQ's entropy loss, the mean over groups of ``entropy_group`` images.
+
+        Args:
+            total: adds arrays over devices; without groups the average code covers all devices' images.
+
+        Raises:
+            ConfigError: this device's images do not divide into groups.
+        """
+        temperature, offset, group = (
+            getattr(self.train, f"entropy_{name}") for name in ("temperature", "offset", "group")
+        )
+        if not group:
+            return lfq.entropy_loss(latents, temperature, offset, total)
+        images = latents.shape[0]
+        require(
+            images % group == 0,
+            f"tokenizer_train.entropy_group is {group}, but a device computes {images} images at once; "
+            f"choose a divisor, or 0 for one average over the whole batch",
+        )
+        groups = latents.reshape(-1, group, *latents.shape[1:])
+        return jnp.mean(jax.vmap(lambda part: lfq.entropy_loss(part, temperature, offset))(groups))
 
     def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
         if extra is None or "lecam" not in self.loss_weights:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from rsjax.sim.expert import Expert, draw_manner
 from rsjax.sim.lift import LiftSim
 from rsjax.sim.render import Camera
-from rsjax.sim.tracks import TOLERANCE, Snapshot, pick_pixels, track, unoccluded
+from rsjax.sim.tracks import TOLERANCE, Snapshot, grid_pixels, object_pixels, track, unoccluded
 
 SIZE = 64
 
@@ -37,7 +37,7 @@ def test_picked_pixels_are_different_and_favour_what_moves(count: int, seed: int
     bodies[30:35, 20:25] = 2
     bodies[:10, 20:50] = 1
     movable = np.array([False, True, True])
-    pixels = pick_pixels(bodies, movable, 2, count, np.random.default_rng(seed))
+    pixels = object_pixels(bodies, movable, 2, count, np.random.default_rng(seed))
     assert pixels.shape == (count, 2)
     assert pixels.min() >= 0
     assert pixels.max() < SIZE
@@ -46,6 +46,18 @@ def test_picked_pixels_are_different_and_favour_what_moves(count: int, seed: int
     if 16 <= count <= 400:
         assert (on > 0).sum() >= 0.45 * count
         assert (on == 2).sum() >= min(25 - 4, count // 5)
+
+
+@given(st.integers(1, 5000), st.integers(0, 2**32 - 1))
+def test_grid_pixels_are_different_and_lie_evenly(count: int, seed: int) -> None:
+    pixels = grid_pixels(SIZE, count, np.random.default_rng(seed))
+    assert pixels.shape == (count, 2)
+    assert pixels.min() >= 0
+    assert pixels.max() < SIZE
+    assert len(np.unique(pixels, axis=0)) == min(count, SIZE**2)
+    quarters = np.bincount((pixels[:, 0] >= SIZE // 2) * 2 + (pixels[:, 1] >= SIZE // 2), minlength=4)
+    side = min(int(np.sqrt(count)), SIZE)
+    assert quarters.min() >= (side // 2) ** 2
 
 
 def test_occlusion() -> None:
@@ -114,7 +126,7 @@ def test_a_track_on_the_cube_agrees_with_an_independent_projection(sim: LiftSim,
 
 def test_visible_tracks_lie_on_their_body_and_hidden_ones_do_not(sim: LiftSim, moments) -> None:
     _, view, bodies = moments[0]
-    pixels = pick_pixels(bodies, sim.movable, sim.cube_body, 256, np.random.default_rng(0))
+    pixels = object_pixels(bodies, sim.movable, sim.cube_body, 256, np.random.default_rng(0))
     tracks, visible = track(pixels, view.depth, bodies, [m[0] for m in moments])
     assert visible[:, 0].all()
     np.testing.assert_allclose(tracks[:, 0], (pixels[:, ::-1] + 0.5) / SIZE, atol=1e-5)

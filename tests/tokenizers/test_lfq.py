@@ -80,25 +80,29 @@ def test_commitment_draws_latents_to_their_codes() -> None:
     np.testing.assert_allclose(gradient, 2 * (latents - codes) / latents.size, rtol=1e-5, atol=1e-7)
 
 
-def entropy_over_all_codes(latents: np.ndarray, temperature: float) -> float:
+def entropy_over_all_codes(latents: np.ndarray, temperature: float, offset: float) -> float:
+    """The reference: softmax over all codes, and log(p + offset) in the average's entropy only."""
     codes = np.array(list(itertools.product([-1.0, 1.0], repeat=latents.shape[-1])))
     affinity = 2 * latents.astype(np.float64) @ codes.T / temperature
     p = np.exp(affinity - affinity.max(-1, keepdims=True))
     p /= p.sum(-1, keepdims=True)
 
-    def entropy(distribution: np.ndarray) -> float:
+    def entropy(distribution: np.ndarray, offset: float = 0.0) -> float:
         positive = distribution[distribution > 0]
-        return float(-np.sum(positive * np.log(positive)))
+        return float(-np.sum(positive * np.log(positive + offset)))
 
-    return float(np.mean([entropy(row) for row in p])) - entropy(p.mean(0))
+    return float(np.mean([entropy(row) for row in p])) - entropy(p.mean(0), offset)
 
 
 @pytest.mark.parametrize("code_bits", [1, 2, 5, 8])
 @pytest.mark.parametrize(("scale", "temperature"), [(0.005, 0.01), (1.0, 0.01), (0.5, 1.0)])
-def test_factorised_entropy_is_the_sum_over_all_codes(code_bits: int, scale: float, temperature: float) -> None:
+@pytest.mark.parametrize("offset", [0.0, 1e-5, 1e-2])
+def test_factorised_entropy_is_the_sum_over_all_codes(
+    code_bits: int, scale: float, temperature: float, offset: float
+) -> None:
     latents = np.random.default_rng(code_bits).normal(scale=scale, size=(6, 2, code_bits)).astype(np.float32)
-    expected = entropy_over_all_codes(latents.reshape(-1, code_bits), temperature)
-    found = jax.jit(lfq.entropy_loss)(jnp.array(latents), temperature)
+    expected = entropy_over_all_codes(latents.reshape(-1, code_bits), temperature, offset)
+    found = jax.jit(lfq.entropy_loss)(jnp.array(latents), temperature, offset)
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-5)
 
 
@@ -108,7 +112,7 @@ def test_the_entropy_of_the_average_is_that_of_all_devices_tokens() -> None:
     )  # four devices' parts, of which each uses few codes
 
     def on_each(latents: jax.Array) -> jax.Array:
-        return lfq.entropy_loss(latents, 0.01, lambda x: jax.lax.psum(x, "devices"))
+        return lfq.entropy_loss(latents, 0.01, total=lambda x: jax.lax.psum(x, "devices"))
 
     whole = jax.jit(lfq.entropy_loss)(latents, 0.01)
     parts = jax.jit(jax.vmap(on_each, axis_name="devices"))(latents)
@@ -119,8 +123,8 @@ def test_the_entropy_of_the_average_is_that_of_all_devices_tokens() -> None:
 
 def test_entropy_is_lowest_where_every_code_is_used_with_certainty() -> None:
     every_code = lfq.tokens_to_codes(jnp.arange(16), 4)
-    np.testing.assert_allclose(lfq.entropy_loss(every_code, 0.01), -math.log(16), rtol=1e-5)
-    np.testing.assert_allclose(lfq.entropy_loss(jnp.ones((16, 4)), 0.01), 0.0, atol=1e-5)
+    np.testing.assert_allclose(lfq.entropy_loss(every_code, 0.01, 0.0), -math.log(16), rtol=1e-5)
+    np.testing.assert_allclose(lfq.entropy_loss(jnp.ones((16, 4)), 0.01, 0.0), 0.0, atol=1e-5)
 
 
 def test_the_entropy_of_the_full_vocabulary_is_finite_with_finite_gradients() -> None:
@@ -129,3 +133,9 @@ def test_the_entropy_of_the_full_vocabulary_is_finite_with_finite_gradients() ->
     assert np.isfinite(loss)
     assert np.all(np.isfinite(gradient))
     assert np.any(gradient != 0)
+
+
+def test_at_18_bits_the_offset_changes_the_gradient() -> None:
+    latents = jax.random.normal(jax.random.key(0), (64, 18))
+    exact, reference = (np.ravel(jax.grad(lfq.entropy_loss)(latents, 0.01, offset)) for offset in (0.0, 1e-5))
+    assert exact @ reference < 0, "for few tokens the gradients even point apart"

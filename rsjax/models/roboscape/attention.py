@@ -214,8 +214,7 @@ class Attention(nn.Module):
         if self.config.qk_norm:
             q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
         if self.config.mup:
-            # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code's default, fused
-            # attention. (Its plain attention scales before the norm, which undoes the scaling.)
+            # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code.
             q = q * (8 * self.config.head_width**-0.5)
         return q, k, v
 

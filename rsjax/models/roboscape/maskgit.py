@@ -5,10 +5,12 @@ A clip's draws depend only on its own key, not on other clips of the batch.
 Axes: B clips, S cells, n vocabularies of V codes.
 """
 
+import math
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int, Key
 
@@ -25,11 +27,14 @@ class Frame:
     mask: Bool[Array, "*B S"]
 
 
-def masked_after(step: Array | int, steps: int, cells: int) -> Array:
-    """Returns how many cells stay masked after a step: ceil(cos((step + 1)/steps · π/2) · S); 0 after the last."""
-    # In float32 cos(π/2) is slightly above 0, and ceil would leave a cell masked.
-    share = jnp.where(jnp.asarray(step) + 1 >= steps, 0.0, jnp.cos((step + 1) / steps * jnp.pi / 2))
-    return jnp.ceil(share * cells).astype(jnp.int32)
+def masked_after(steps: int, cells: int) -> Int[np.ndarray, " K"]:
+    """Returns how many of S cells stay masked after each step s: ceil(cos((s + 1)/K · π/2) · S), and 0 after the last.
+
+    It is computed in float64 as in the reference: cos(π/3) is slightly above ½ there, so that after two of three steps
+    one cell more than half stays masked; float32 would drop it.
+    """
+    left = [math.ceil(math.cos((step + 1) / steps * math.pi / 2) * cells) for step in range(steps - 1)]
+    return np.array([*left, 0], np.int32)
 
 
 def sample_tokens(
@@ -103,4 +108,4 @@ def _unmask_clip(
         confidence = jax.random.uniform(order_key, frame.mask.shape)
     # Cells that are already decided stay decided: they get the highest rank.
     rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
-    return Frame(tokens, rank < masked_after(step, config.steps, frame.mask.shape[-1]))
+    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step])

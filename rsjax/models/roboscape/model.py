@@ -109,12 +109,28 @@ def attention_term(of: Predictions) -> Term:
 
 @loss_term("keypoint")
 def keypoint_term(of: Predictions) -> Term:
-    """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over frames t ≥ 2 in which keypoint i is visible."""
-    predicted = expected_codes(of.logits["rgb"], of.model.architecture.code_bits)  # B T S D
+    """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over frames t ≥ 2 in which keypoint i is visible.
+
+    ``keypoint_target`` "observed" puts the true code in the place of ŝ_1, ``keypoint_masked_only`` leaves out keypoints
+    on cells that are not masked.
+    """
+    bits, loss = of.model.architecture.code_bits, of.model.loss
     cells = of.keypoints.cells.swapaxes(1, 2)  # B T K
-    at_points = jnp.take_along_axis(predicted, cells[..., None], axis=2)  # B T K D
-    distance = jnp.sum(jnp.square(at_points[:, 1:] - at_points[:, :1]), axis=-1)
+
+    def at_points(codes: Float[Array, "B t S D"], cells: Int[Array, "B t K"]) -> Float[Array, "B t K D"]:
+        return jnp.take_along_axis(codes, cells[..., None], axis=2)
+
+    predicted = expected_codes(of.logits["rgb"], bits)  # B T S D
+    if loss.keypoint_target == "observed":
+        first = lfq.tokens_to_codes(of.clean["rgb"][:, :1], bits)
+        anchor = at_points(first.reshape(predicted[:, :1].shape), cells[:, :1])
+    else:
+        anchor = at_points(predicted[:, :1], cells[:, :1])
+    distance = jnp.sum(jnp.square(at_points(predicted[:, 1:], cells[:, 1:]) - anchor), axis=-1)
     weight = of.keypoints.visible.swapaxes(1, 2)[:, 1:] * of.batch.weight[:, None, None]
+    if loss.keypoint_masked_only:
+        mask = of.mask.reshape(*of.mask.shape[:2], -1)  # B T S
+        weight = weight * jnp.take_along_axis(mask[:, 1:], cells[:, 1:], axis=2)
     return jnp.sum(distance * weight), jnp.sum(weight)
 
 

@@ -49,9 +49,9 @@ def cross_entropy() -> jax.Array:
     return losses.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
 
 
-def predictions(keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, gamma: float = 5.0) -> Predictions:
+def predictions(keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, **loss: Any) -> Predictions:
     """Both branches with the same logits and tokens, and these keypoints instead of selected ones."""
-    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(gamma=gamma)))
+    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(**loss)))
     batch: Any = SimpleNamespace(weight=jnp.asarray(weight), has_depth=None)
     logits, tokens = (dict.fromkeys(("rgb", "depth"), jnp.array(x)) for x in (LOGITS, TOKENS))
     of = Predictions(model, logits, tokens, jnp.array(MASK), batch)
@@ -104,22 +104,28 @@ def test_expected_codes_are_the_mean_over_all_tokens() -> None:
     np.testing.assert_allclose(losses.expected_codes(jnp.array(LOGITS), BITS), plain_expected_codes(), atol=1e-5)
 
 
-def test_keypoints_are_equation_5() -> None:
+@pytest.mark.parametrize("masked_only", [False, True])
+@pytest.mark.parametrize("target", ["predicted", "observed"])
+def test_keypoints_are_equation_5(target: str, masked_only: bool) -> None:
     s_hat = plain_expected_codes()
     total = weight = 0.0
     for clip in np.flatnonzero(CLIP_WEIGHT):
         for i in range(5):
-            first = s_hat[clip, 0, int(KEYPOINTS.cells[clip, i, 0])]
+            row, column = divmod(int(KEYPOINTS.cells[clip, i, 0]), GRID)
+            code = np.array([2 * (int(TOKENS[clip, 0, row, column]) >> c & 1) - 1 for c in range(BITS)])
+            first = code if target == "observed" else s_hat[clip, 0, row * GRID + column]
             for t in range(1, T):
-                if KEYPOINTS.visible[clip, i, t]:
-                    total += np.sum((s_hat[clip, t, int(KEYPOINTS.cells[clip, i, t])] - first) ** 2)
+                cell = int(KEYPOINTS.cells[clip, i, t])
+                if KEYPOINTS.visible[clip, i, t] and (not masked_only or MASK[clip, t].ravel()[cell]):
+                    total += np.sum((s_hat[clip, t, cell] - first) ** 2)
                     weight += 1
-    assert_term(losses.keypoint_term(predictions()), (total, weight))
+    of = predictions(keypoint_target=target, keypoint_masked_only=masked_only)
+    assert_term(losses.keypoint_term(of), (total, weight))
 
 
 def test_all_visible_points_weigh_what_equation_5_divides_by() -> None:
     seen = Keypoints(KEYPOINTS.cells, jnp.ones((B, 5, T), bool))
-    _, weight = losses.keypoint_term(predictions(seen, np.ones(B)))
+    _, weight = losses.keypoint_term(predictions(seen, np.ones(B), keypoint_masked_only=False))
     assert float(weight) == B * (T - 1) * 5
 
 
