@@ -1,6 +1,6 @@
 """Measures how exact Lucas–Kanade tracks and depth colours are on a simulator's clips, as docs/annotate.md reports.
 
-python -m tests.ingest.annotators.track_accuracy data/lift-4d419252e972e2e4 --split test
+python -m tests.ingest.annotators.track_accuracy data/lift-2bf9a2b8adc30d79 --split test
 """
 
 import argparse
