@@ -27,6 +27,7 @@ from rsjax.ingest.episode import Episode, EpisodeError, Segment
 from rsjax.ingest.windows import (
     WindowConfig,
     WindowIndex,
+    check_rate,
     cut_spans,
     index_windows,
     judge,
@@ -37,6 +38,7 @@ from rsjax.ingest.windows import (
 from rsjax.ingest.work_items import Inputs, Records, Step
 
 CLIPS = "clips"  # the step's name
+_UNEVEN = 1e-3  # seconds that times between frames may be off before they are written down
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class ClipConfig:
 
 def clip_step(config: ClipConfig, needs: tuple[str, ...] = (), cpus: float = 1.0) -> Step:
     """Returns the step that cuts clips, after the annotation steps that it needs."""
-    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=2, cpus=cpus)
+    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=3, cpus=cpus)
 
 
 def _cut_episode(config: ClipConfig, episode: Episode, inputs: Inputs) -> Records:
@@ -83,12 +85,15 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     episode, windows = annotated.episode, config.windows
     camera = camera_of(episode, config.camera)
     spans = cut_spans(len(episode.timestamps), annotated.shots, annotated.segments, windows)
-    index = index_windows(episode.fps, spans, windows)
+    index = index_windows(episode.timestamps, episode.fps, spans, windows)
     motion = annotated.motion
     if motion is not None and len(motion) != len(episode.timestamps):
         count = len(episode.timestamps)
         raise EpisodeError(f"motion: {len(motion)} values for {count} frames; annotate it again")
     reasons = judge(index, episode.timestamps, motion, annotated.key_frames, windows)
+    step = check_rate(episode.fps, windows)
+    whole = abs(step - round(step)) < 0.01 * step  # otherwise sampled_actions says what to do
+    stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows of each action
     layout = Layout.from_json(episode.meta.get("actions", {}))
     pictures = _Resized(episode.cameras[camera].read, config.image_size)
     depths, unit = _depths(annotated, camera, config)
@@ -96,7 +101,10 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     statistics: Statistics | None = None
     near, far, succeeded = np.inf, 0.0, 0
     for number in np.flatnonzero(np.array(reasons) == "").tolist():
-        frames = index.frames(number)
+        frames = index.frames[number]
+        if stacked and (np.diff(frames) != stacked).any():
+            reasons[number] = "uneven"
+            continue
         tracks = _tracks(stored, frames, config.tracks)
         if tracks is None:
             reasons[number] = "no track"
@@ -135,10 +143,11 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
 def _short(index: WindowIndex, spans: list[tuple[int, int]], fps: float, windows: WindowConfig) -> dict[str, Any]:
     faster = "raise --windows.rate or " if 0 < windows.rate < fps else ""
     at = f" at {windows.rate:g} Hz" if windows.rate else ""
+    span = round((windows.frames - 1) * check_rate(fps, windows)) + 1
     return {
         "spans": index.short,
         "longest": max((end - first for first, end in spans), default=0),
-        "window": f"{windows.frames} frames{at} take {index.span} of {fps:g} fps",
+        "window": f"{windows.frames} frames{at} take {span} of {fps:g} fps",
         "cure": f"{faster}lower --windows.frames",
     }
 
@@ -163,6 +172,9 @@ def _words(
         "scene": config.categories.scene(annotated.scene),
         "depth_unit": unit,
     }
+    times = episode.timestamps[frames]
+    if not np.allclose(np.diff(times), np.diff(frames) / episode.fps, atol=_UNEVEN):
+        provenance["times"] = times.tolist()  # seconds; elsewhere they follow from frames and fps
     if annotated.motion is not None:
         provenance["motion"] = float(np.mean(annotated.motion[frames[0] + 1 : frames[-1] + 1]))
     return {"task": task, "provenance": provenance}

@@ -1,7 +1,8 @@
 """Windows: fixed numbers of frames at a fixed rate, as an index into an episode, and which of them become clips.
 
 Windows overlap: a minute at 30 fps has about a hundred of 16 frames at 2 Hz, each spanning 226 recorded frames. So
-depth and tracks are made once per episode, and a window is no more than the numbers of its frames.
+depth and tracks are made once per episode, and a window is no more than the numbers of its frames. These are chosen by
+their time stamps, as not every camera keeps its rate.
 
 Axes: N recorded frames, T frames of a window, W windows, S spans.
 """
@@ -18,6 +19,7 @@ from rsjax.config import require
 from rsjax.ingest.episode import EpisodeError, Segment
 
 MAX_STEP = 2**20  # recorded frames from one frame of a window to the next
+_TIE = 1e-6  # of the time between two frames: what rounding may take from the later one of two that are equally near
 Span = tuple[int, int]  # first frame, and the one after the last
 
 
@@ -29,7 +31,7 @@ class WindowConfig:
     """
 
     frames: int = 16
-    rate: float = 2.0  # frames per second of a window; 0: as recorded
+    rate: float = 2.0  # frames per second of a window, by the time stamps; 0: each recorded frame
     hop: int = 1  # frames of the window between one window's start and the next one's
     within_segments: bool = False  # each window in one segment of the data set; else only cuts between shots bound it
     least_motion: float = 0.0  # mean over the window's frames; below, nothing happens
@@ -53,30 +55,19 @@ class WindowIndex:
     """The windows of one episode.
 
     Attributes:
-        offsets: recorded frames from a window's first frame to each of its frames; the same for all windows.
-        starts: each window's first frame, increasing.
+        frames: the recorded frames of each window, increasing, unless the recording stopped between them.
         short: how many spans (shots, segments) are too short for a window.
     """
 
-    offsets: Int[np.ndarray, " T"]
-    starts: Int[np.ndarray, " W"]
+    frames: Int[np.ndarray, "W T"]
     short: int = 0
 
     def __len__(self) -> int:
-        return len(self.starts)
-
-    @property
-    def span(self) -> int:
-        """Recorded frames from a window's first frame to its last, both included."""
-        return int(self.offsets[-1]) + 1
-
-    def frames(self, window: int) -> Int[np.ndarray, " T"]:
-        """Returns the recorded frames of a window."""
-        return self.starts[window] + self.offsets
+        return len(self.frames)
 
 
-def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
-    """Returns the recorded frames nearest to even steps of ``1 / rate`` seconds, from 0 on, increasing.
+def check_rate(fps: float, config: WindowConfig) -> float:
+    """Returns how many recorded frames lie between two frames of a window, 1 or more.
 
     Raises:
         EpisodeError: it was recorded at a lower rate than windows take, or at one that no camera has.
@@ -87,31 +78,50 @@ def frame_offsets(fps: float, config: WindowConfig) -> Int[np.ndarray, " T"]:
     if step < 1 - 1e-6:
         message = f"fps: recorded at {fps:g} fps, windows take {config.rate:g}; lower windows.rate"
         raise EpisodeError(message, option="--windows.rate")
-    return np.floor(np.arange(config.frames) * step + 0.5 + 1e-9).astype(np.int64)
+    return step
 
 
-def index_windows(fps: float, spans: Sequence[Span], config: WindowConfig) -> WindowIndex:
-    """Returns all windows that lie within one span.
+def index_windows(
+    timestamps: Float[np.ndarray, " N"], fps: float, spans: Sequence[Span], config: WindowConfig
+) -> WindowIndex:
+    """Returns all windows that lie within one span: the recorded frames nearest to even steps of ``1 / rate`` seconds.
 
     Args:
+        timestamps: seconds of the recorded frames, increasing.
         fps: recorded frames per second.
         spans: in order, without overlap.
         config: how long windows are and how far apart.
 
     Raises:
-        EpisodeError: as :func:`frame_offsets`.
+        EpisodeError: as :func:`check_rate`.
     """
-    offsets = frame_offsets(fps, config)
-    step = fps / config.rate if config.rate else 1.0
-    starts, short = [np.zeros(0, np.int64)], 0
+    check_rate(fps, config)
+    parts, short = [np.zeros((0, config.frames), np.int64)], 0
     for first, end in spans:
-        last = end - first - int(offsets[-1]) - 1  # the last possible start, from the first frame of the span
-        if last < 0:
-            short += 1
-            continue
-        even = np.floor(np.arange(int(last / (step * config.hop)) + 2) * step * config.hop + 0.5 + 1e-9)
-        starts.append(first + even[even <= last].astype(np.int64))
-    return WindowIndex(offsets, np.concatenate(starts), short)
+        windows = first + _windows_of(timestamps[first:end], fps, config)
+        short += not len(windows)
+        parts.append(windows)
+    return WindowIndex(np.concatenate(parts), short)
+
+
+def _windows_of(times: Float[np.ndarray, " n"], fps: float, config: WindowConfig) -> Int[np.ndarray, "W T"]:
+    """Returns the windows of one span, in frames from its first on."""
+    count, rate, clock = len(times), config.rate, times
+    if not rate:  # as recorded
+        rate, clock = 1.0, np.arange(count, dtype=np.float64)
+    clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # what is nearest to this is too late
+    # A start for each even step that is the nearest to some frame: a recording that stops for years has few of them.
+    numbers = np.unique(np.floor((clock - clock[0]) * rate / config.hop + 0.5 + _TIE))
+    starts = np.unique(_nearest(clock, clock[0] + numbers * config.hop / rate))
+    frames = _nearest(clock, clock[starts, None] + np.arange(config.frames) / rate)
+    return frames[frames[:, -1] < count]
+
+
+def _nearest(times: Float[np.ndarray, " n"], wanted: Float[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
+    """Returns the place of the nearest of increasing times, the later one of two; there are at least two."""
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    share = (wanted - times[after - 1]) / (times[after] - times[after - 1])
+    return after - (share < 0.5 - _TIE)
 
 
 def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], config: WindowConfig) -> list[Span]:
@@ -161,14 +171,15 @@ def judge(
     Returns:
         ``gap``, ``still``, ``shaking``, ``no key frame`` or "".
     """
-    frames = index.starts[:, None] + index.offsets
+    frames = index.frames
     recorded = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
+    numbers, seconds = np.diff(frames, axis=1), np.diff(timestamps[frames], axis=1)
     # Rounding to recorded frames makes some steps longer than 1 / rate where nothing is missing.
-    steps = np.maximum(np.diff(index.offsets) * recorded, 1 / config.rate if config.rate else 0.0)
-    torn = (np.diff(timestamps[frames], axis=1) > config.most_gap * steps).any(1) if len(index) else np.zeros(0, bool)
+    steps = np.maximum(numbers * recorded, 1 / config.rate if config.rate else 0.0)
+    torn = ((seconds > config.most_gap * steps) | (numbers < 1)).any(1)
     means = np.full(len(index), np.nan) if motion is None else _window_means(motion, index)  # nan passes both bounds
     keys = np.sort(np.asarray(key_frames, np.int64))
-    has_key = np.searchsorted(keys, index.starts) < np.searchsorted(keys, index.starts + index.span)
+    has_key = np.searchsorted(keys, frames[:, 0]) < np.searchsorted(keys, frames[:, -1], "right")
     reasons = {
         "gap": torn,
         "still": means < config.least_motion,
@@ -187,7 +198,7 @@ def tally(reasons: Sequence[str]) -> dict[str, int]:
 def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, list[int]]:
     """Returns the first frames of the windows that each reason leaves out."""
     starts: dict[str, list[int]] = {}
-    for start, reason in zip(index.starts.tolist(), reasons, strict=True):
+    for start, reason in zip(index.frames[:, 0].tolist(), reasons, strict=True):
         if reason:
             starts.setdefault(reason, []).append(start)
     return starts
@@ -196,4 +207,5 @@ def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, li
 def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:
     """Returns the mean motion between a window's first frame and its last; that of the first frame lies before it."""
     sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
-    return (sums[index.starts + index.span] - sums[index.starts + 1]) / (index.span - 1)
+    first, last = index.frames[:, 0], index.frames[:, -1]
+    return (sums[last + 1] - sums[first + 1]) / np.maximum(last - first, 1)

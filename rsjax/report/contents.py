@@ -166,6 +166,8 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
     if not fps or len(frames) < 2:
         return []
     step = (frames[-1] - frames[0]) / (len(frames) - 1)
+    if times := provenance.get("times"):
+        return [f"uneven, about {(len(times) - 1) / (times[-1] - times[0]):.2g} Hz"]
     return [f"{fps:.4g} fps, every {f'{step:.3g} frames' if step != 1 else 'frame'} ({fps / step:.3g} Hz)"]
 
 

@@ -75,6 +75,19 @@ def test_joined_actions_are_the_sums_over_the_frames_between(fps: float, rate: f
         np.testing.assert_allclose(record["actions"], [np.zeros(3), *between], rtol=1e-4, atol=1e-4)
 
 
+def test_uneven_frames_are_sampled_by_time_and_say_so() -> None:
+    times = np.concatenate([np.arange(20) / 10, 2 + np.arange(20) / 5])
+    made = episode("a", timestamps=times)
+    kept, _ = clips(made)
+    assert [record["provenance"]["frames"] for record in kept[:1]] == [[0, 5, 10, 15]]
+    slow = kept[-1]["provenance"]
+    np.testing.assert_allclose(np.diff(slow["times"]), 0.5, atol=0.11)
+    np.testing.assert_allclose(slow["times"], times[slow["frames"]])
+    assert "times" not in kept[0]["provenance"]
+    stacked, summary = clips(made, ClipConfig(CONFIG.windows, 8, 6, actions=ActionConfig(compose="stack")))
+    assert summary["windows"]["uneven"] and {record["actions"].shape[1] for record in stacked} == {10}
+
+
 @settings(max_examples=40)
 @given(st.lists(st.integers(1, 119), max_size=5), st.sampled_from([0.0, 2.0, 3.0]), st.booleans())
 def test_no_clip_reaches_across_a_cut(cuts: list[int], rate: float, within: bool) -> None:

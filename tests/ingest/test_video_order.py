@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from rsjax.ingest import checks, video_index
+from rsjax.ingest.annotate import Annotated
+from rsjax.ingest.clips import ClipConfig, cut
 from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.formats import open_source
 from rsjax.ingest.video import VideoFrames, misread, scan
+from rsjax.ingest.windows import WindowConfig
 from tests.ingest.formats.videos import close_videos, numbers_of, picture
 
 COUNT = 30
@@ -115,3 +118,22 @@ def test_the_doctor_compares_seeking_with_decoding_in_order(tmp_path: Path, monk
     assert "seeking" in kinds()
     monkeypatch.undo()
     assert not kinds()
+
+
+@pytest.mark.parametrize("ending", ["mkv", "mp4", "mov"])
+@pytest.mark.parametrize("name", ["closed groups", "key frames alone"])
+def test_uneven_videos_give_clips_at_one_rate(tmp_path: Path, name: str, ending: str) -> None:
+    """Pictures come every 1/30 s at first and every 1/10 s later."""
+    stamps = np.concatenate([np.arange(15), 15 + 3 * np.arange(COUNT - 15)])
+    (tmp_path / "one").mkdir()
+    check_order(write(tmp_path / f"one/main.{ending}", name, stamps))
+    np.save(tmp_path / "one/actions.npy", np.ones((COUNT, 2)))
+    source = open_source("folder", tmp_path, task="go", kind="delta")
+    episode = source.read(next(source.episodes()))
+    np.testing.assert_allclose(episode.timestamps, stamps / 30, atol=1e-3)
+    clips = list(cut(Annotated(episode), ClipConfig(WindowConfig(frames=3, rate=5), image_size=32, tracks=1)))
+    for clip in clips:
+        numbers = numbers_of(clip["rgb"])
+        assert numbers == clip["provenance"]["frames"] and np.abs(np.diff(stamps[numbers]) - 6).max() <= 1
+        assert clip["actions"][1:, 0].tolist() == np.diff(numbers).tolist()
+    assert {*np.diff([clip["provenance"]["frames"] for clip in clips]).ravel()} >= {2, 6}

@@ -11,8 +11,8 @@ from rsjax.ingest.episode import EpisodeError, Segment
 from rsjax.ingest.windows import (
     Span,
     WindowConfig,
+    WindowIndex,
     cut_spans,
-    frame_offsets,
     index_windows,
     judge,
     segment_at,
@@ -24,6 +24,11 @@ CONFIGS = st.builds(
     WindowConfig, frames=st.integers(2, 20), rate=st.sampled_from([0.0, 1, 2, 2.5, 3, 5]), hop=st.integers(1, 5)
 )
 FPS = st.sampled_from([5.0, 7.5, 10, 15, 24, 25, 29.97, 30, 60])
+
+
+def even_windows(fps: float, spans: list[Span], config: WindowConfig) -> WindowIndex:
+    count = max((end for _, end in spans), default=0)
+    return index_windows(np.arange(count) / fps, fps, spans, config)
 
 
 @st.composite
@@ -39,52 +44,85 @@ def spans(draw: st.DrawFn) -> list[Span]:
 
 def test_the_papers_windows_span_226_recorded_frames() -> None:
     config = WindowConfig(frames=16, rate=2)
-    index = index_windows(30, [(0, 2160)], config)
-    assert index.span == 226
-    assert set(np.diff(index.frames(0))) == {15}
+    index = even_windows(30, [(0, 2160)], config)
+    assert index.frames[0].tolist() == list(range(0, 226, 15))
     assert len(index) == (2160 - 226) // 15 + 1 == 129
-    assert index_windows(30, [(0, 225)], config).short == 1
+    assert even_windows(30, [(0, 225)], config).short == 1
 
 
 @given(FPS, spans(), CONFIGS)
 def test_windows_are_increasing_whole_and_within_one_span(fps: float, parts: list[Span], config: WindowConfig) -> None:
-    index = index_windows(fps, parts, config)
-    assert (np.diff(index.starts) > 0).all()
-    for number in range(len(index)):
-        frames = index.frames(number)
-        assert len(frames) == config.frames and (np.diff(frames) > 0).all()
+    index = even_windows(fps, parts, config)
+    starts = index.frames[:, 0]
+    assert (np.diff(starts) > 0).all() and index.frames.shape[1] == config.frames
+    for frames in index.frames:
+        assert (np.diff(frames) > 0).all()
         assert any(first <= frames[0] and frames[-1] < end for first, end in parts)
-    holding = [any(first <= start < end for start in index.starts) for first, end in parts]
+    holding = [any(first <= start < end for start in starts) for first, end in parts]
     assert index.short == holding.count(False)
-
-
-@given(FPS, CONFIGS)
-def test_frames_are_nearest_to_even_steps_of_time(fps: float, config: WindowConfig) -> None:
-    offsets = frame_offsets(fps, config)
-    step = fps / config.rate if config.rate else 1
-    assert np.abs(offsets - np.arange(config.frames) * step).max() <= 0.5 + 1e-6
 
 
 @given(FPS, spans(), CONFIGS)
 def test_no_room_is_left_for_one_more_window(fps: float, parts: list[Span], config: WindowConfig) -> None:
-    index = index_windows(fps, parts, config)
-    hop = (fps / config.rate if config.rate else 1) * config.hop
+    """Where time is even, windows are at even steps, rounded to frames."""
+    index = even_windows(fps, parts, config)
+    step = fps / config.rate if config.rate else 1
+    offsets = np.floor(np.arange(config.frames) * step + 0.5 + 1e-6)
+    expected = []
     for first, end in parts:
-        starts = [start for start in index.starts if first <= start < end]
-        if end - first >= index.span:
-            assert starts[0] == first
-            assert starts[-1] + index.span + hop > end - 1
+        starts = np.floor(np.arange((end - first) / step / config.hop + 1) * step * config.hop + 0.5 + 1e-6)
+        expected += [first + start + offsets for start in starts if first + start + offsets[-1] < end]
+    np.testing.assert_array_equal(index.frames, np.reshape(expected, (-1, config.frames)))
+
+
+@given(
+    st.lists(st.sampled_from([0.01, 0.02, 0.033, 0.04, 0.1, 0.12, 0.25, 3.0]), min_size=20, max_size=200),
+    st.sampled_from([1.0, 2, 2.5, 3]),
+    st.integers(2, 8),
+    st.integers(1, 3),
+)
+def test_uneven_recordings_are_sampled_by_time(steps: list[float], rate: float, count: int, hop: int) -> None:
+    config = WindowConfig(frames=count, rate=rate, hop=hop)
+    times = np.cumsum(steps)
+    index = index_windows(times, 100.0, [(0, len(times))], config)
+    kept = [frames for frames, why in zip(index.frames, judge(index, times, None, (), config), strict=True) if not why]
+    for frames in kept:
+        wanted = times[frames[0]] + np.arange(count) / rate
+        nearest = np.abs(times[:, None] - wanted).min(0)
+        np.testing.assert_allclose(np.abs(times[frames] - wanted), nearest, atol=1e-6)
+        assert (np.diff(frames) > 0).all()
+    starts = times[index.frames[:, 0]] - times[0]
+    even = np.arange(starts[-1] * rate / hop + 1) * hop / rate if len(starts) else np.zeros(0)
+    near = [np.abs(times - times[0] - at).argmin() for at in even]
+    assert {*index.frames[:, 0]} <= {*near, *(place + 1 for place in near)}  # the later one of two
+
+
+def test_a_camera_that_slows_down_is_sampled_at_one_rate() -> None:
+    """A frame every 1/30 s, then, in the dark, every 1/10 s: by number, clips would run three times as fast."""
+    times = np.concatenate([np.arange(300) / 30, 10 + np.arange(100) / 10])
+    config = WindowConfig(frames=16, rate=2)
+    index = index_windows(times, 30.0, [(0, 400)], config)
+    assert len(index) == 25 and set(judge(index, times, None, (), config)) == {""}
+    np.testing.assert_allclose(np.diff(times[index.frames], axis=1), 0.5)
+    assert np.diff(index.frames[10]).tolist() == [15] * 10 + [5] * 5
+
+
+def test_a_recording_that_stops_for_years_has_few_windows() -> None:
+    times = np.concatenate([np.arange(100) / 10, 1e9 + np.arange(100) / 10])
+    config = WindowConfig(frames=4, rate=2)
+    reasons = judge(index_windows(times, 10.0, [(0, 200)], config), times, None, (), config)
+    assert 34 <= tally(reasons)["kept"] <= 36 and tally(reasons)["gap"] <= 6
 
 
 def test_a_rate_above_the_recorded_one_is_refused() -> None:
     with pytest.raises(EpisodeError, match=r"fps: recorded at 5 fps, windows take 10"):
-        frame_offsets(5, WindowConfig(rate=10))
+        even_windows(5, [(0, 9)], WindowConfig(rate=10))
 
 
 @pytest.mark.parametrize("fps", [1e30, float("inf"), float("nan")])
 def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
     with pytest.raises(EpisodeError, match=r"fps: recorded at .* which no camera does"):
-        index_windows(fps, [(0, 100)], WindowConfig())
+        index_windows(np.arange(100.0), fps, [(0, 100)], WindowConfig())
 
 
 @given(FPS, st.lists(st.integers(1, 299), max_size=6), st.lists(st.integers(0, 300), max_size=8), CONFIGS)
@@ -96,9 +134,8 @@ def test_no_window_reaches_across_a_cut_or_out_of_a_segment(
     segments = [Segment(a, b, f"{a}") for a, b in itertools.pairwise(edges)][::2]
     for within in (False, True):
         changed = dataclasses.replace(config, within_segments=within)
-        index = index_windows(fps, cut_spans(300, list(itertools.pairwise(bounds)), segments, changed), changed)
-        for number in range(len(index)):
-            first, last = index.frames(number)[[0, -1]]
+        index = even_windows(fps, cut_spans(300, list(itertools.pairwise(bounds)), segments, changed), changed)
+        for first, last in index.frames[:, [0, -1]]:
             assert first >= 0 and last < 300
             assert not any(first < cut <= last for cut in bounds)
             assert not (within and segments) or any(s.start <= first and last < s.end for s in segments)
@@ -123,8 +160,8 @@ def test_the_segment_that_holds_most_frames_names_the_window() -> None:
 
 
 def test_each_filter_leaves_out_what_it_names() -> None:
-    index = index_windows(10, [(0, 60)], WindowConfig(frames=3, rate=2, hop=2))
-    assert index.starts.tolist() == [0, 10, 20, 30, 40]
+    index = even_windows(10, [(0, 60)], WindowConfig(frames=3, rate=2, hop=2))
+    assert index.frames[:, 0].tolist() == [0, 10, 20, 30, 40]
     times, motion = np.arange(60) / 10, np.full(60, 5.0)
     times[5:] += 3  # the recording stopped
     motion[11:21], motion[31:41] = 0.1, 90
@@ -139,7 +176,7 @@ def test_each_filter_leaves_out_what_it_names() -> None:
 @pytest.mark.parametrize(("fps", "rate"), [(5.0, 4.0), (30.0, 24.0), (30.0, 29.0), (10.0, 3.0)])
 def test_rounding_to_recorded_frames_is_no_gap(fps: float, rate: float) -> None:
     config = WindowConfig(frames=8, rate=rate)
-    index = index_windows(fps, [(0, 200)], config)
+    index = even_windows(fps, [(0, 200)], config)
     times = np.arange(200) / fps
     assert set(judge(index, times, None, (), config)) == {""}
     times[100:] += 2 / rate
@@ -148,7 +185,7 @@ def test_rounding_to_recorded_frames_is_no_gap(fps: float, rate: float) -> None:
 
 @given(FPS, spans(), CONFIGS, st.integers(0, 2**32 - 1))
 def test_reasons_are_one_for_each_window(fps: float, parts: list[Span], config: WindowConfig, seed: int) -> None:
-    index = index_windows(fps, parts, config)
+    index = even_windows(fps, parts, config)
     count = max((end for _, end in parts), default=1)
     rng = np.random.default_rng(seed)
     reasons = judge(index, np.cumsum(rng.random(count)), rng.random(count), [0], config)

@@ -115,7 +115,8 @@ def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, F
     if "control_hz" in provenance:
         fps = float(provenance["control_hz"]) / steps
     elif count > 1 and len(provenance.get("frames", ())) == count:
-        times = (np.array(provenance["frames"]) - provenance["frames"][0]) / float(provenance["fps"])
+        seconds = provenance.get("times") or np.array(provenance["frames"]) / float(provenance["fps"])
+        times = np.asarray(seconds, np.float64) - seconds[0]
         return 1 / max(float(np.median(np.diff(times))), 1e-6), times
     else:
         fps = FPS
