@@ -9,14 +9,17 @@
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from rsjax.clip import Clip
     from rsjax.data.store import Store
     from rsjax.models.trained import TrainedModel
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "load", "open_store"]
+__all__ = ["__version__", "load", "open_store", "write_store"]
 
 
 def load(run: "Path | str") -> "TrainedModel":
@@ -52,3 +55,37 @@ def open_store(path: "Path | str") -> "Store":
     from rsjax.data import store
 
     return store.open_store(path)
+
+
+def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]", *, test_share: float = 0.1) -> "Store":
+    """Writes a store of clips, on which ``experiments.train PRESET --store PATH`` trains.
+
+    Args:
+        path: the store's directory; an older store there is replaced once the new one is complete.
+        clips: read once, one at a time; all of one shape. Each is a :class:`rsjax.clip.Clip` or a dict with
+
+            - ``rgb``: uint8 (T, S, S, 3), RGB, upright;
+            - ``actions``: (T, A), where row t led from frame t-1 into frame t, and row 0 is zeros;
+            - ``depth``, if it is known: z-depth in metres, (T, S, S), above 0;
+            - ``tracks`` and ``visible``, if they are known: (N, T, 2), x and y from 0 to 1 across the image, and
+              (N, T), bool;
+            - ``success``: bool, or one for each frame; ``fps``: frames per second;
+            - ``task``, ``difficulty``, ``scene``, ``segment``, ``skill``: texts, by which a curriculum or a split
+              chooses clips;
+            - ``episode``: a name; all clips of one episode are in one split. By default each clip is an episode;
+            - ``provenance``: further JSON-ready values.
+
+            Only ``rgb`` and ``actions`` have to be there.
+        test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split.
+
+    Returns:
+        The store, opened.
+
+    Raises:
+        rsjax.data.store.StoreError: a clip lacks a field or has a wrong one (the message names its number), or ``path``
+            holds something that is not a store.
+        rsjax.files.FileError: the disk is full or refuses.
+    """
+    from rsjax.data import build
+
+    return build.write_clips(path, clips, test_share)

@@ -17,6 +17,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
 def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     store = toy.store(tmp_path / "clips")
     model = toy.trained(store)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rsjax, "load", lambda run: model)
     monkeypatch.setattr(rsjax, "open_store", lambda path: store)
     namespace: dict[str, Any] = {}

@@ -1,12 +1,12 @@
 """Packs cut clips into one store: which episodes, in which split, in which unit of depth, with what manifest."""
 
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from rsjax.data.build import choose_test
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import StoreError, open_store, write_store
@@ -52,9 +52,7 @@ class Contents:
 
 def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
     """Splits into ``train`` and ``test``, in order, by a hash of the ids; each gets one at least of two or more."""
-    ranked = sorted(refs, key=lambda ref: hashlib.sha256(ref.id.encode("utf-8", "surrogatepass")).digest())
-    count = min(len(refs) - 1, max(1, round(test_share * len(refs)))) if test_share > 0 else 0
-    test = {ref.id for ref in ranked[:count]}
+    test = choose_test([ref.id for ref in refs], test_share)
     return {"train": [r for r in refs if r.id not in test], "test": [r for r in refs if r.id in test]}
 
 

@@ -1,0 +1,193 @@
+"""Makes a store out of clips in memory: for data that no reader of :mod:`rsjax.ingest` knows.
+
+Axes: T frames, S×S pixels, A action dimensions, N₀ tracks.
+"""
+
+import dataclasses
+import hashlib
+import tempfile
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from array_record.python.array_record_module import ArrayRecordWriter
+
+from rsjax.clip import Clip
+from rsjax.data.codec import Record, encode
+from rsjax.data.normalization import Statistics
+from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
+from rsjax.errors import did_you_mean
+from rsjax.files import disk_guard
+
+TRACKS = 256  # of clips without tracks
+UNKNOWN = "unknown"
+_LABELS = ("difficulty", "scene", "segment", "skill")
+_FIELDS = (*(field.name for field in dataclasses.fields(Clip)), "episode", "fps", *_LABELS)
+
+
+@dataclasses.dataclass
+class _Episode:
+    """What the manifest says of the clips of one episode."""
+
+    numbers: list[int] = dataclasses.field(default_factory=list)
+    statistics: Statistics | None = None
+    depth: list[float] = dataclasses.field(default_factory=list)
+    successes: int = 0
+
+
+def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
+    """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
+    path = Path(path)
+    if not 0 < test_share < 1:
+        raise StoreError(f"test_share is {test_share}; it is a share of the episodes, above 0 and below 1")
+    if path.exists() and not (path / MANIFEST).exists():
+        raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
+    episodes: dict[str, _Episode] = {}
+    first: dict[str, tuple[int, ...]] = {}
+    digest, scored = hashlib.sha256(), False
+    with disk_guard(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.") as folder:
+        spool = Path(folder) / "clips.array_record"
+        writer, count = ArrayRecordWriter(str(spool), WRITER_OPTIONS), 0
+        for clip in clips:
+            given = encode_clip(clip) if isinstance(clip, Clip) else clip
+            record = _record(given, f"clip {count}", count)
+            shapes = {name: array.shape for name, array in record.items() if isinstance(array, np.ndarray)}
+            _check_alike({name: shape for name, shape in shapes.items() if name != "depth"}, first, f"clip {count}")
+            _note(episodes.setdefault(record["provenance"]["episode"], _Episode()), record, count)
+            scored |= "success" in given
+            payload = encode(record)
+            digest.update(payload)
+            with disk_guard(path):  # what reading the clips raises is the caller's
+                writer.write(payload)
+            count += 1
+        with disk_guard(path):
+            writer.close()
+        if not count:
+            raise StoreError(f"{path}: there are no clips to write")
+        _write(path, Source(Path(folder), "clips", [(spool.name, count)]), episodes, test_share, digest, scored)
+    return open_store(path)
+
+
+def choose_test(names: Collection[str], share: float) -> set[str]:
+    """Returns which of the names are test, by a hash of them; each split gets one at least of two or more."""
+    ranked = sorted(names, key=lambda name: hashlib.sha256(name.encode("utf-8", "surrogatepass")).digest())
+    return set(ranked[: min(len(ranked) - 1, max(1, round(share * len(ranked)))) if share > 0 else 0])
+
+
+def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: float, digest: Any, scored: bool) -> None:
+    test = choose_test(episodes, share)
+    names = {split: [name for name in episodes if (name in test) == (split == "test")] for split in ("train", "test")}
+    total: Statistics | None = None
+    for name in names["train"]:
+        rows = episodes[name].statistics
+        total = total.merged(rows) if total and rows else rows
+    near_far = [value for name in names["train"] for value in episodes[name].depth]
+    depth_range = [min(near_far), max(near_far)] if near_far else None
+    successes = sum(episode.successes for episode in episodes.values())
+    meta = {
+        "key": f"{digest.hexdigest()[:12]}-{share}",
+        "source": "write_store",
+        **(total.to_json() if total else {}),
+        "depth_range": depth_range,
+        "depth_unit": "metres" if depth_range else None,
+        "episodes": names,
+        "success_share": successes / len(spooled) if scored else None,
+    }
+    splits = {
+        split: (
+            record | {"provenance": record["provenance"] | {"depth_range": depth_range}}
+            for name in chosen
+            for record in map(spooled.__getitem__, episodes[name].numbers)
+        )
+        for split, chosen in names.items()
+    }
+    write_store(path, "clips", splits, meta, _labels)
+
+
+def _labels(record: Record) -> dict[str, str]:
+    return {"task": record["task"]} | {name: record["provenance"][name] for name in _LABELS}
+
+
+def _note(episode: _Episode, record: Record, number: int) -> None:
+    """Adds a clip to what is known of its episode."""
+    rows = Statistics.of(record["actions"][1:])
+    episode.statistics = episode.statistics.merged(rows) if episode.statistics else rows
+    episode.numbers.append(number)
+    episode.successes += bool(record["success"][-1])
+    if record["depth"] is not None:
+        episode.depth += [float(record["depth"].min()), float(record["depth"].max())]
+        episode.depth = [min(episode.depth), max(episode.depth)]
+
+
+def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
+    """Returns a clip as the store has it; :class:`StoreError` names a field that is missing or wrong."""
+    for name in clip:
+        if name not in _FIELDS:
+            raise StoreError(f"{where}: no field {name!r}{did_you_mean(name, _FIELDS)}; it has {', '.join(_FIELDS)}")
+    rgb = _array(clip, "rgb", where, "uint8 (T, S, S, 3)", np.uint8, (None, None, None, 3))
+    count, size = rgb.shape[:2]
+    if count < 2 or size < 8 or rgb.shape[2] != size:
+        wrong = f"{count} frames of {rgb.shape[2]} × {size} pixels"
+        raise StoreError(f"{where}: rgb has {wrong}; give two frames at least, cut or scaled to a square")
+    actions = _array(clip, "actions", where, f"numbers ({count}, A)", np.float32, (count, None))
+    if actions[0].any():
+        cure = "shift them by a frame, or set row 0 to zeros if it is what led into frame 0"
+        raise StoreError(
+            f"{where}: row 0 of actions is not zeros; row t is what led from frame t-1 into frame t: {cure}"
+        )
+    depth = None
+    if clip.get("depth") is not None:
+        depth = _array(clip, "depth", where, f"metres ({count}, {size}, {size})", np.float32, (count, size, size))
+        if depth.min() <= 0:
+            raise StoreError(f"{where}: depth is {depth.min():g} somewhere; it is in metres, above 0: fill its holes")
+    tracks, visible = np.zeros((TRACKS, count, 2), np.float32), np.zeros((TRACKS, count), bool)
+    if clip.get("tracks") is not None:
+        tracks = _array(clip, "tracks", where, f"numbers (N, {count}, 2)", np.float32, (None, count, 2))
+        visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])
+    success = np.asarray(clip.get("success", False), bool)
+    if success.shape not in ((), (count,)):
+        raise StoreError(f"{where}: success has the shape {success.shape}, should be one value or ({count},)")
+    origin = {"source": "write_store", "episode": number} | dict(clip.get("provenance") or {})
+    words = {name: str(clip.get(name) or origin.get(name) or UNKNOWN) for name in _LABELS}
+    timing = {"fps": float(clip["fps"]), "frames": list(range(count))} if clip.get("fps") else {}
+    unit = {"depth_unit": "metres" if depth is not None else ""}
+    return {
+        "rgb": rgb,
+        "depth": depth,
+        "actions": actions,
+        "tracks": tracks,
+        "visible": visible,
+        "success": np.broadcast_to(success, (count,)).copy(),
+        "task": str(clip.get("task") or ""),
+        "provenance": origin | words | timing | unit | {"episode": str(clip.get("episode", origin["episode"]))},
+    }
+
+
+def _array(
+    clip: Mapping[str, Any], name: str, where: str, expected: str, kind: type, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """Returns a field as an array of this type and shape; None stands for any length."""
+    if clip.get(name) is None:
+        raise StoreError(f"{where}: has no {name}; give {expected}")
+    array = np.asarray(clip[name])
+    fits = array.ndim == len(shape) and all(
+        wanted in (None, side) for wanted, side in zip(shape, array.shape, strict=True)
+    )
+    kinds = "fiu" if kind is np.float32 else np.dtype(kind).kind
+    if not fits or array.dtype.kind not in kinds or (kind is np.uint8 and array.dtype != np.uint8) or not array.size:
+        raise StoreError(f"{where}: {name} is {array.dtype} {array.shape}, should be {expected}")
+    with np.errstate(over="ignore"):
+        array = array.astype(kind)
+    if kind is np.float32 and not np.isfinite(array).all():
+        raise StoreError(f"{where}: {name} has values that are not finite; leave the clip out")
+    return array
+
+
+def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int, ...]], where: str) -> None:
+    """Checks that a clip's arrays have the shapes of the first clip's, which are noted."""
+    for name, shape in shapes.items():
+        if first.setdefault(name, shape) != shape:
+            raise StoreError(f"{where}: {name} has the shape {shape}, that of the first clip {first[name]}")

@@ -1,0 +1,124 @@
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rsjax
+from rsjax.config import presets
+from rsjax.data.build import TRACKS, choose_test
+from rsjax.data.normalization import Normalization
+from rsjax.data.store import StoreError
+from rsjax.pipeline.own_data import on_store
+from tests.pipeline import toy
+
+FRAMES, SIZE = 4, 64
+
+
+def clip(number: int = 0, **changes: Any) -> dict[str, Any]:
+    actions = np.full((FRAMES, 3), number, np.float64)
+    actions[0] = 0
+    return {"rgb": np.full((FRAMES, SIZE, SIZE, 3), number, np.uint8), "actions": actions} | changes
+
+
+def test_a_store_has_the_clips_their_statistics_and_labels(tmp_path: Path) -> None:
+    depth = np.linspace(0.5, 2, FRAMES * SIZE * SIZE).reshape(FRAMES, SIZE, SIZE)
+    made = [clip(i, depth=depth, task="push", scene="lab", success=i % 2 == 0, fps=5) for i in range(10)]
+    store = rsjax.write_store(tmp_path / "mine", made, test_share=0.2)
+    assert store.counts() == {"train": 8, "test": 2}
+    records = [record for split in store.splits for record in map(store.source(split).__getitem__, range(2))]
+    for record in records:
+        number = int(record["provenance"]["episode"])
+        assert (record["rgb"] == number).all() and (record["actions"][1:] == number).all()
+        assert record["actions"].dtype == record["depth"].dtype == np.float32
+        assert record["success"].tolist() == [number % 2 == 0] * FRAMES and record["task"] == "push"
+        assert record["tracks"].shape == (TRACKS, FRAMES, 2) and not record["visible"].any()
+        assert record["provenance"]["depth_range"] == [0.5, 2] and record["provenance"]["frames"] == [0, 1, 2, 3]
+    train = [int(name) for name in store.manifest["episodes"]["train"]]
+    assert Normalization.create(store).action_mean == pytest.approx((np.mean(train),) * 3)
+    assert Normalization.create(store).depth_range == (0.5, 2)
+    assert store.manifest["success_share"] == 0.5
+    assert store.labels("train").counts()["scene"] == {"lab": 8} and store.labels("test").of(0)["skill"] == "unknown"
+
+
+def test_a_store_of_pictures_and_actions_alone_can_be_trained_on(tmp_path: Path) -> None:
+    store = rsjax.write_store(tmp_path / "mine", map(clip, range(20)))
+    assert store.source("test")[0]["depth"] is None and Normalization.create(store).depth_range is None
+    config = on_store(presets.debug(), tmp_path / "mine")
+    assert (config.clips.frames, config.clips.image_size, config.clips.action_dim) == (FRAMES, SIZE, 3)
+    assert store.manifest["success_share"] is None
+
+
+def test_the_key_follows_the_content(tmp_path: Path) -> None:
+    keys = [
+        rsjax.write_store(tmp_path / f"{number}", map(clip, range(count)), test_share=share).manifest["key"]
+        for number, (count, share) in enumerate([(4, 0.5), (4, 0.5), (5, 0.5), (4, 0.25)])
+    ]
+    assert keys[0] == keys[1] and len(set(keys)) == 3
+
+
+def test_clips_of_the_dataclass_go_in_too(tmp_path: Path) -> None:
+    store = rsjax.write_store(tmp_path / "mine", (toy.clip(number) for number in range(4)), test_share=0.5)
+    record, original = store.source("train")[0], store.source("train")[0]["provenance"]["episode"]
+    np.testing.assert_array_equal(record["tracks"], toy.clip(int(original)).tracks)
+
+
+@settings(max_examples=8)
+@given(names=st.lists(st.sampled_from("abcdef"), min_size=1, max_size=12), share=st.floats(0.01, 0.99))
+def test_all_clips_of_an_episode_are_in_one_split(
+    tmp_path_factory: pytest.TempPathFactory, names: list[str], share: float
+) -> None:
+    path = tmp_path_factory.mktemp("store") / "mine"
+    made = (clip(number, episode=name) for number, name in enumerate(names))
+    store = rsjax.write_store(path, made, test_share=share)
+    episodes = [
+        {store.source(split)[number]["provenance"]["episode"] for number in range(count)}
+        for split, count in store.counts().items()
+    ]
+    assert not episodes[0] & episodes[1] and episodes[1] == choose_test(set(names), share)
+    assert sum(store.counts().values()) == len(names) and episodes[0]
+    assert not [file for file in path.parent.iterdir() if file != path]
+
+
+WRONG = [
+    ({"rgb": None}, r"has no rgb; give uint8 \(T, S, S, 3\)"),
+    ({"rgb": np.zeros((FRAMES, SIZE, SIZE, 3))}, r"rgb is float64 \(4, 64, 64, 3\), should be uint8 \(T, S, S, 3\)"),
+    ({"rgb": np.zeros((FRAMES, 32, SIZE, 3), np.uint8)}, "rgb has 4 frames of 64 × 32 pixels; .*a square"),
+    ({"actions": np.zeros((FRAMES - 1, 3))}, r"actions is float64 \(3, 3\), should be numbers \(4, A\)"),
+    ({"actions": np.ones((FRAMES, 3))}, "row 0 of actions is not zeros; row t is what led from frame t-1"),
+    ({"actions": np.array([[0.0], [1], [np.nan], [2]])}, "actions has values that are not finite"),
+    ({"actions": np.full((FRAMES, 3), "a")}, "actions is <U1"),
+    ({"depth": np.zeros((FRAMES, SIZE, SIZE))}, "depth is 0 somewhere; it is in metres, above 0"),
+    ({"depth": np.ones((FRAMES, 8, 8))}, r"depth is float64 \(4, 8, 8\), should be metres \(4, 64, 64\)"),
+    ({"tracks": np.zeros((5, FRAMES, 2))}, r"has no visible; give bool \(5, 4\)"),
+    ({"success": [True, False]}, r"success has the shape \(2,\)"),
+    ({"tsak": "push"}, "no field 'tsak'; did you mean 'task'"),
+    ({"actions": np.zeros((FRAMES, 4))}, r"actions has the shape \(4, 4\), that of the first clip \(4, 3\)"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), WRONG)
+def test_a_wrong_clip_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(StoreError, match=f"clip 2: {message}"):
+        rsjax.write_store(tmp_path / "mine", [clip(), clip(), clip(**changes)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_store_is_not_replaced_and_the_callers_errors_stay_its_own(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(StoreError, match="mine: exists and is not a store"):
+        rsjax.write_store(tmp_path / "mine", [clip()])
+    with pytest.raises(StoreError, match="there are no clips to write"):
+        rsjax.write_store(tmp_path / "none", [])
+    with pytest.raises(StoreError, match="test_share is 1"):
+        rsjax.write_store(tmp_path / "none", [clip()], test_share=1)
+
+    def broken() -> Iterator[dict[str, Any]]:
+        yield clip()
+        raise FileNotFoundError("my own file")
+
+    with pytest.raises(FileNotFoundError, match="my own file"):
+        rsjax.write_store(tmp_path / "none", broken())
