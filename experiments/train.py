@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,8 +50,10 @@ def main() -> None:
     from rsjax.pipeline.stages import run_all
 
     run = Run(config, options.run_dir or Path("runs") / config.name, options.data_dir)
-    distributed.on_lead("run directory", lambda: run.prepare(options.overwrite))
-    run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
+    with ExitStack() as stack:
+        distributed.on_lead("run directory", lambda: stack.enter_context(run.locked()))
+        distributed.on_lead("run directory", lambda: run.prepare(options.overwrite))
+        run_all(run, options.resume, command=shlex.join([*PROG.split(), *sys.argv[1:]]))
     if distributed.is_lead():
         print(f"report: {run.output('report').absolute()}")
 

@@ -6,9 +6,10 @@ import json
 import os
 import re
 import shutil
+import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -139,14 +140,15 @@ def disk_guard(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def lock(path: Path, wait: str = "") -> Iterator[bool]:
-    """Takes the lock of this name and yields True, or yields False if another process keeps it.
+def lock(path: Path, wait: str = "", required: bool = True) -> Iterator[bool]:
+    """Takes the lock of this name and yields True, or yields False if another process keeps it (:func:`holder`).
 
     The operating system releases the lock of a process that dies. The file stays: deleting it would let two processes
     take locks of one name.
 
     Args:
-        wait: a message to print before waiting for another process. Empty: do not wait.
+        wait: a message to print, with the holder, before waiting for another process. Empty: do not wait.
+        required: False goes on without a lock, and says so, where the file system has none.
 
     Raises:
         FileError: the file system has no locks, or the file cannot be made.
@@ -155,22 +157,63 @@ def lock(path: Path, wait: str = "") -> Iterator[bool]:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        taken = _take(handle, path)
+        try:
+            taken = _take(handle, path)
+        except FileError:
+            if required:
+                raise
+            note(f"{path.parent}: this file system has no locks, so nothing keeps a second process from writing here")
+            taken = True
         if not taken and wait:
-            note(wait)
+            note(f"{wait} ({holder(path)})")
             taken = _take(handle, path, float("inf"))
+        if taken:
+            os.ftruncate(handle, 0)
+            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield taken
     finally:
         os.close(handle)
+
+
+def holder(path: Path) -> str:
+    """Returns who keeps the lock of this name, such as ``process 4711 on node3``."""
+    with suppress(OSError):
+        return path.read_text("utf-8", errors="replace") or "another process"
+    return "another process"
+
+
+@contextmanager
+def making(path: Path, wait: bool) -> Iterator[None]:
+    """Keeps other processes from making the data set at ``path`` meanwhile; readers are not locked out.
+
+    Args:
+        wait: wait for another process that is making it, or raise.
+
+    Raises:
+        FileError: another process is making it.
+    """
+    message = f"waiting for another process that makes {path}" if wait else ""
+    with lock(lock_file(path), wait=message, required=False) as free:
+        if not free:
+            raise FileError(f"{path}: {holder(lock_file(path))} is making it; wait for that one or stop it")
+        yield
+
+
+def lock_file(path: Path) -> Path:
+    """Returns the path of the lock that :func:`making` takes."""
+    return path.with_name(f".{path.name}.lock")
 
 
 def is_held(path: Path) -> bool:
     """Returns whether another process keeps the lock of this name; makes no file."""
     if not path.exists():
         return False
-    handle = os.open(path, os.O_RDONLY)
+    # NFS locks only what is open for writing.
+    handle = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
     try:
         return not _take(handle, path)
+    except FileError:  # without locks nobody keeps one
+        return False
     finally:
         os.close(handle)
 

@@ -53,6 +53,19 @@ try:
 finally:
     time.sleep(600)
 """
+COMPILING = """
+import threading
+import jax, jax.numpy as jnp
+begun = threading.Event()
+def traced(x):
+    for _ in range(300):
+        x = jnp.sin(x @ x) + jnp.linalg.norm(x)
+    begun.set()
+    return x
+threading.Thread(target=jax.jit(traced), args=(jnp.ones((300, 300)),), daemon=True).start()
+begun.wait()
+said(lambda: time.sleep(600))
+"""
 
 
 def stopped(lines: str, number: int, again: bool = False) -> tuple[int, str]:
@@ -82,6 +95,6 @@ def test_a_second_interrupt_ends_a_command_at_once_in_one_line(lines: str) -> No
     assert stopped(lines, signal.SIGINT, again=True) == (130, INTERRUPTED)
 
 
-@pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION])
+@pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION, COMPILING])
 def test_one_interrupt_is_one_line(lines: str) -> None:
     assert stopped(lines, signal.SIGINT) == (130, INTERRUPTED)

@@ -1,3 +1,5 @@
+import os
+import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 
 from rsjax.convert.files import read_tensors
 from rsjax.errors import UserError
-from rsjax.files import is_held, lock, placeholder, read_json
+from rsjax.files import holder, is_held, lock, making, placeholder, read_json
 from rsjax.ingest.annotators.networks.local import require_weights
 from rsjax.tokenizers.lpips import load_lpips
 
@@ -45,7 +47,7 @@ def test_a_directory_and_a_loop_of_links_are_no_json_files(tmp_path: Path) -> No
 
 
 def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a" / "lock"
     assert not is_held(path)
@@ -62,6 +64,10 @@ def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(
     monkeypatch.setattr("rsjax.files.lock_descriptor", without)
     with pytest.raises(UserError, match="this file system has no locks"), lock(path):
         pass
+    assert not is_held(path)
+    with lock(path, required=False) as free:
+        assert free
+    assert "no locks, so nothing keeps a second process from writing here" in capsys.readouterr().out
 
 
 KEEP = """
@@ -74,15 +80,36 @@ with lock(Path(sys.argv[1])):
 """
 
 
-def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
+def test_the_lock_of_a_killed_process_is_free_for_one_that_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, said = tmp_path / "lock", list[str]()
     with subprocess.Popen([sys.executable, "-c", KEEP, path], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout and process.stdout.readline() == "ready\n"
         with lock(path) as free:
             assert not free
-        process.kill()
+        who = f"process {process.pid} on {socket.gethostname()}"
+        assert holder(path) == who
+
+        def kill(line: str) -> None:
+            said.append(line)
+            process.kill()
+
+        monkeypatch.setattr("rsjax.files.note", kill)
         with lock(path, wait="waiting for another process") as free:
             assert free
+        assert said == [f"waiting for another process ({who})"]
+    assert holder(tmp_path / "none") == "another process"
+
+
+def test_a_data_set_is_made_by_one_process_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with making(path, wait=False):
+        with pytest.raises(UserError, match=rf"{path}: process {os.getpid()} on .* is making it"), making(path, False):
+            pass
+        with making(tmp_path / "other", wait=False):
+            pass
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(

@@ -25,14 +25,13 @@ from rsjax.ablation.table import (
     as_csv,
     as_json,
     as_markdown,
-    lock_of,
     read_metrics,
     read_result,
     tabulate,
 )
 from rsjax.config import require
 from rsjax.errors import UserError
-from rsjax.files import FileError, disk_guard, lock, write_atomically, write_json
+from rsjax.files import FileError, disk_guard, holder, lock, write_atomically, write_json
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
 from rsjax.progress import note, stage
@@ -63,9 +62,9 @@ def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "
     runs = runs_of(grid, out, data)
     states: dict[str, State] = {}
     for number, name in enumerate(chosen, 1):
-        with lock(lock_of(runs[name])) as free:
+        with lock(runs[name].lock_file) as free:
             if not free:
-                states[name], text = "running", "another process runs it, left to that one"
+                states[name], text = "running", f"left to {holder(runs[name].lock_file)}, which runs it"
             elif read_metrics(runs[name]) is not None:
                 states[name], text = "finished", "finished, skipped"
             else:
@@ -114,19 +113,16 @@ def share(run: Run, others: Sequence[Run], shared: Path) -> None:
         others: the other cells' runs.
         shared: the directory where shared stages are made and kept.
     """
-    # The directory of an ingested store may be read-only.
-    locks = shared / ".locks" if run.config.data.key else run.clips.parent
-    with lock(locks / f".{run.clips.name}.lock", wait="waiting for another process that collects"):
-        if not run.finished("collect"):
-            with run.stage("collect"):
-                stages.collect_clips(run)
+    if not run.finished("collect"):
+        with run.stage("collect"):
+            stages.collect_clips(run)
     for name in (name for name in SHARED if name in run.stages):
         key = run.keys()[name]
         same = [other for other in others if other.keys().get(name) == key]
         if run.finished(name) or (name == "world_model" and not same):
             continue
         maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
-        with lock(shared / ".locks" / maker.directory.name, wait=f"waiting for another process that makes the {name}"):
+        with lock(maker.lock_file, wait=f"waiting for another process that makes the {name}"):
             source = next((source for source in (maker, *same) if source.finished(name)), None)
             if source is None:
                 _make(maker, run, name)

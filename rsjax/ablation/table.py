@@ -6,14 +6,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from rsjax.ablation.grid import Value, values_of
 from rsjax.evaluation.registry import Metric, metrics
-from rsjax.files import FileError, is_held, read_json
+from rsjax.files import FileError, holder, is_held, read_json
 from rsjax.models import create_model
 from rsjax.pipeline.run import Run
 from rsjax.training.log import read_log
@@ -76,20 +75,15 @@ class Row:
         return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as configured"
 
 
-def lock_of(run: Run) -> Path:
-    """Returns the path of the lock that a process holds while it runs the cell."""
-    return run.directory.parent / ".locks" / f"cell-{run.directory.name}"
-
-
 def read_result(run: Run) -> Result:
     """Reads a cell's state and metrics; damaged files count as unfinished, and nothing is changed."""
-    if is_held(lock_of(run)):
-        return Result(run, "running", "in another process", {})
+    if is_held(run.lock_file):
+        return Result(run, "running", f"in {holder(run.lock_file)}", {})
     if (metrics := read_metrics(run)) is not None:
         return Result(run, "finished", "", metrics)
     with suppress(FileError):
         return Result(run, "failed", str(read_json(run.directory / ERROR).get("error")), {})
-    if run.directory.exists():
+    if (run.directory / "config.json").exists():
         done = sum(run.finished(stage) for stage in run.stages)
         return Result(run, "interrupted", f"{done} of {len(run.stages)} stages are finished", {})
     return Result(run, "missing", "not started", {})

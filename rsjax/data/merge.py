@@ -16,7 +16,7 @@ from rsjax.data.labels import Words
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, NO_ARRAY, Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, token_sets, tokens_key
-from rsjax.files import safe_id
+from rsjax.files import making, safe_id
 
 UNITS = ("action_mean", "action_std", "depth_range")  # fields of a manifest that normalization reads
 LEFT_OUT = ("filtered", "quarantine")  # fields with a reason for each episode that was left out
@@ -35,18 +35,19 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
     Raises:
         StoreError: fewer than two stores, one of them twice, stores of other kinds or shapes, tokens of another
             tokenizer or depth range, or ``out`` exists or lies in one of them.
-        FileError: ``out`` cannot be written.
+        FileError: ``out`` cannot be written, or another process is making it.
     """
     if len(paths) < 2:
         raise StoreError("merging takes two stores or more")
     stores = [open_store(path) for path in paths]
     _check_mergeable(stores, out)
     key = content_key("merge", *(store.manifest.get("key") or str(store.path) for store in stores))
-    merged = _write_merged(stores, out, key)
-    if all(store.manifest.get("depth_range") == merged.manifest.get("depth_range") for store in stores):
-        sets = [token_sets(store) for store in stores]
-        for tokenizer in set.intersection(*map(set, sets)):
-            _write_merged([one[tokenizer] for one in sets], out / FOLDER / tokenizer, tokens_key(key, tokenizer))
+    with making(out, wait=False):
+        merged = _write_merged(stores, out, key)
+        if all(store.manifest.get("depth_range") == merged.manifest.get("depth_range") for store in stores):
+            sets = [token_sets(store) for store in stores]
+            for tokenizer in set.intersection(*map(set, sets)):
+                _write_merged([one[tokenizer] for one in sets], out / FOLDER / tokenizer, tokens_key(key, tokenizer))
     return merged
 
 
@@ -60,7 +61,7 @@ def split(path: Path, parts: Mapping[Path, Numbers]) -> dict[Path, Store]:
 
     Raises:
         StoreError: no record is chosen for a new store, or its place is taken or lies in the old one.
-        FileError: a new store cannot be written.
+        FileError: a new store cannot be written, or another process is making it.
     """
     store = open_store(path)
     sets = token_sets(store)
@@ -70,9 +71,10 @@ def split(path: Path, parts: Mapping[Path, Numbers]) -> dict[Path, Store]:
             raise StoreError(f"{out}: no record of {path} is chosen for it; choose otherwise")
     for out, numbers in parts.items():
         key = content_key("split", store.manifest.get("key") or str(path), *(f"{n}{v}" for n, v in numbers.items()))
-        _write_part(store, numbers, out, key)
-        for tokenizer, tokens in sets.items():
-            _write_part(tokens, numbers, out / FOLDER / tokenizer, tokens_key(key, tokenizer))
+        with making(out, wait=False):
+            _write_part(store, numbers, out, key)
+            for tokenizer, tokens in sets.items():
+                _write_part(tokens, numbers, out / FOLDER / tokenizer, tokens_key(key, tokenizer))
     return {out: open_store(out) for out in parts}
 
 

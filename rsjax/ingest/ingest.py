@@ -11,7 +11,7 @@ import cv2
 
 from rsjax.config import content_key
 from rsjax.data.store import MANIFEST, StoreError, open_store
-from rsjax.files import disk_guard, lock
+from rsjax.files import disk_guard, holder, lock
 from rsjax.ingest.clips import CLIPS
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.packing import choose_contents, cut_episodes, pack, refuse_odd
@@ -79,7 +79,7 @@ def ingest(
         return None
     with lock(plan.folder / LOCK) as locked:
         if not locked:
-            raise StoreError(f"{plan.out}: another process is making it; wait for that one or stop it")
+            raise StoreError(f"{plan.out}: {holder(plan.folder / LOCK)} is making it; wait for that one or stop it")
         if retry and not _forget_failures(plan, refs) and up_to_date:
             return None
         this_run = _run(plan, refs, run, progress)

@@ -18,7 +18,7 @@ from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_s
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
-from rsjax.files import FileError, read_json, write_json
+from rsjax.files import FileError, holder, lock, read_json, write_json
 from rsjax.sim.collect import collection_key
 
 STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
@@ -39,7 +39,7 @@ RECIPE = 1  # increase it when the same configuration gives new results
 
 
 class RunError(UserError):
-    """A run directory that belongs to another configuration."""
+    """A run directory that belongs to another configuration, or that another process is working in."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +113,26 @@ class Run:
                 continue
             key = keys[stage] = content_key(RECIPE, stage, key, *parts)
         return keys
+
+    @property
+    def lock_file(self) -> Path:
+        """The lock that a process keeps while it makes stages here."""
+        return self.directory / ".lock"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps other processes from making stages here; whoever only reads is not locked out.
+
+        Raises:
+            RunError: another process does so; the message names it.
+        """
+        with lock(self.lock_file, required=False) as free:
+            if not free:
+                raise RunError(
+                    f"{self.directory}: {holder(self.lock_file)} is training here; wait for it, stop it, or choose "
+                    f"another --run-dir"
+                )
+            yield
 
     def prepare(self, overwrite: bool) -> None:
         """Makes the directory, or checks that it fits this configuration, and writes ``config.json``.

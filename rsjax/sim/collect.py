@@ -20,7 +20,7 @@ from rsjax.clip import Clip
 from rsjax.config import SimConfig, content_key, to_dict
 from rsjax.data.store import Record, complete_key, decode, encode, encode_clip, write_store
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, write_atomically
+from rsjax.files import disk_guard, making, write_atomically
 from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.sim.expert import MODES, Expert, difficulty, draw_manner
 from rsjax.sim.gl import GLError, choose_gl
@@ -95,7 +95,7 @@ def _track_pixels(
 def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) -> None:
     """Collects ``config.episodes`` episodes into a store at ``out``; its test split is the last ``test_episodes``.
 
-    Returns at once if ``out`` is a store made by the same configuration.
+    Returns at once if ``out`` is a store made by the same configuration, and waits for another process that makes it.
 
     Args:
         report: called with (episodes done, episodes in all) as they finish.
@@ -109,6 +109,14 @@ def collect(config: SimConfig, out: Path, report: Callable[[int, int], None]) ->
         report(config.episodes, config.episodes)
         return
     choose_gl()
+    with making(out, wait=True):
+        if complete_key(out) == collection_key(config):  # that one has made it
+            report(config.episodes, config.episodes)
+        else:
+            _make(config, out, report)
+
+
+def _make(config: SimConfig, out: Path, report: Callable[[int, int], None]) -> None:
     partial = out.with_name(f"{out.name}.partial")
     with disk_guard(partial):
         _prepare(partial, collection_key(config))

@@ -18,7 +18,7 @@ from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
-from rsjax.files import lock
+from rsjax.files import lock_file, making
 from rsjax.progress import Progress, note
 from rsjax.sim.expert import difficulty
 from rsjax.tokenizers.codec import Codec
@@ -54,7 +54,7 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
         return _listed(beside, clips, max_damaged, place)
     if not _writable(beside):
         out = place.resolve() / "own" / tokenizer
-    with lock(_lock_of(out), wait=f"waiting for another process that makes {out}"):
+    with making(out, wait=True):
         if not _is_made(out, key, clips):
             _write(out, clips, codec, key)
     return _listed(out, clips, max_damaged, place)
@@ -73,12 +73,8 @@ def _is_made(out: Path, key: str, clips: Store) -> bool:
 
 def _writable(out: Path) -> bool:
     """Returns whether this user may write the set at ``out``; the store may be another user's."""
-    parent, lock_file = next(folder for folder in out.parents if folder.exists()), _lock_of(out)
-    return os.access(parent, os.W_OK) and (not lock_file.exists() or os.access(lock_file, os.W_OK))
-
-
-def _lock_of(out: Path) -> Path:
-    return out.with_name(f".{out.name}.lock")
+    parent, lock = next(folder for folder in out.parents if folder.exists()), lock_file(out)
+    return os.access(parent, os.W_OK) and (not lock.exists() or os.access(lock, os.W_OK))
 
 
 def _write(out: Path, clips: Store, codec: Codec, key: str) -> None:

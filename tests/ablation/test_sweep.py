@@ -13,7 +13,7 @@ import pytest
 from experiments import ablation
 from rsjax.ablation import sweep
 from rsjax.ablation.grid import Choice, Grid
-from rsjax.ablation.table import lock_of, read_result
+from rsjax.ablation.table import read_result
 from rsjax.errors import Preempted, UserError
 from rsjax.files import lock
 from rsjax.pipeline import stages
@@ -48,7 +48,7 @@ def counts(place: Path) -> dict[str, int]:
 
 
 def files(place: Path) -> dict[Path, int]:
-    return {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file()}
+    return {path: path.stat().st_mtime_ns for path in place.rglob("*") if path.is_file() and path.name != ".lock"}
 
 
 def fail_in(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
@@ -167,7 +167,7 @@ def test_lost_numbers_are_counted_again_from_what_is_there(tmp_path: Path) -> No
 
 def test_a_cell_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> None:
     grid = toy.grid("model.loss.gamma=4,5")
-    with lock(lock_of(runs(tmp_path, grid)[0])) as free:
+    with lock(runs(tmp_path, grid)[0].lock_file) as free:
         assert free
         assert sweep_in(tmp_path, grid) == ["running", "finished"]
         assert states(tmp_path, grid) == ["running", "finished"]

@@ -8,6 +8,7 @@ import pytest
 from rsjax.ablation import sweep
 from rsjax.ablation.grid import Grid, expand, parse_axes
 from rsjax.config import Config, RoboScapeConfig, presets
+from rsjax.files import making
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
 
@@ -64,8 +65,13 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
                     if stage == "report":
                         (run.directory / "metrics.json").write_text(json.dumps({"psnr": psnr(run.config)}))
 
+    def collect(run: Run) -> None:
+        with making(run.clips, wait=True):
+            if not run.clips.exists():
+                leave(run, "collect")
+
     monkeypatch.setattr(stages, "run_all", everything)
-    monkeypatch.setattr(stages, "collect_clips", lambda run: None if run.clips.exists() else leave(run, "collect"))
+    monkeypatch.setattr(stages, "collect_clips", collect)
     monkeypatch.setattr(stages, "train_tokenizer", lambda run, resume: leave(run, "tokenizer"))
     monkeypatch.setattr(stages, "prepare", lambda run: leave(run, "tokens"))
     monkeypatch.setattr(stages, "train_world_model", lambda run, resume: leave(run, "world_model"))

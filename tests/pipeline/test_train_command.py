@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,8 @@ import numpy as np
 import pytest
 
 from experiments import train
-from rsjax.pipeline.run import STAGES
+from rsjax.config import presets
+from rsjax.pipeline.run import STAGES, Run
 from rsjax.pipeline.trained import load
 from rsjax.sim import gl as gl_module
 from rsjax.training.log import read_log
@@ -32,7 +34,9 @@ def skipped(output: str) -> list[str]:
 
 def files(run: Path) -> dict[Path, tuple[int, int]]:
     """Every file's size and time of change, but for those that every start writes."""
-    found = [path for path in run.rglob("*") if path.is_file() and path.name not in ("config.json", "run.json")]
+    found = [
+        path for path in run.rglob("*") if path.is_file() and path.name not in ("config.json", "run.json", ".lock")
+    ]
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in found}
 
 
@@ -99,6 +103,14 @@ def test_another_way_to_decode_runs_only_what_depends_on_it(run: Path, command: 
     assert done.returncode == 0, done.stderr
     assert skipped(done.stdout) == list(STAGES[:4])
     assert json.loads((run / "config.json").read_text())["model"]["sample"]["steps"] == 3
+
+
+def test_a_run_directory_in_use_is_refused_by_name(tmp_path: Path, command: Commands) -> None:
+    """Readers are not: they take no lock."""
+    with Run(presets.debug(), tmp_path / "run", tmp_path).locked():
+        line = command.refused("experiments.train", "debug", "--run-dir", tmp_path / "run", "--model.width", 64)
+    assert f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} is training here; wait for it" in line
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"], "nothing is written"
 
 
 @pytest.mark.parametrize(

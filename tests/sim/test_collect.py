@@ -1,6 +1,7 @@
 import errno
 import multiprocessing
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
 from rsjax.data.store import complete_key, decode_clip, encode, encode_clip, open_store
-from rsjax.files import FileError
+from rsjax.files import FileError, making
 from rsjax.processes import WorkerDied
 from rsjax.sim import collect as collect_module
 from rsjax.sim.collect import CollectError, collect, collection_key, run_episode
@@ -128,6 +129,25 @@ def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:
         else:
             collect_module._clip_file(partial, i).write_bytes(encode(encode_clip(clip)))
     return out
+
+
+def test_a_collection_waits_for_the_process_that_makes_the_same_and_uses_its_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, counts = tmp_path / "store", []
+    monkeypatch.setattr(collect_module, "choose_gl", lambda: None)
+    monkeypatch.setattr(collect_module, "complete_key", lambda path: collection_key(CONFIG) if path.exists() else None)
+    first = ExitStack()
+    first.enter_context(making(out, wait=False))
+
+    def finish(line: str) -> None:
+        out.mkdir()
+        first.close()
+
+    monkeypatch.setattr("rsjax.files.note", finish)
+    collect(CONFIG, out, lambda *done: counts.append(done))
+    assert counts == [(4, 4)]
+    assert list(out.iterdir()) == [] and not (tmp_path / "store.partial").exists()
 
 
 def test_failed_episodes_are_left_out_and_named(gl: str, tmp_path: Path) -> None:
