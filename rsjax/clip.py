@@ -18,8 +18,8 @@ class Clip:
 
     Attributes:
         rgb: frames, 0–255, RGB order, upright (row 0 is the top).
-        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0; None if none was
-            recorded or estimated.
+        depth: distance along the camera's optical axis in metres (z-depth, not ray length), > 0, or 0 in the bars of
+            a padded picture; None if none was recorded or estimated.
         actions: row t led from frame t-1 into frame t; row 0 is zeros (nothing led into the first frame).
         tracks: x (right) and y (down) of each keypoint in each frame; 0 and 1 are the image's outer edges, so the
             centre of pixel column i is (i + 0.5) / W. May leave [0, 1] when the point leaves the image.

@@ -20,13 +20,14 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
     """Returns depth as colours 0–255 (float32, whole numbers); depth outside [near, far] is clipped to it.
 
     Args:
-        depth: depth in metres, > 0; numpy or JAX, and the colours likewise.
+        depth: depth in metres; 0, where there is none, becomes black; numpy or JAX, and the colours likewise.
         near: depth that becomes white.
         far: depth that becomes black.
         scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.
     """
     near_value, far_value = _scaled(near, scale), _scaled(far, scale)
-    position = ((_scaled(depth, scale) - far_value) / (near_value - far_value)).clip(0.0, 1.0)
+    with np.errstate(divide="ignore"):
+        position = ((_scaled(depth, scale) - far_value) / (near_value - far_value)).clip(0.0, 1.0) * (depth > 0)
     level = (position * 765.0).round()
     return (level[..., None] - np.array([0.0, 255.0, 510.0], np.float32)).clip(0.0, 255.0)
 

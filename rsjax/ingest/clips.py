@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,6 +23,7 @@ from rsjax.ingest.annotators.depth import FilledDepths
 from rsjax.ingest.annotators.protocols import Tracked
 from rsjax.ingest.annotators.tracks import window_tracks
 from rsjax.ingest.episode import Episode, EpisodeError, Segment
+from rsjax.ingest.fit import Fit, Placement
 from rsjax.ingest.windows import (
     WindowConfig,
     WindowIndex,
@@ -46,9 +46,10 @@ class ClipConfig:
     """How clips are cut."""
 
     windows: WindowConfig = field(default_factory=WindowConfig)
-    image_size: int = 64  # pixels; pictures of another shape are squeezed into the square
+    image_size: int = 64  # pixels
     tracks: int = 256  # N₀
     camera: str = ""  # none: the episode's first
+    fit: Fit = "crop"  # how pictures of another shape become squares
     recorded_depth: bool = True  # take the depth that the data set has
     most_holes: float = 0.5  # of a recorded depth map; holes are filled from the nearest measured pixel
     actions: ActionConfig = field(default_factory=ActionConfig)
@@ -73,11 +74,12 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     """Cuts an episode into clips, as records of :class:`rsjax.clip.Clip`; ``depth`` is None where there is none.
 
     Returns:
-        ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason),
-        ``short`` (how many ``spans`` are too short for a window, the ``longest`` of all in recorded frames, how many
-        a ``window`` takes, and the ``cure``, in words), ``actions`` (statistics of the clips' actions),
-        ``action_dim``, ``depth`` (its range), ``depth_unit`` ("metres" or "relative"; both None without depth),
-        ``success`` (the number of clips that end in success; None where the data set does not record it).
+        ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason), ``fit``
+        (what became of the pictures, in words; "" where they are square), ``short`` (how many ``spans`` are too short
+        for a window, the ``longest`` of all in recorded frames, how many a ``window`` takes, and the ``cure``, in
+        words), ``actions`` (statistics of the clips' actions), ``action_dim``, ``depth`` (its range), ``depth_unit``
+        ("metres" or "relative"; both None without depth), ``success`` (the number of clips that end in success; None
+        where the data set does not record it).
 
     Raises:
         EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
@@ -95,8 +97,8 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     whole = abs(step - round(step)) < 0.01 * step  # otherwise sampled_actions says what to do
     stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows of each action
     layout = Layout.from_json(episode.meta.get("actions", {}))
-    pictures = _Resized(episode.cameras[camera].read, config.image_size)
-    depths, unit = _depths(annotated, camera, config)
+    pictures = _Fitted(episode.cameras[camera].read, config)
+    depths, unit = _depths(annotated, camera, config, pictures)
     stored = None if annotated.tracks is None else FrameRecords(annotated.tracks)
     statistics: Statistics | None = None
     near, far, succeeded = np.inf, 0.0, 0
@@ -105,17 +107,17 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         if stacked and (np.diff(frames) != stacked).any():
             reasons[number] = "uneven"
             continue
-        tracks = _tracks(stored, frames, config.tracks)
+        rgb = pictures.read(frames.tolist())
+        tracks = _tracks(stored, frames, config.tracks, pictures.placement)
         if tracks is None:
             reasons[number] = "no track"
             continue
-        rgb = pictures.read(frames.tolist())
         depth = depths.read(frames.tolist()) if depths is not None else None
         actions = sampled_actions(episode.actions, frames, config.actions, layout)
         rows = Statistics.of(actions[1:])
         statistics = statistics.merged(rows) if statistics else rows
         if depth is not None:
-            near, far = min(near, float(depth.min())), max(far, float(depth.max()))
+            near, far = min(near, float(depth[depth > 0].min())), max(far, float(depth.max()))
         success = np.asarray(episode.meta.get("success", False), bool)  # by frame, or for the whole
         success = success[frames] if success.ndim else np.full(len(frames), bool(success))
         succeeded += bool(success[-1])
@@ -131,6 +133,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     return {
         "windows": tally(reasons),
         "left_out": starts_by_reason(index, reasons),
+        "fit": pictures.placement.words if pictures.placement else "",
         "short": _short(index, spans, episode.fps, windows),
         "actions": statistics.to_json() if statistics else None,
         "action_dim": len(statistics.mean) if statistics else None,
@@ -164,6 +167,7 @@ def _words(
         "episode": episode.id,
         "fingerprint": episode.fingerprint,
         "camera": camera,
+        "fit": config.fit,
         "fps": float(episode.fps),
         "frames": frames.tolist(),
         "segment": segment.text,
@@ -186,8 +190,10 @@ def clip_labels(record: Record) -> dict[str, str]:
     return {"task": record["task"]} | {name: record["provenance"][name] or UNKNOWN for name in columns}
 
 
-def _tracks(stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: int) -> Tracked | None:
-    """Returns ``count`` of the points that are visible in a window's first frame; None where there are none.
+def _tracks(
+    stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: int, placement: Placement | None
+) -> Tracked | None:
+    """Returns ``count`` of the points that are visible in a clip's first frame; None where there are none.
 
     Without a tracks step they are zeros that are never visible.
     """
@@ -195,30 +201,41 @@ def _tracks(stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: i
         return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
     record = stored.with_frames(int(frames[0]), int(frames[-1]))
     columns = frames - record["first"] if record else frames
-    if record is None or not record["visible"][:, columns[0]].any():
+    if record is None or placement is None:
         return None
-    tracked = Tracked(record["points"][:, columns].astype(np.float32), record["visible"][:, columns])
-    return window_tracks(tracked, np.arange(len(frames)), count)
+    tracked = Tracked(*placement.tracks(record["points"][:, columns], record["visible"][:, columns]))
+    return window_tracks(tracked, np.arange(len(frames)), count) if tracked.visible[:, 0].any() else None
 
 
-def _depths(annotated: Annotated, camera: str, config: ClipConfig) -> "tuple[_Resized | None, str]":
+def _depths(annotated: Annotated, camera: str, config: ClipConfig, pictures: "_Fitted") -> "tuple[_Fitted | None, str]":
     """Returns the depth maps and their unit; None and "" where there are none. Measured ones are preferred."""
     episode = annotated.episode
     if camera in episode.depth and config.recorded_depth:
         where = f"episode {episode.id}: depth of {camera}"
         filled = FilledDepths(episode.depth[camera], config.most_holes, where)
-        return _Resized(filled.read, config.image_size), "metres"
+        return _Fitted(filled.read, config, pictures), "metres"
     if annotated.depth is not None and len(annotated.depth):
         estimated = StoredDepths(annotated.depth, episode)
-        return _Resized(estimated.read, config.image_size), estimated.unit
+        return _Fitted(estimated.read, config, pictures), estimated.unit
     return None, ""
 
 
-class _Resized:
-    """Pictures or depth maps at the clips' size; each is read once for the overlapping windows that need it."""
+class _Fitted:
+    """Pictures or depth maps as clips have them; each is read once for the overlapping windows that need it.
 
-    def __init__(self, read: Callable[[list[int]], Iterable[np.ndarray]], size: int) -> None:
-        self._read, self._size = read, size
+    Args:
+        read: reads the recorded ones.
+        pictures: those that depth maps belong to, and follow in their placement; they are read first.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[list[int]], Iterable[np.ndarray]],
+        config: ClipConfig,
+        pictures: "_Fitted | None" = None,
+    ) -> None:
+        self._read, self._config, self._pictures = read, config, pictures or self
+        self.placement: Placement | None = None
         self._kept: dict[int, np.ndarray] = {}
 
     def read(self, frames: list[int]) -> Float[np.ndarray, "T S S *C"]:
@@ -226,12 +243,12 @@ class _Resized:
         missing = [frame for frame in frames if frame not in self._kept]
         new = self._read(missing) if missing else ()
         kept = {frame: picture for frame, picture in self._kept.items() if frame >= frames[0]}
-        sized = (resized(picture, self._size) for picture in new)
+        sized = (self._fitted(picture) for picture in new)
         self._kept = kept | dict(zip(missing, sized, strict=True))
         return np.stack([self._kept[frame] for frame in frames])
 
-
-def resized(picture: np.ndarray, size: int) -> np.ndarray:
-    """A picture as means over areas; a depth map by its nearest values, as a mean of two surfaces lies on neither."""
-    method = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST_EXACT
-    return cv2.resize(picture, (size, size), interpolation=method)
+    def _fitted(self, picture: np.ndarray) -> np.ndarray:
+        if self._pictures.placement is None:
+            height, width = picture.shape[:2]
+            self._pictures.placement = Placement.create(self._config.fit, height, width, self._config.image_size)
+        return self._pictures.placement.picture(picture)

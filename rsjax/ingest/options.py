@@ -30,6 +30,8 @@ class IngestOptions:
     actions: ActionConfig = field(default_factory=ActionConfig)
     image_size: int = 64
     """Side of a clip in pixels."""
+    fit: Literal["crop", "pad", "stretch"] = "crop"
+    """How a picture that is not square becomes a clip: crop its middle square, pad it with bars, or stretch it."""
     points: int = 256
     """Tracks of a clip."""
     selection: Path | None = None
@@ -110,6 +112,7 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
         options.image_size,
         options.points,
         options.camera,
+        options.fit,
         recorded_depth=recorded is not None,
         most_holes=recorded.most_holes if recorded else 0.0,
         actions=options.actions,

@@ -34,6 +34,7 @@ class IngestSummary:
         windows: how many were ``kept``, and how many each reason left out.
         steps: of each, how many work items are done and failed, their seconds on a worker and on its cores, and the
             clips per second of such a worker.
+        fits: episodes by what became of their pictures, in words, if they were not square.
         depth_left_out: clips that lost their depth because its unit is not the store's.
         this_run: ``items`` (work items that were run), ``clips``, ``seconds`` and ``clips_per_second`` of the last
             run alone.
@@ -45,6 +46,7 @@ class IngestSummary:
     quarantined: list[dict[str, Any]]
     windows: dict[str, int]
     steps: dict[str, dict[str, Any]]
+    fits: dict[str, int]
     depth_left_out: int = 0
     this_run: dict[str, float] | None = None
 
@@ -75,6 +77,7 @@ def summarise(
     short: dict[str, dict[str, Any]] = {}
     quarantined = [dict(zip(_ROW, (ref.id, "list", ref.fingerprint, why, "", ""), strict=True)) for ref, why in refused]
     windows = Counter({"kept": 0})
+    fits = Counter[str]()
     steps: dict[str, dict[str, Any]] = {
         step.name: {"done": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0} for step in plan.steps
     }
@@ -95,6 +98,7 @@ def summarise(
                 break
         else:  # the last mark is that of the cut
             windows.update(last["summary"]["windows"])
+            fits.update(filter(None, [last["summary"].get("fit")]))
             clips += last["records"]
             if last["records"]:
                 done += 1
@@ -112,7 +116,7 @@ def summarise(
     for name, why in short.items():
         most = longest[why["window"], why["cure"]]
         filtered[name] = f"shorter than a window ({why['window']}; the longest has {most}): {why['cure']}"
-    return IngestSummary(len(refs) + len(refused), done, filtered, quarantined, dict(windows), steps)
+    return IngestSummary(len(refs) + len(refused), done, filtered, quarantined, dict(windows), steps, dict(fits))
 
 
 def _left_out(windows: dict[str, int]) -> list[str]:
@@ -158,6 +162,7 @@ def lines(summary: IngestSummary) -> list[str]:
         f"{len(summary.quarantined)} quarantined",
         " + ".join([f"windows   {sum(windows.values())} = {windows['kept']} kept", *_left_out(windows)]),
     ]
+    text += [f"pictures  of {number} episodes, {how}" for how, number in summary.fits.items()]
     if summary.depth_left_out:
         text.append(f"depth     left out of {summary.depth_left_out} clips: metres and relative depth do not mix")
     if (run := summary.this_run) is not None:

@@ -62,3 +62,9 @@ def test_inverse_depth_is_finer_near_the_camera() -> None:
     near, far = np.array([0.50, 0.51], np.float32), np.array([3.50, 3.51], np.float32)
     assert np.ptp(depth_to_color(near, NEAR, FAR, "inverse").sum(-1)) > 5
     assert np.ptp(depth_to_color(far, NEAR, FAR, "inverse").sum(-1)) < 2
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_no_depth_is_black(scale: Scale) -> None:
+    colors = np.asarray(depth_to_color(np.array([0, NEAR, FAR], np.float32), NEAR, FAR, scale))
+    assert colors[:, 0].tolist() == [0, 255, 0] and colors.dtype == np.float32

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rsjax.ingest.windows import WindowConfig
 from tests.ingest.toy import Pictures, episode
 
 CONFIG = ClipConfig(WindowConfig(frames=4, rate=2), image_size=8, tracks=6)
+STRETCHED = replace(CONFIG, fit="stretch")
 
 
 class Records(list):
@@ -122,13 +124,35 @@ def test_estimated_depth_is_read_from_its_parts() -> None:
         clips(episode("a"), depth=Records(parts[:5]))
 
 
+def test_rgb_depth_and_tracks_follow_one_fit() -> None:
+    """Pictures are 16 × 12: a crop leaves out an eighth at either side, and bars cover an eighth above and below."""
+    xs = np.array([0.05, 0.125, 0.5, 0.95])
+    points = np.stack([np.broadcast_to(xs[:, None], (4, 40)), np.zeros((4, 40))], -1).astype(np.float16)
+    tracks = Records([{"first": 0, "points": points, "visible": np.ones((4, 40), bool)}])
+    made = {
+        fit: clips(episode("a", depth=True), replace(CONFIG, fit=fit), tracks=tracks)
+        for fit in ("crop", "pad", "stretch")
+    }
+    shown = {fit: sorted({*np.round(kept[0]["tracks"][:, 0, 0], 3).tolist()}) for fit, (kept, _) in made.items()}
+    assert shown["crop"] == [0.0, 0.5]
+    assert shown["pad"] == shown["stretch"] == pytest.approx([0.05, 0.125, 0.5, 0.95], abs=1e-3)
+    assert (made["pad"][0][0]["tracks"][..., 1] == 0.125).all()
+    for fit, (kept, summary) in made.items():
+        bars = np.zeros((8, 8), bool)
+        bars[[0, -1]] = fit == "pad"
+        assert (kept[0]["depth"][:, bars] == 0).all() and (kept[0]["depth"][:, ~bars] >= 1).all()
+        assert (kept[0]["rgb"][:, bars] == 0).all() and (kept[0]["rgb"][:, ~bars, 0] == 100).all()
+        assert summary["depth"] == pytest.approx([1.0, 1 + 35 / 10])
+        assert kept[0]["provenance"]["fit"] == fit and summary["fit"].startswith("16 × 12")
+
+
 def test_tracks_are_those_of_the_windows_shot() -> None:
     seen = np.ones((3, 20), bool)
     seen[2, :18] = False
     points = np.broadcast_to(np.arange(20)[None, :, None], (3, 20, 2)).astype(np.float16)
     shots = [(0, 20), (20, 40)]
     records = Records({"first": first, "points": points, "visible": seen} for first, _ in shots)
-    kept, summary = clips(episode("a"), shots=shots, tracks=records)
+    kept, summary = clips(episode("a"), STRETCHED, shots=shots, tracks=records)
     assert summary["windows"] == {"kept": 2}
     for record, first in zip(kept, (0, 20), strict=True):
         assert record["tracks"].shape == (6, 4, 2) and record["visible"].all()
@@ -149,7 +173,9 @@ def test_the_tracks_of_a_shot_are_read_once() -> None:
     points = np.zeros((3, 20, 2), np.float16)
     shots = [(0, 20), (20, 40)]
     records = Counting({"first": first, "points": points, "visible": np.ones((3, 20), bool)} for first, _ in shots)
-    kept, _ = clips(episode("a"), ClipConfig(WindowConfig(frames=4, rate=0), 8, 6), shots=shots, tracks=records)
+    kept, _ = clips(
+        episode("a"), ClipConfig(WindowConfig(frames=4, rate=0), 8, 6, fit="pad"), shots=shots, tracks=records
+    )
     assert len(kept) == 34 and read == [0, 1]
 
 

@@ -1,5 +1,5 @@
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from rsjax.ingest.packing import split_episodes
 from rsjax.ingest.summary import IngestSummary, lines
 from rsjax.ingest.windows import WindowConfig
 from rsjax.ingest.work_items import EpisodeWork
-from tests.ingest.toy import ByDepth, Relative, Source, clip_plan, episode, ingested
+from tests.ingest.toy import CONFIG, ByDepth, Relative, Source, clip_plan, episode, ingested
 
 
 def episodes(store: Store, split: str) -> list[str]:
@@ -162,7 +162,8 @@ def test_a_network_that_cannot_be_loaded_ends_the_ingest_and_quarantines_nothing
 
 def test_a_network_that_tracks_sees_recorded_depth_or_else_that_of_the_step(tmp_path: Path) -> None:
     methods = Annotators(None, None, Relative(), ByDepth(), None)  # type: ignore[arg-type]
-    ingested(clip_plan(tmp_path, Source(2, deep=1), methods, share=0.0))
+    config = replace(CONFIG, fit="stretch")
+    ingested(clip_plan(tmp_path, Source(2, deep=1), methods, share=0.0, config=config))
     source = open_store(tmp_path / "store").source("train")
     for number in range(len(source)):
         record = source[number]
