@@ -13,7 +13,7 @@ from rsjax.ingest.episode import EpisodeSource, SourceError
 from rsjax.ingest.formats.files import exists
 from rsjax.ingest.formats.options import check_options
 
-FORMATS = ("agibot", "lerobot", "robomimic", "libero", "rlds", "bair", "folder", "sim")
+FORMATS = ("agibot", "lerobot", "robomimic", "libero", "rlds", "bair", "folder", "npz", "sim")
 
 
 def open_source(name: str, path: Path | str, **options: Any) -> EpisodeSource:

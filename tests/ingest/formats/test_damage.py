@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rsjax.errors import UserError
 from rsjax.ingest.formats import open_source
-from tests.ingest.formats import test_agibot, test_bair, test_folder, test_lerobot, test_libero, test_sim
+from tests.ingest.formats import test_agibot, test_bair, test_folder, test_lerobot, test_libero, test_npz, test_sim
 from tests.ingest.formats.toy_demos import demo, write_demos
 from tests.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.ingest.formats.videos import close_videos
@@ -34,6 +34,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "libero": lambda root: write_demos(root / "a_demo.hdf5", {"demo_0": test_libero.libero_demo()}),
     "rlds": lambda root: write_bridge(root, [bridge_episode(3), bridge_episode(4)]),
     "bair": lambda root: test_bair.write(root, *[test_bair.episode_bytes()] * 2),
+    "npz": lambda root: [test_npz.write(root / f"{number}.npz", bool(number)) for number in range(2)],
     "sim": write_sim,
 }
 
