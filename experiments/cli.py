@@ -11,7 +11,7 @@ import tyro
 from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
 from rsjax.command import main_errors as main_errors  # every command imports both from here
-from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets, require
+from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
 from rsjax.config.curriculum import format_stage, parse_stage
 from rsjax.config.leaves import leaves
 from rsjax.errors import did_you_mean
@@ -153,7 +153,10 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
             parsed: Any = tyro.cli(type(default), **settings)
     except BrokenPipeError:  # --help-all | head
         os._exit(0)
-    return parsed[0] if rest else parsed
+    parsed = parsed[0] if rest else parsed
+    if "options" in parts:
+        check_numbers(parsed.options, "--", dash=True)
+    return parsed
 
 
 def _message(event: parse_errors.ParseErrorEvent, flags: list[str]) -> str:

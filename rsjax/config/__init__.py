@@ -10,6 +10,7 @@ out, so changing it never invalidates finished work.
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import (
     ConfigError,
+    check_numbers,
     content_key,
     from_dict,
     require,
@@ -57,6 +58,7 @@ __all__ = [
     "TokenizerConfig",
     "TokenizerTrainConfig",
     "TransformerConfig",
+    "check_numbers",
     "content_key",
     "from_dict",
     "register_family",

@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import math
+import types
 import typing
 from collections.abc import Collection
 from dataclasses import field
@@ -11,6 +13,8 @@ from typing import Any, TypeVar
 from rsjax.errors import UserError
 
 T = TypeVar("T")
+
+MOST_SEED = 2**32 - 1  # jax.random.key drops higher bits, so that two seeds would be one
 
 
 class ConfigError(UserError):
@@ -44,6 +48,39 @@ def require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
+def require_range(config: Any, section: str, low: float, high: float, *names: str) -> None:
+    """Raises :class:`ConfigError` unless each of these fields of a section lies in ``low`` … ``high``."""
+    for name in names:
+        value = getattr(config, name)
+        wanted = f"at least {low}" if high == math.inf else f"{low} … {high}"
+        require(low <= value <= high, f"{section}.{name} is {value}; it must be {wanted}")
+
+
+def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
+    """Checks that every number of a dataclass is finite and every seed one of 32 bits, also in nested dataclasses.
+
+    Args:
+        prefix: precedes the fields' names in the error.
+        dash: whether to write the names as flags of a command line.
+
+    Raises:
+        ConfigError: a number is not.
+    """
+    for f in dataclasses.fields(settings):
+        name = prefix + (f.name.replace("_", "-") if dash else f.name)
+        value = getattr(settings, f.name)
+        for item in value if isinstance(value, tuple) else (value,):
+            if dataclasses.is_dataclass(item):
+                check_numbers(item, f"{name}.", dash)
+            elif isinstance(item, float):
+                finite = math.isfinite(item) or item == f.default  # a limit that is off may be infinite
+                require(finite, f"{name} is {item}; it must be a finite number")
+            elif isinstance(item, int) and f.name in ("seed", "seeds"):
+                require(0 <= item <= MOST_SEED, f"{name} is {item}; a seed is a whole number from 0 to {MOST_SEED}")
+            elif isinstance(item, int):
+                require(abs(item) < 2**63, f"{name} is {item}; it must fit in 64 bits")
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns a config as JSON-ready values; a model's settings include the name of its ``family``."""
     values = {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
@@ -61,26 +98,48 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
 
     Raises:
         ConfigError: ``values`` or a nested value is not a dictionary; a field is unknown, as in a file written by
-            another version; or the configuration is impossible.
+            another version, or its value of another type; or the configuration is impossible.
         TypeError: a field without a default is missing.
     """
     require(isinstance(values, dict), f"{kind.__name__} must be fields by name; it is {values!r:.40}")
     if hasattr(kind, "family"):
         kind, values = typing.cast(Any, kind).chosen(values)
-    hints = {f.name: typing.get_type_hints(kind)[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
+    declared = typing.get_type_hints(kind)
+    hints = {f.name: declared[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
     return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})
 
 
 def _read(name: str, hint: Any, value: Any) -> Any:
-    """Converts a field's JSON value: objects to dataclasses and lists to tuples, recursively."""
+    """Converts a field's JSON value: objects to dataclasses and lists to tuples, recursively; checks its type."""
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast(type, hint), value)
+
+    def expect(right: bool, kind: str) -> None:
+        require(right, f"{name} must be {kind}; it is {value!r:.40}")
+
+    kinds = typing.get_args(hint)
     if typing.get_origin(hint) is tuple:
-        require(isinstance(value, list), f"{name} must be a list; it is {value!r:.40}")
-        return tuple(_read(name, typing.get_args(hint)[0], item) for item in value)
+        expect(isinstance(value, list), "a list")
+        return tuple(_read(name, kinds[0], item) for item in value)
+    if typing.get_origin(hint) is typing.Literal:
+        expect(value in kinds, f"one of {', '.join(map(str, kinds))}")
+    elif typing.get_origin(hint) in (typing.Union, types.UnionType):
+        if not (value is None and type(None) in kinds):
+            return _read(name, next(kind for kind in kinds if kind is not type(None)), value)
+    elif hint in _JSON_KINDS:
+        text, allowed = _JSON_KINDS[hint]
+        expect(type(value) in allowed, text)
     return value
+
+
+_JSON_KINDS: dict[Any, tuple[str, tuple[type, ...]]] = {
+    bool: ("true or false", (bool,)),
+    int: ("a whole number", (int,)),
+    float: ("a number", (float, int)),
+    str: ("text", (str,)),
+}
 
 
 def differences(saved: Any, own: Any, free: Collection[str]) -> str:

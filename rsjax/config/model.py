@@ -47,7 +47,7 @@ class ModelConfig:
     @classmethod
     def chosen(cls, values: dict[str, Any]) -> tuple[type["ModelConfig"], dict[str, Any]]:
         """Returns the class and the fields of a dictionary made by :func:`rsjax.config.to_dict`."""
-        require("family" in values, "model has no family; the file is of another version")
+        require(isinstance(values.get("family"), str), "model has no family; the file is of another version")
         return family(values["family"]), {name: value for name, value in values.items() if name != "family"}
 
 

@@ -1,10 +1,11 @@
 """Settings of evaluation, and of a whole run."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 from rsjax.config.data import ClipShape, DataConfig
-from rsjax.config.fields import require
+from rsjax.config.fields import check_numbers, require, require_range
 from rsjax.config.model import ModelConfig, RoboScapeConfig, converted
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
@@ -22,8 +23,7 @@ class EvalConfig:
     report_clips: int = 4  # clips shown in the report
 
     def __post_init__(self) -> None:
-        for name in ("loss_clips", "batch_size", "action_draws", "report_clips"):
-            require(getattr(self, name) > 0, f"eval.{name} is {getattr(self, name)}; it must be positive")
+        require_range(self, "eval", 1, math.inf, "loss_clips", "batch_size", "action_draws", "report_clips")
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Config:
     eval: EvalConfig = EvalConfig()
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         clips = self.clips
         require(
             1 <= self.prompt_frames < clips.frames,

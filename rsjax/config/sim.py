@@ -1,10 +1,11 @@
 """Settings of the simulator's episodes."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import require, runtime
+from rsjax.config.fields import require, require_range, runtime
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,8 @@ class SimConfig:
             f"sim.test_episodes is {self.test_episodes}; it must lie between 1 and sim.episodes - 1 "
             f"({self.episodes - 1}), so that both splits have clips",
         )
-        for name in ("control_steps", "image_size", "tracks"):
-            require(getattr(self, name) > 0, f"sim.{name} is {getattr(self, name)}; it must be positive")
+        require_range(self, "sim", 1, math.inf, "control_steps", "image_size", "tracks")
+        require_range(self, "sim", 0, math.inf, "workers")
 
     @property
     def action_dim(self) -> int:

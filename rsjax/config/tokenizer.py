@@ -1,9 +1,10 @@
 """Settings of the tokenizer and its training."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import require
+from rsjax.config.fields import require, require_range
 from rsjax.config.train import LoopConfig
 
 
@@ -25,6 +26,12 @@ class TokenizerConfig:
     depth_scale: Literal["linear", "inverse"] = "inverse"
 
     def __post_init__(self) -> None:
+        sizes = ("patch_size", "channels", "res_blocks", "norm_groups", "code_bits", "vocabularies")
+        require_range(self, "tokenizer", 1, math.inf, *sizes)
+        require(
+            bool(self.channel_multipliers) and min(self.channel_multipliers) >= 1,
+            f"tokenizer.channel_multipliers are {self.channel_multipliers}; give one for each level, at least 1",
+        )
         require(
             self.code_bits % self.vocabularies == 0,
             f"tokenizer.code_bits {self.code_bits} does not divide into {self.vocabularies} vocabularies; "
@@ -99,11 +106,16 @@ class TokenizerTrainConfig(LoopConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        value = self.adversarial_weight
-        require(value >= 0, f"tokenizer_train.adversarial_weight is {value}; it cannot be negative")
+        require_range(self, "tokenizer_train", 0, math.inf, "adversarial_weight", "disc_start", "entropy_group")
+        require_range(self, "tokenizer_train", 1, math.inf, "frames_per_clip")
+        require_range(self, "tokenizer_train", 0, 1, "depth_share", "lecam_decay")
+        require(
+            self.entropy_temperature > 0,
+            f"tokenizer_train.entropy_temperature is {self.entropy_temperature}; it must be above 0",
+        )
         images = self.batch_size // self.accumulate * self.frames_per_clip
         require(
-            self.entropy_group >= 0 and (self.entropy_group == 0 or images % self.entropy_group == 0),
+            self.entropy_group == 0 or images % self.entropy_group == 0,
             f"tokenizer_train.entropy_group is {self.entropy_group}; it must divide the {images} images of a batch "
             f"(batch_size / accumulate × frames_per_clip), or be 0 for one average over all of them",
         )

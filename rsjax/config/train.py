@@ -1,9 +1,10 @@
 """Settings of the training loop and its optimizer."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import require, runtime
+from rsjax.config.fields import require, require_range, runtime
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,9 @@ class OptimizerConfig:
             0 < self.decay_share <= 1,
             f"optimizer.decay_share is {self.decay_share}; it is a share of the run, above 0 and at most 1",
         )
+        amounts = ("learning_rate", "warmup_steps", "weight_decay", "grad_clip")
+        require_range(self, "optimizer", 0, math.inf, *amounts)
+        require_range(self, "optimizer", 0, 1, "final_share", "beta1", "beta2")
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,8 @@ class LoopConfig:
             require(value >= least, f"{name} of a training loop is {value}; it must be at least {least}")
         for name in ("skip_budget", "keep_every", "eval_every", "workers", "profile"):
             require(getattr(self, name) >= 0, f"{name} of a training loop is {getattr(self, name)}; it is at least 0")
+        for name in ("ema", "max_damaged"):
+            require(0 <= getattr(self, name) <= 1, f"{name} of a training loop is {getattr(self, name)}; it is 0 … 1")
         require(
             list(self.restarts) == sorted(set(self.restarts)) and all(step > 0 for step in self.restarts),
             f"restarts of a training loop are {self.restarts}; they are steps above 0, in their order",

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from typing import Any
 
 import pytest
@@ -103,10 +104,55 @@ def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
 
 
 @pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("train.seed", "3", "LoopConfig.seed must be a whole number; it is '3'"),
+        ("train.steps", True, "LoopConfig.steps must be a whole number; it is True"),
+        ("train.steps", 2.0, "LoopConfig.steps must be a whole number; it is 2.0"),
+        ("train.steps", None, "LoopConfig.steps must be a whole number; it is None"),
+        ("train.keep_best", 1, "LoopConfig.keep_best must be true or false; it is 1"),
+        ("train.ema", "0.9", "LoopConfig.ema must be a number; it is '0.9'"),
+        ("train.sharding", "ring", "LoopConfig.sharding must be one of auto, jit, pmap, mesh; it is 'ring'"),
+        ("train.restarts", [1, "2"], "LoopConfig.restarts must be a whole number; it is '2'"),
+        ("sim.camera", ["front"], r"SimConfig.camera must be text; it is \['front'\]"),
+        ("name", {}, "Config.name must be text; it is {}"),
+        ("model.family", 3, "model has no family"),
+    ],
+)
+def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any, message: str) -> None:
+    plain = c.to_dict(BASE)
+    *heads, name = path.split(".")
+    part = plain
+    for head in heads:
+        part = part[head]
+    part[name] = value
+    with pytest.raises(c.ConfigError, match=message):
+        c.from_dict(c.Config, plain)
+
+
+@pytest.mark.parametrize(
     ("path", "changes", "names"),
     [
         ("", {"prompt_frames": 0}, "prompt_frames is 0 of 6 frames"),
         ("", {"prompt_frames": 6}, "prompt_frames is 6 of 6 frames"),
+        ("train", {"seed": -1}, "train.seed is -1; a seed is a whole number from 0 to 4294967295"),
+        ("tokenizer_train", {"seed": 2**32}, "tokenizer_train.seed is 4294967296; a seed"),
+        ("sim", {"seed": 2**70}, "sim.seed is 1180591620717411303424; a seed"),
+        ("model.sample", {"seed": -3}, "model.sample.seed is -3; a seed"),
+        ("train.optimizer", {"learning_rate": math.nan}, "optimizer.learning_rate is nan"),
+        ("train.optimizer", {"learning_rate": math.inf}, "train.optimizer.learning_rate is inf; it must be a finite"),
+        ("train.optimizer", {"learning_rate": -1e-3}, "optimizer.learning_rate is -0.001; it must be at least 0"),
+        ("train.optimizer", {"beta1": 1.5}, "optimizer.beta1 is 1.5; it must be 0 … 1"),
+        ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
+        ("model.mask", {"corruption_decay": -math.inf}, "model.mask.corruption_decay is -inf; it must be a finite"),
+        ("train", {"ema": math.nan}, "ema of a training loop is nan; it is 0 … 1"),
+        ("train", {"max_damaged": 2.0}, "max_damaged of a training loop is 2.0"),
+        ("train", {"steps": 2**63}, "train.steps is 9223372036854775808; it must fit in 64 bits"),
+        ("", {"train": c.LoopConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),
+        ("tokenizer", {"vocabularies": 0}, "tokenizer.vocabularies is 0; it must be at least 1"),
+        ("tokenizer", {"norm_groups": 0}, "tokenizer.norm_groups is 0; it must be at least 1"),
+        ("tokenizer", {"channel_multipliers": ()}, "tokenizer.channel_multipliers are ()"),
+        ("tokenizer_train", {"entropy_temperature": 0.0}, "tokenizer_train.entropy_temperature is 0.0"),
         ("sim", {"frames": 1}, "sim.frames is 1"),
         ("sim", {"test_episodes": 8}, "sim.test_episodes is 8"),
         ("sim", {"test_episodes": 0}, "sim.test_episodes is 0"),

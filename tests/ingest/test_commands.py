@@ -122,7 +122,8 @@ def test_the_help_says_what_source_and_path_are(command: Command, capsys: pytest
         command(ingest, "--help")
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert (
-        "agibot, lerobot, robomimic, libero, rlds, bair, folder, npz, sim" in text and "PATH is the folder or file" in text
+        "agibot, lerobot, robomimic, libero, rlds, bair, folder, npz, sim" in text
+        and "PATH is the folder or file" in text
     )
 
 
