@@ -35,17 +35,23 @@ class EncodedFrames:
     Attributes:
         payloads: each frame's PNG or JPEG.
         where: the file and field that messages name.
+        depth_scale: if above 0, they are depth maps, as ``Depths``: PNG of whole numbers that count this many metres,
+            or of four channels that are the bytes of float32 metres, as TFDS writes them.
     """
 
     payloads: Sequence[bytes]
     where: str
+    depth_scale: float = 0.0
 
     def __len__(self) -> int:
         return len(self.payloads)
 
-    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """Returns these pictures; :class:`EpisodeError` names one that is damaged or of another size."""
-        return decode_pictures((f"{self.where} frame {index}", self.payloads[index]) for index in indices)
+    def read(self, indices: Sequence[int]) -> np.ndarray:
+        """Returns these pictures or maps; :class:`EpisodeError` names one that is damaged or of another size."""
+        chosen = ((f"{self.where} frame {index}", self.payloads[index]) for index in indices)
+        if self.depth_scale:
+            return stack_pictures((where, _depth(data, where, self.depth_scale)) for where, data in chosen)
+        return decode_pictures(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +77,18 @@ class PictureFiles:
         """
         paths = [self.paths[index] for index in indices]
         if self.depth:
-            return stack_pictures((path, _depth(path)) for path in paths)
+            return stack_pictures((path, _depth(_bytes(path), path, 0.001)) for path in paths)
         return decode_pictures((path, _bytes(path)) for path in paths)
 
 
-def _depth(path: Path) -> Float32[np.ndarray, "H W"]:
-    raw = _decode(_bytes(path), cv2.IMREAD_UNCHANGED, path)
+def _depth(payload: bytes, where: Path | str, scale: float) -> Float32[np.ndarray, "H W"]:
+    raw = _decode(payload, cv2.IMREAD_UNCHANGED, where)
+    if raw.dtype == np.uint8 and raw.ndim == 3 and raw.shape[2] == 4:  # OpenCV has the red byte third
+        metres = np.ascontiguousarray(raw[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
+        return np.nan_to_num(metres, nan=0, posinf=0, neginf=0)
     if raw.dtype != np.uint16 or raw.ndim != 2:
-        raise EpisodeError.at(path, f"{raw.dtype} {raw.shape}, a depth map has 16 bits and one channel")
-    return raw.astype(np.float32) * np.float32(0.001)
+        raise EpisodeError.at(where, f"{raw.dtype} {raw.shape}, a depth map has 16 bits and one channel")
+    return raw.astype(np.float32) * np.float32(scale)
 
 
 def decode_pictures(payloads: Iterable[tuple[Path | str, bytes]]) -> UInt8[np.ndarray, "n H W 3"]:

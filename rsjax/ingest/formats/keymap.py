@@ -1,7 +1,7 @@
 """Key maps: which feature of an RLDS data set is what. Some are named, and users can write their own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ class KeyMap:
         quaternions: likewise.
         held: likewise.
         after: whether a step's observation was recorded after its action, against the convention.
+        depth: the feature of each camera's depth maps, by the camera's name.
+        depth_scale: metres that a depth map of whole numbers counts as 1; floats are metres.
         names: of the data sets that this map is for.
     """
 
@@ -38,7 +40,14 @@ class KeyMap:
     quaternions: tuple[int, ...] = ()
     held: tuple[int, ...] = ()
     after: bool = False
+    depth: Mapping[str, str] = field(default_factory=dict)
+    depth_scale: float = 0.001
     names: tuple[str, ...] = field(default=(), compare=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the fields that differ from their defaults, as a file of a key map has them."""
+        blank = asdict(KeyMap({}, (), 0.0)) | {"names": self.names}
+        return {name: value for name, value in asdict(self).items() if value != blank[name]}
 
 
 def _cameras(*names: str) -> dict[str, str]:
@@ -115,13 +124,19 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
     Raises:
         SourceError: there is no such map, or the file has wrong fields.
     """
-    choices = f"{', '.join(MAPS)}, or a .json file"
+    choices = f"{', '.join(MAPS)}, a .json file, or auto"
     if keys in MAPS:
         return MAPS[keys]
     if keys.endswith(".json"):
         keymap = from_json(KeyMap, read_json(Path(keys)), keys)
         if not 0 < keymap.fps <= MAX_FPS:
             raise SourceError(f"{keys}: fps is {keymap.fps!r}, should be a number above 0 and at most {MAX_FPS:g}")
+        if keymap.depth_scale <= 0:
+            raise SourceError(f"{keys}: depth_scale is {keymap.depth_scale!r}, should be the metres that a 1 counts")
+        if unknown := keymap.depth.keys() - keymap.cameras.keys():
+            raise SourceError(
+                f"{keys}: depth names the camera {min(unknown)!r}; cameras are {', '.join(keymap.cameras)}"
+            )
         return keymap
     if keys:
         raise SourceError(f"unknown key map {keys!r}{did_you_mean(keys, MAPS)}; there are {choices}")
@@ -129,39 +144,3 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
         if dataset in known.names:
             return known
     raise SourceError(f"{folder}: no key map for the data set {dataset!r}; choose one with keys: {choices}")
-
-
-def check_keys(keys: KeyMap, path: Path, features: Mapping[str, Any]) -> None:
-    """Checks that a data set has each feature of a map.
-
-    Args:
-        path: of ``features.json``, for messages.
-        features: its content; nothing is checked if it is empty.
-
-    Raises:
-        SourceError: a feature is missing or of another kind.
-    """
-    try:
-        steps = features.get("featuresDict", {}).get("features", {}).get("steps", {})
-        kinds = _kinds(steps.get("sequence", {}).get("feature", {}))
-    except (AttributeError, TypeError) as error:
-        raise SourceError(f"{path}: not such as TFDS writes ({error}); fetch it again") from error
-    wanted = [(key, "image") for key in keys.cameras.values()]
-    wanted += [(key, "tensor") for key in (*keys.action, *keys.state)]
-    for key, kind in wanted if kinds else ():
-        if key not in kinds:
-            hint = did_you_mean(key, kinds) or f"; steps have {', '.join(sorted(kinds))}"
-            raise SourceError(f"{path}: no steps/{key}, which the key map names{hint}. Maps: {', '.join(MAPS)}")
-        if kinds[key] != kind:
-            raise SourceError(f"{path}: steps/{key} is of kind {kinds[key]}, the key map says {kind}; mend the map")
-
-
-def _kinds(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Returns the kind (image, text, tensor …) of every feature of a step by its key below ``steps/``."""
-    kinds: dict[str, str] = {}
-    for name, child in tree.get("featuresDict", {}).get("features", {}).items():
-        if "featuresDict" in child:
-            kinds |= _kinds(child, f"{prefix}{name}/")
-        else:
-            kinds[f"{prefix}{name}"] = next((kind for kind in ("image", "text", "tensor") if kind in child), "other")
-    return kinds

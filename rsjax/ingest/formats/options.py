@@ -50,7 +50,9 @@ def from_json(kind: type[T], values: Any, where: Path | str) -> T:
     if not isinstance(values, Mapping):
         raise SourceError(f"{where}: should be an object with {', '.join(hints)}")
     check_options(values, hints, str(where), "field")
-    required = [field.name for field in dataclasses.fields(kind) if field.default is dataclasses.MISSING]  # type: ignore
+    missing = dataclasses.MISSING
+    fields = dataclasses.fields(kind)  # type: ignore
+    required = [field.name for field in fields if field.default is missing and field.default_factory is missing]
     for name in required:
         if not values.get(name):
             raise SourceError(f"{where}: {name} is missing or empty; give {', '.join(required)}")

@@ -6,9 +6,10 @@ feature is what differs from data set to data set: a :class:`KeyMap` says it, an
 RLDS the action of a step was done *after* its observation.
 """
 
+import json
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +19,36 @@ from jaxtyping import Float32
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Layout, align_actions, check_layout
-from rsjax.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, runs
+from rsjax.ingest.episode import (
+    LEAVE_OUT,
+    MAX_FPS,
+    Depths,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    runs,
+)
 from rsjax.ingest.formats.files import broken, exists, near, read_json
-from rsjax.ingest.formats.keymap import KeyMap, check_keys, key_map
+from rsjax.ingest.formats.keymap import KeyMap, key_map
+from rsjax.ingest.formats.rlds_features import check_keys, propose, step_features
 from rsjax.ingest.formats.tfrecord import Example, read_record, record_refs
-from rsjax.ingest.pictures import EncodedFrames
+from rsjax.ingest.pictures import ArrayFrames, EncodedFrames
+from rsjax.progress import note
 
 _SHARD = re.compile(r"(?P<name>.+)-(?P<split>[^-]+)\.tfrecord-(?P<number>\d+)-of-(?P<shards>\d+)")
 
 
-def open_source(path: Path, keys: str = "", split: str = "") -> "RldsSource":
+def open_source(path: Path, keys: str = "", split: str = "", fps: float = 0.0) -> "RldsSource":
     """Opens an RLDS data set.
 
     Args:
         path: the folder with the shards, one of its two parents (``name/1.0.0/``), or a single shard.
-        keys: a named key map, or the path of one as JSON (the fields of :class:`KeyMap`); "": the one for the data
-            set's name.
+        keys: a named key map, the path of one as JSON (the fields of :class:`KeyMap`), or ``auto``: one proposed from
+            ``features.json``, which is printed; "": the one for the data set's name.
         split: the only one to read; "": all.
+        fps: steps per second, in place of the key map's; 0: the key map's.
 
     Raises:
         SourceError: there are no shards, or the key map does not fit ``features.json``.
@@ -42,13 +56,25 @@ def open_source(path: Path, keys: str = "", split: str = "") -> "RldsSource":
     shards = _shards(path)
     folder = shards[0].parent
     info = _read_object(folder / "dataset_info.json")
-    keymap = key_map(keys, info.get("name") or _split_name(shards[0])[0], folder)
-    check_keys(keymap, folder / "features.json", _read_object(folder / "features.json"))
+    if not 0 <= fps <= MAX_FPS:
+        raise SourceError(f"rlds: option fps is {fps}; it must be above 0 and at most {MAX_FPS:g}")
+    described = folder / "features.json"
+    features = step_features(described, _read_object(described))
+    if keys == "auto":
+        keymap = propose(described, features, fps)
+        cure = "save it as a .json file and mend it if it is wrong (--option keys=FILE)"
+        note(f"{folder}: taking {keymap.kind} actions by the key map {json.dumps(keymap.to_json())}; {cure}")
+    else:
+        keymap = key_map(keys, info.get("name") or _split_name(shards[0])[0], folder)
+    keymap = replace(keymap, fps=fps) if fps else keymap
+    check_keys(keymap, described, features)
+    shapes = {key: features[key].shape for key in keymap.depth.values() if key in features}
+    sides = {key: shape[:2] for key, shape in shapes.items() if shape and len(shape) > 1}
     chosen = [shard.name for shard in shards if not split or _split_name(shard)[1] == split]
     if not chosen:
         splits = sorted({_split_name(shard)[1] for shard in shards})
         raise SourceError(f"{folder}: no split {split!r}{did_you_mean(split, splits)}; it has {', '.join(splits)}")
-    return RldsSource(folder, tuple(chosen), keymap, path.is_file())
+    return RldsSource(folder, tuple(chosen), keymap, path.is_file(), sides)
 
 
 @dataclass(frozen=True)
@@ -60,6 +86,7 @@ class RldsSource:
         shards: their file names, in order.
         keys: which feature is what.
         single: whether the user named one shard, not a folder, so that no others are missing.
+        sides: height and width of depth maps, by their features.
     """
 
     name = "rlds"
@@ -67,6 +94,7 @@ class RldsSource:
     shards: tuple[str, ...]
     keys: KeyMap
     single: bool = False
+    sides: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every record of every shard; one that cannot be read stands for what a damaged shard lacks."""
@@ -75,7 +103,8 @@ class RldsSource:
             match = _SHARD.fullmatch(shard)
             stem = f"{match['split']}-{int(match['number']):05d}" if match else safe_id(shard)
             counts = expected.get(shard, 0), "dataset_info.json names"
-            yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, asdict(self.keys))
+            settings = {n: v for n, v in asdict(self.keys).items() if self.keys.depth or not n.startswith("depth")}
+            yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, settings)
         if not self.single:
             yield from self._missing_shards()
 
@@ -112,6 +141,7 @@ class RldsSource:
             actions=align_actions(actions, self.keys.after),
             states=_joined(example, self.keys.state, count) if self.keys.state else None,
             cameras=cameras,
+            depth={name: self._depth(example, key) for name, key in self.keys.depth.items() if name in cameras},
             segments=tuple(segments) if len({segment.text for segment in segments}) > 1 else (),
             meta={
                 "source": "rlds",
@@ -122,6 +152,20 @@ class RldsSource:
             },
         )
         return checked(episode, example.where)
+
+    def _depth(self, example: Example, key: str) -> Depths:
+        """Returns the depth maps of a feature: encoded pictures, or numbers one after the other."""
+        name, scale = f"steps/{key}", self.keys.depth_scale
+        if example.is_bytes(name):
+            return EncodedFrames(example.blobs(name), f"{example.where}: {name}", scale)
+        height, width = self.sides.get(key, (0, 0))
+        if height <= 0 or width <= 0:
+            raise EpisodeError.at(example.where, f"{name} is of numbers, and features.json has no shape", LEAVE_OUT)
+        values, floats = example.flat(name)
+        if values.size % (height * width):
+            raise EpisodeError.at(example.where, f"{name} has {values.size} values, maps have {height} × {width}")
+        maps = values.reshape(-1, height, width) * np.float32(1 if floats else scale)
+        return ArrayFrames(np.nan_to_num(maps, nan=0, posinf=0, neginf=0))
 
 
 def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], list[str]]:

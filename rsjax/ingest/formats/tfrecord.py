@@ -156,13 +156,18 @@ class Example:
             raise EpisodeError.at(self.where, f"{name} has {len(values)} values for {rows} steps")
         return np.array(values, np.float32).reshape(rows, -1)
 
+    def flat(self, name: str) -> tuple[Float32[np.ndarray, " n"], bool]:
+        """Returns the numbers of a feature, and whether they are floats. Raises as :meth:`numbers`."""
+        values = self._values(name, ("float_list", "int64_list"))
+        return np.array(values, np.float32), self._features[name].WhichOneof("kind") == "float_list"
+
     def blobs(self, name: str) -> list[bytes]:
         """Returns a feature of byte strings. Raises as :meth:`numbers`."""
         return list(self._values(name, ("bytes_list",)))
 
     def is_bytes(self, name: str) -> bool:
         """Whether a feature's values are byte strings."""
-        return self._features[name].WhichOneof("kind") == "bytes_list"
+        return name in self and self._features[name].WhichOneof("kind") == "bytes_list"
 
     def plain(self, name: str) -> list[str | int | float]:
         """Returns a feature's values of whatever kind, JSON-ready; byte strings as text."""

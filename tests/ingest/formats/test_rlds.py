@@ -1,8 +1,12 @@
 import contextlib
+import dataclasses
 import json
 import pickle
+import re
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,10 +14,20 @@ from hypothesis import strategies as st
 
 from rsjax.ingest.episode import EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
-from rsjax.ingest.formats.keymap import MAPS
+from rsjax.ingest.formats.keymap import MAPS, KeyMap, key_map
+from rsjax.ingest.formats.rlds import RldsSource
 from tests.bridge import BRIDGE, needs_bridge
 from tests.ingest.formats.reading import read_first
-from tests.ingest.formats.toy_tfrecord import bridge_episode, encoded, picture, step, write_bridge, write_records
+from tests.ingest.formats.toy_tfrecord import (
+    bridge_episode,
+    encoded,
+    example,
+    features,
+    picture,
+    step,
+    write_bridge,
+    write_records,
+)
 
 
 def test_an_action_stands_with_the_frame_that_it_led_into(tmp_path: Path) -> None:
@@ -235,6 +249,114 @@ def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
     (tmp_path / "features.json").write_text("{")
     with pytest.raises(SourceError, match="features.json: cannot be read"):
         open_source("rlds", tmp_path)
+
+
+def image(*shape: int, dtype: str = "uint8") -> dict[str, Any]:
+    return {"image": {"shape": {"dimensions": [str(side) for side in shape]}, "dtype": dtype}}
+
+
+def tensor(*shape: int, dtype: str = "float32") -> dict[str, Any]:
+    return {"tensor": {"shape": {"dimensions": [str(side) for side in shape]} if shape else {}, "dtype": dtype}}
+
+
+def write_kitchen(folder: Path, observed: dict[str, Any], steps: dict[str, Any], values: dict[str, Any]) -> Path:
+    """A data set that no named key map is for, of one episode with the frames of ``bridge_episode``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    feature = features({"observation": features(observed)} | steps)
+    (folder / "features.json").write_text(json.dumps(features({"steps": {"sequence": {"feature": feature}}})))
+    return write_records(folder / "kitchen-train.tfrecord-00000-of-00001", [example(values)])
+
+
+OBSERVED = {
+    "front_rgb": image(8, 8, 3),
+    "front_depth": image(8, 8, 1, dtype="uint16"),
+    "wrist_rgb": image(8, 8, 3),
+    "eef_pose": tensor(6),
+    "clip_embedding": tensor(512),
+}
+STEPS = {"action": tensor(7), "language_instruction": {"text": {}}, "reward": tensor()}
+PICTURES = [encoded(picture(step(t))) for t in range(3)]
+VALUES = {
+    "steps/observation/front_rgb": PICTURES,
+    "steps/observation/wrist_rgb": PICTURES[::-1],
+    "steps/observation/eef_pose": np.arange(18.0),
+    "steps/action": np.repeat(np.arange(3) + 1.0, 7),
+    "steps/language_instruction": [b"fold"] * 3,
+}
+
+
+def depth_picture(metres: np.ndarray, floats: bool) -> bytes:
+    """As TFDS writes it: 16 bits, or four channels that are the bytes of a float32."""
+    if not floats:
+        return bytes(cv2.imencode(".png", np.round(metres * 1000).astype(np.uint16))[1])
+    pixels = metres.astype("<f4").view(np.uint8).reshape(*metres.shape, 4)
+    return bytes(cv2.imencode(".png", pixels[..., [2, 1, 0, 3]])[1])
+
+
+@pytest.mark.parametrize("kind", ["uint16", "float32", "tensor"])
+def test_a_proposed_key_map_reads_pictures_depth_and_texts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    metres = [np.full((8, 8), 1 + t / 4) for t in range(3)]
+    maps: Any = np.stack(metres).astype(np.float32)
+    if kind != "tensor":
+        maps = [depth_picture(each, kind == "float32") for each in metres]
+    described = tensor(8, 8, 1) if kind == "tensor" else image(8, 8, 1, dtype=kind)
+    values = VALUES | {"steps/observation/front_depth": maps}
+    write_kitchen(tmp_path / "set", OBSERVED | {"front_depth": described}, STEPS, values)
+    episode = read_first("rlds", tmp_path / "set", keys="auto", fps=4)
+    assert list(episode.cameras) == ["front_rgb", "wrist_rgb"] and list(episode.depth) == ["front_rgb"]
+    np.testing.assert_allclose(episode.depth["front_rgb"].read([2, 0])[:, 3, 3], [1.5, 1])
+    assert episode.depth["front_rgb"].read([0]).dtype == np.float32
+    assert (episode.fps, episode.task, episode.actions.shape) == (4, "fold", (3, 7))
+    assert episode.states is not None and episode.states.shape == (3, 6)
+    printed = capsys.readouterr().out
+    assert "taking delta actions by the key map" in printed and "--option keys=FILE" in printed
+    proposed = json.loads(printed[printed.index("{") : printed.rindex("}") + 1])
+    (tmp_path / "map.json").write_text(json.dumps(proposed))
+    again = read_first("rlds", tmp_path / "set", keys=str(tmp_path / "map.json"))
+    assert list(again.depth) == ["front_rgb"] and again.meta["actions"] == episode.meta["actions"]
+
+
+def test_parts_of_an_action_are_joined_in_the_proposal(tmp_path: Path) -> None:
+    parts = {"world_vector": tensor(3), "gripper": tensor(1), "terminate_episode": tensor(3, dtype="int32")}
+    values = {name: value for name, value in VALUES.items() if name != "steps/action"}
+    values |= {"steps/action/world_vector": np.ones(9), "steps/action/gripper": np.zeros(3)}
+    write_kitchen(tmp_path, {"front_rgb": image(8, 8, 3)}, {"action": features(parts)}, values)
+    assert read_first("rlds", tmp_path, keys="auto", fps=3).actions.shape == (3, 4)
+
+
+def test_what_cannot_be_proposed_is_refused(tmp_path: Path) -> None:
+    write_kitchen(tmp_path / "a", OBSERVED, STEPS, VALUES)
+    with pytest.raises(SourceError, match="how fast its pictures are; add --option fps="):
+        open_source("rlds", tmp_path / "a", keys="auto")
+    with pytest.raises(SourceError, match="choose one with keys: .*a .json file, or auto"):
+        open_source("rlds", tmp_path / "a")
+    with pytest.raises(EpisodeError, match="has no steps/observation/front_depth"):
+        read_first("rlds", tmp_path / "a", keys="auto", fps=5)
+    write_kitchen(tmp_path / "b", OBSERVED, {"reward": tensor()}, VALUES)
+    with pytest.raises(SourceError, match="no actions among observation/front_rgb"):
+        open_source("rlds", tmp_path / "b", keys="auto", fps=5)
+    (tmp_path / "b/features.json").unlink()
+    with pytest.raises(SourceError, match="no pictures among no features; write a key map as JSON"):
+        open_source("rlds", tmp_path / "b", keys="auto", fps=5)
+
+
+def test_the_example_of_the_page_is_a_key_map(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs/formats.md").read_text().split("## RLDS")[1]
+    (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "kitchen.json").write_text(block)
+    keys = key_map(str(tmp_path / "kitchen.json"), "", tmp_path)
+    assert keys.depth_scale == 0.001 and set(keys.depth) <= set(keys.cameras)
+    documented = set(re.findall(r"^\| `(\w+)`", text.split("\n## ")[0], re.MULTILINE))
+    assert documented == {field.name for field in dataclasses.fields(KeyMap)} - {"names"}
+
+
+@needs_bridge
+def test_the_proposal_for_bridge_is_its_named_map(tmp_path: Path) -> None:
+    proposed, named = (open_source("rlds", BRIDGE, keys=keys, fps=5) for keys in ("auto", "bridge"))
+    assert isinstance(proposed, RldsSource) and isinstance(named, RldsSource)
+    assert proposed.keys == named.keys
 
 
 @needs_bridge
