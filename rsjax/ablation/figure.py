@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rsjax.ablation.table import ABSENT, Row, best, shown_columns
-from rsjax.evaluation.registry import Metric
+from rsjax.ablation.table import Row, best, shown_columns
+from rsjax.evaluation.registry import ABSENT, Metric
 
 PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
 PANEL, LINE = 2.3, 0.42  # inches: width of a panel, height of a line

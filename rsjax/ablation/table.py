@@ -5,13 +5,13 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from rsjax.ablation.grid import Value, values_of
-from rsjax.evaluation.registry import Metric, metrics
+from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
 from rsjax.files import FileError, holder, is_held, read_json
 from rsjax.models import create_model
 from rsjax.pipeline.run import Run
@@ -19,7 +19,6 @@ from rsjax.training.log import read_log
 
 ERROR = "error.json"  # in the directory of a cell that failed
 FINAL_SHARE = 0.1  # of the logged steps, over which a loss term is averaged
-ABSENT = "–"
 LEGEND = (
     "Mean ± sample standard deviation over the finished seeds (of all). **Bold**: the best mean of its column, "
     "which may be chance. L: training loss terms, mean over the last tenth of the logged steps."
@@ -34,12 +33,14 @@ class Result:
     Attributes:
         reason: one line that says why there are no metrics.
         metrics: the numbers of ``metrics.json``, and ``loss_rgb`` … at the end of training.
+        reasons: why it has no number for a registered metric, by name.
     """
 
     run: Run
     state: State
     reason: str
     metrics: Mapping[str, float]
+    reasons: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -74,13 +75,18 @@ class Row:
         """``model.use_depth True, model.loss.use_keypoints False``."""
         return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as configured"
 
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why a result has no number for a metric, by name."""
+        return {name: reason for result in self.results for name, reason in result.reasons.items()}
+
 
 def read_result(run: Run) -> Result:
     """Reads a cell's state and metrics; damaged files count as unfinished, and nothing is changed."""
     if is_held(run.lock_file):
         return Result(run, "running", f"in {holder(run.lock_file)}", {})
     if (metrics := read_metrics(run)) is not None:
-        return Result(run, "finished", "", metrics)
+        return Result(run, "finished", "", metrics, read_reasons(run))
     with suppress(FileError):
         return Result(run, "failed", str(read_json(run.directory / ERROR).get("error")), {})
     if (run.directory / "config.json").exists():
@@ -100,6 +106,14 @@ def read_metrics(run: Run) -> dict[str, float] | None:
     numbers = {name: float(value) for name, value in saved.items() if isinstance(value, int | float)}
     terms = tuple(create_model(run.config).loss_weights)
     return numbers | final_terms(read_log(run.directory / "world_model"), terms)
+
+
+def read_reasons(run: Run) -> dict[str, str]:
+    """Returns why a run's ``metrics.json`` has no number for a metric, by name; empty where it does not say."""
+    with suppress(FileError):
+        reasons = read_json(run.directory / "metrics.json").get("reasons")
+        return {name: str(reason) for name, reason in reasons.items()} if isinstance(reasons, dict) else {}
+    return {}
 
 
 def final_terms(log: Sequence[Mapping[str, Any]], terms: Sequence[str]) -> dict[str, float]:
@@ -137,38 +151,44 @@ def best(rows: Sequence[Row], column: Metric) -> set[int]:
     return {i for i, mean in means.items() if mean == top} if len(means) > 1 else set()
 
 
-def shown_columns(rows: Sequence[Row]) -> tuple[Metric, ...]:
-    """Returns the registered metrics, and the loss terms of the last steps, that any row has a number for."""
+def shown_columns(rows: Sequence[Row], with_reasons: bool = False) -> tuple[Metric, ...]:
+    """Returns the registered metrics, and the loss terms of the last steps, that any row has a number for.
+
+    Args:
+        with_reasons: also those that a row only has a reason for.
+    """
     names = dict.fromkeys(name for row in rows for name in row.spreads)
     terms = [name for name in names if name.startswith("loss_")]
-    columns = [*metrics().values(), *(Metric(name, f"L_{name[5:]}", "", "lower", 3) for name in terms)]
-    return tuple(column for column in columns if column.name in names)
+    own = [metric for metric in metrics().values() if metric.column]
+    columns = [*own, *(Metric(name, f"L_{name[5:]}", "", "lower", 3) for name in terms)]
+    known = {*names, *(name for row in rows for name in row.reasons if with_reasons)}
+    return tuple(column for column in columns if column.name in known)
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """Returns the table, its legend, and every cell that is not in it with the reason."""
-    columns, fields = shown_columns(rows), list(rows[0].values)
+    """Returns the table, its legend, reasons for absent metrics, and every cell that is not in it with its reason."""
+    columns, fields, notes = shown_columns(rows, with_reasons=True), list(rows[0].values), Footnotes()
     texts = [[*fields, "seeds", *(column.heading for column in columns)]]
     for row in rows:
         finished = sum(result.state == "finished" for result in row.results)
         values = [str(value).replace("|", r"\|") for value in row.values.values()]
-        texts.append([*values, f"{finished}/{len(row.results)}", *(_number(row, column) for column in columns)])
+        texts.append([*values, f"{finished}/{len(row.results)}", *(_number(row, column, notes) for column in columns)])
     for x, column in enumerate(columns, start=len(fields) + 1):
         for y in best(rows, column):
             texts[y + 1][x] = f"**{texts[y + 1][x]}**"
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     texts.insert(1, ["-" * width for width in widths])
     lines = [" | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) for line in texts]
-    parts = ["\n".join(f"| {line} |" for line in lines), LEGEND]
+    parts = ["\n".join(f"| {line} |" for line in lines), LEGEND, *notes.texts]
     absent = [result for row in rows for result in row.results if result.state != "finished"]
     if absent:
         parts.append("Not in the table:\n\n" + "\n".join(f"- {r.name}: {r.state} ({r.reason})" for r in absent))
     return "\n\n".join(parts) + "\n"
 
 
-def _number(row: Row, column: Metric) -> str:
+def _number(row: Row, column: Metric, notes: Footnotes) -> str:
     if column.name not in row.spreads:
-        return ABSENT
+        return ABSENT + notes.mark(row.reasons.get(column.name))
     return " ± ".join(f"{x:.{column.decimals}f}" for x in row.spreads[column.name][:2] if x is not None)
 
 
@@ -194,5 +214,11 @@ def as_json(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _cell_json(result: Result) -> dict[str, Any]:
-    seed, metrics = result.run.config.train.seed, dict(result.metrics)
-    return {"name": result.name, "seed": seed, "state": result.state, "reason": result.reason, "metrics": metrics}
+    return {
+        "name": result.name,
+        "seed": result.run.config.train.seed,
+        "state": result.state,
+        "reason": result.reason,
+        "metrics": dict(result.metrics),
+        "reasons": dict(result.reasons),
+    }

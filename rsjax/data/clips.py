@@ -61,7 +61,15 @@ class Clips:
         """Frames and depth; NaN in clips without depth."""
         if not self.has_depth.any():
             return Video(self.rgb)
-        return Video(self.rgb, np.where(self.has_depth[:, None, None, None], self.depth, np.float32(np.nan)))
+        return self._video(self.has_depth)
+
+    @property
+    def metric_video(self) -> Video:
+        """Frames and depth in metres; NaN in clips without."""
+        return self._video(self.metric)
+
+    def _video(self, has_depth: Bool[np.ndarray, " B"]) -> Video:
+        return Video(self.rgb, np.where(has_depth[:, None, None, None], self.depth, np.float32(np.nan)))
 
 
 def spread(source: Sized, count: int) -> list[int]:

@@ -3,6 +3,7 @@
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,25 +12,47 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.clip import Video
+from rsjax.config import EvalConfig
 from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import decode, encode
 from rsjax.data.store import Store, StoreError
+from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
 from rsjax.evaluation.metrics import delta_psnr
-from rsjax.evaluation.registry import Metric, Scene, metrics
+from rsjax.evaluation.registry import Metric, Scene, Unavailable, metrics
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
+from rsjax.tokenizers.lpips import load_lpips
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores by name, and arrays of the clips in the report (with a leading axis over clips)."""
+    """The result of an evaluation.
+
+    Attributes:
+        metrics: scores by name.
+        reasons: why a registered metric has no score, by name.
+        shown: arrays of the clips in the report, with a leading axis over clips.
+    """
 
     metrics: dict[str, float]
+    reasons: dict[str, str]
     shown: dict[str, np.ndarray]
+
+
+def check_files(settings: EvalConfig) -> None:
+    """Checks the files of weights that metrics need, so that a run does not train for hours first.
+
+    Raises:
+        UserError: one is missing, damaged or of another network.
+    """
+    for path, net in ((settings.lpips_alex_weights, "alexnet"), (settings.lpips_vgg_weights, "vgg16")):
+        if path:
+            load_lpips(path, net)
+    choose_estimator(settings)
 
 
 def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
@@ -41,21 +64,25 @@ def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
 
     Raises:
         StoreError: a test clip is damaged.
+        UserError: a file of weights is missing, damaged or of another network, or the depth estimator cannot run.
     """
+    check_files(trained.config.eval)
     source, config = store.source("test"), trained.config
     numbers = spread(source, config.eval.clips)
     clips = Clips.stacked([source[number] for number in numbers], numbers)
-    reconstruction = trained.model.reconstruct(trained.assets, clips.video)
-    videos = _generate_all(trained, clips, store)
-    own = videos.pop("own")[0]
+    scenes = _scenes(trained, clips, _generate_all(trained, clips, store))
 
     scores: dict[str, float] = {}
+    reasons: dict[str, str] = {}
     for metric in metrics().values():
-        scores |= _score(metric, clips, own, videos, reconstruction, config.prompt_frames)
+        try:
+            scores |= _score(metric, scenes)
+        except Unavailable as reason:
+            reasons[metric.name] = str(reason)
     scores["clips"] = float(len(clips.rgb))
     if (share := store.manifest.get("success_share")) is not None:
         scores["success_share"] = float(share)
-    return Evaluation(scores, _shown(clips, reconstruction, own, videos["other"][0], config.eval.report_clips))
+    return Evaluation(scores, reasons, _shown(clips, scenes, config.eval.report_clips))
 
 
 def _generate_all(trained: TrainedModel, clips: Clips, store: Store) -> dict[str, list[Video]]:
@@ -100,28 +127,34 @@ def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: b
     return Video(rgb, np.concatenate(unknown)[: len(actions)])
 
 
-def _score(
-    metric: Metric,
-    clips: Clips,
-    own: Video,
-    alternatives: dict[str, list[Video]],
-    reconstruction: Video | None,
-    prompt_frames: int,
-) -> dict[str, float]:
-    """Scores the prediction and both baselines with a metric; empty if the metric's data are missing."""
-    if "depth" in metric.needs and (own.depth is None or not clips.metric.any()):
-        return {}
-    rows = clips.metric if "depth" in metric.needs else np.ones(len(clips.rgb), bool)
-    others = {kind: [video[rows] for video in videos] for kind, videos in alternatives.items()}
-    scene = Scene(clips.video[rows], own[rows], prompt_frames, others)
-    scores = _flat(metric, scene, "")
-    if {"other", "uniform"} & set(metric.needs):
+def _scenes(trained: TrainedModel, clips: Clips, videos: dict[str, list[Video]]) -> dict[str, Scene]:
+    """Returns the prediction's scene as "", and those of both baselines by their suffix of names."""
+    settings, prompt, truth = trained.config.eval, trained.config.prompt_frames, clips.metric_video
+    alternatives = dict(videos)
+    shown = {"": alternatives.pop("own")[0], "_repeat_first": _repeat_first(truth, prompt)}
+    if (reconstruction := trained.model.reconstruct(trained.assets, clips.video)) is not None:
+        shown["_tokenizer"] = reconstruction
+    estimator = choose_estimator(settings)
+    rgb = {suffix: video.rgb for suffix, video in shown.items()}
+    estimated = estimate_depth(estimator, truth.rgb, rgb) if estimator else {}
+    return {
+        suffix: Scene(truth, video, prompt, {} if suffix else alternatives, estimated.get(suffix), settings)
+        for suffix, video in shown.items()
+    }
+
+
+def _score(metric: Metric, scenes: dict[str, Scene]) -> dict[str, float]:
+    """Scores the prediction and both baselines with a metric.
+
+    Raises:
+        Unavailable: the prediction cannot be scored. A baseline that cannot is left out.
+    """
+    scores = _flat(metric, scenes[""], "")
+    if metric.needs:
         return scores | {f"{metric.name}_repeat_first": 0.0}  # this baseline ignores actions
-    scores |= _flat(
-        metric, Scene(scene.truth, _repeat_first(scene.truth, prompt_frames), prompt_frames), "_repeat_first"
-    )
-    if reconstruction is not None:
-        scores |= _flat(metric, Scene(scene.truth, reconstruction[rows], prompt_frames), "_tokenizer")
+    for suffix in filter(None, scenes):
+        with suppress(Unavailable):
+            scores |= _flat(metric, scenes[suffix], suffix)
     return scores
 
 
@@ -141,9 +174,9 @@ def _repeat_first(video: Video, prompt_frames: int) -> Video:
     return Video(np.repeat(last.rgb, frames, 1), None if last.depth is None else np.repeat(last.depth, frames, 1))
 
 
-def _shown(clips: Clips, reconstruction: Video | None, own: Video, other: Video, count: int) -> dict[str, np.ndarray]:
+def _shown(clips: Clips, scenes: dict[str, Scene], count: int) -> dict[str, np.ndarray]:
     """Returns arrays of the clips in the report: successes and failures alternate, in the split's order."""
-    ends = clips.success[:, -1]
+    ends, own, other = clips.success[:, -1], scenes[""].prediction, scenes[""].alternatives["other"][0]
     good, bad = (list(np.flatnonzero(ends == outcome)) for outcome in (True, False))
     turns = [queue.pop(0) for _ in ends for queue in (good, bad) if queue]
     rows = np.array(turns[:count])
@@ -159,14 +192,14 @@ def _shown(clips: Clips, reconstruction: Video | None, own: Video, other: Video,
         "visible": clips.visible[rows],
         "success": ends[rows],
     }
-    if reconstruction is not None:
-        arrays["reconstruction"] = reconstruction.rgb[rows]
+    if "_tokenizer" in scenes:
+        arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
     return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
 
 
 def save(path: Path, result: Evaluation) -> None:
     """Writes a result atomically."""
-    write_atomically(path, encode({"metrics": result.metrics} | result.shown))
+    write_atomically(path, encode({"metrics": result.metrics, "reasons": result.reasons} | result.shown))
 
 
 def load(path: Path) -> Evaluation:
@@ -179,4 +212,4 @@ def load(path: Path) -> Evaluation:
         record = decode(path.read_bytes())
     except ValueError as error:
         raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
-    return Evaluation(record.pop("metrics"), record)
+    return Evaluation(record.pop("metrics"), record.pop("reasons"), record)

@@ -5,34 +5,65 @@ A metric is a function in a file under ``rsjax/evaluation/metrics``, registered 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from rsjax.clip import Video
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, EvalConfig
 
 PerClip: TypeAlias = Float[np.ndarray, " B"]
 Scores: TypeAlias = PerClip | dict[str, PerClip]  # a dict has several scores by suffix; "" is the metric itself
-# Depth in metres; videos generated under another clip's actions, or under uniform random actions.
-Need = Literal["depth", "other", "uniform"]
+# Videos generated under another clip's actions, or under uniform random actions.
+Need = Literal["other", "uniform"]
+T = TypeVar("T")
+
+
+class Unavailable(Exception):
+    """A metric cannot be computed. The message is the reason that metrics.json and the tables give for its absence."""
 
 
 @dataclass(frozen=True)
+class EstimatedDepth:
+    """Depth of B clips that one estimator computed from frames.
+
+    Attributes:
+        truth: of the recorded frames, > 0, in metres or relative (see :mod:`rsjax.ingest.annotators.depth`).
+        prediction: of the generated frames, in the same unit.
+    """
+
+    truth: Float[np.ndarray, "B T H W"]
+    prediction: Float[np.ndarray, "B T H W"]
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Inputs of a metric: B clips, of which the first ``prompt_frames`` frames are the prompt.
 
     Attributes:
-        truth: the recorded clips.
+        truth: the recorded clips, with depth where it is in metres.
         prediction: videos generated under their own actions.
         alternatives: videos generated under other actions, by kind; one for each draw of actions.
+        estimated: depth estimated from the frames; None without an estimator.
+        settings: with the paths of weights.
     """
 
     truth: Video
     prediction: Video
     prompt_frames: int = 1
     alternatives: Mapping[str, Sequence[Video]] = field(default_factory=dict)
+    estimated: EstimatedDepth | None = None
+    settings: EvalConfig = field(default_factory=EvalConfig)
+    _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def shared(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Returns ``function(self, *arguments)``, which is computed once for all metrics that share it."""
+        key = (function, *arguments)
+        if key not in self._shared:
+            self._shared[key] = function(self, *arguments)
+        result: T = self._shared[key]
+        return result
 
 
 @dataclass(frozen=True)
@@ -45,10 +76,12 @@ class Metric:
         unit: such as "dB"; empty for a pure number.
         better: whether higher or lower values are better.
         decimals: digits after the decimal point.
-        needs: data that it needs beside frames.
+        needs: videos that it needs beside the prediction.
         watch: whether it is also computed during training.
         interval: whether its bootstrap interval is reported.
-        function: scores a scene, one number per clip; None for a number that is not computed from videos.
+        column: whether tables have a column for it.
+        function: scores a scene, one number per clip, or raises :class:`Unavailable`; None for a number that is not
+            computed from videos.
     """
 
     name: str
@@ -59,6 +92,7 @@ class Metric:
     needs: tuple[Need, ...] = ()
     watch: bool = False
     interval: bool = True
+    column: bool = True
     function: Callable[[Scene], Scores] | None = None
 
     @property
@@ -66,6 +100,32 @@ class Metric:
         """The heading of a column: title, unit, and an arrow towards better values."""
         unit = f", {self.unit}" if self.unit else ""
         return f"{self.title}{unit} {'↑' if self.better == 'higher' else '↓'}"
+
+
+ABSENT = "–"  # in tables, in the place of a number
+_SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+class Footnotes:
+    """Numbers the reasons for absent metrics in the order in which a table mentions them.
+
+    Attributes:
+        texts: the footnotes mentioned so far.
+    """
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, str] = {}
+
+    def mark(self, reason: str | None) -> str:
+        """Returns a reason's mark, such as "²"; "" without a reason."""
+        if not reason:
+            return ""
+        return self._numbers.setdefault(reason, str(len(self._numbers) + 1).translate(_SUPERSCRIPT))
+
+    @property
+    def texts(self) -> list[str]:
+        """The reasons with their marks, in order."""
+        return [f"{mark} {reason}" for reason, mark in self._numbers.items()]
 
 
 _METRICS: dict[str, Metric] = {}
@@ -81,6 +141,7 @@ def metric(
     needs: tuple[Need, ...] = (),
     watch: bool = False,
     interval: bool = True,
+    column: bool = True,
 ) -> Callable[[Callable[[Scene], Scores]], Callable[[Scene], Scores]]:
     """Registers a function as a metric; the arguments are the fields of :class:`Metric`.
 
@@ -91,7 +152,7 @@ def metric(
     def register(function: Callable[[Scene], Scores]) -> Callable[[Scene], Scores]:
         if name in _METRICS:
             raise ConfigError(f"two metrics are named {name!r}; rename one of them")
-        _METRICS[name] = Metric(name, title, unit, better, decimals, needs, watch, interval, function)
+        _METRICS[name] = Metric(name, title, unit, better, decimals, needs, watch, interval, column, function)
         return function
 
     return register
@@ -101,5 +162,6 @@ def metrics() -> dict[str, Metric]:
     """Returns all registered metrics by name, in the order of tables: frames, depth, actions, then others."""
     import rsjax.evaluation.metrics  # noqa: F401 - registers the built-in metrics
 
-    first = ("psnr", "ssim", "depth_absrel", "depth_delta1", "depth_delta2", "delta_psnr", "delta_psnr_uniform")
+    depth = [name for name in _METRICS if name.startswith("depth_")]
+    first = ("psnr", "ssim", "lpips_alex", "lpips_vgg", *depth, "delta_psnr", "delta_psnr_uniform")
     return {name: _METRICS[name] for name in (*first, *(name for name in _METRICS if name not in first))}

@@ -79,6 +79,8 @@ def _check_starts(run: Run) -> None:
         starting(create(cfg), loop.start_from, name)
         if loop.wandb:
             find_wandb()
+    if not run.finished("evaluation"):
+        evaluation.check_files(cfg.eval)
 
 
 def _collecting(run: Run) -> str:

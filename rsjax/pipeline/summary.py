@@ -30,6 +30,7 @@ def write_summary(run: Run, command: str) -> None:
     report = Report(
         preset=cfg.name,
         metrics=metrics,
+        reasons=result.reasons,
         clips=[_figure(result.shown, i, cfg) for i in range(len(result.shown["clip"]))],
         logs={stage.replace("_", " "): read_log(run.directory / stage) for stage in TRAINED},
         config=to_dict(cfg),
@@ -39,7 +40,7 @@ def write_summary(run: Run, command: str) -> None:
         show_targets=cfg.name == "tiny" and not cfg.data.key,  # targets are for the simulated clips
     )
     write_report(run.output("report"), report)
-    write_json(run.directory / "metrics.json", metrics)
+    write_json(run.directory / "metrics.json", metrics | dict.fromkeys(result.reasons) | {"reasons": result.reasons})
 
 
 def _figure(shown: dict[str, np.ndarray], row: int, config: Config) -> ClipFigure:

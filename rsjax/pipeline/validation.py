@@ -4,6 +4,7 @@ Validation does not affect training: it shares no random state with it.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,7 +19,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
 from rsjax.data.store import RecordSource, Store
 from rsjax.evaluation.metrics.psnr import psnr
-from rsjax.evaluation.registry import Scene, metrics
+from rsjax.evaluation.registry import Scene, Unavailable, metrics
 from rsjax.models.base import Assets, WorldModel, create_model
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load_tokenizer
@@ -94,18 +95,12 @@ class WorldModelValidation:
 
 def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
     """Computes the metrics that are watched during training."""
-    scores = {}
+    scores, scene = {}, Scene(clips.metric_video, made, prompt_frames)
     for metric in metrics().values():
-        needs_depth = "depth" in metric.needs
-        if (
-            not metric.watch
-            or metric.function is None
-            or (needs_depth and (made.depth is None or not clips.metric.any()))
-        ):
-            continue
-        rows = clips.metric if needs_depth else np.ones(len(clips.rgb), bool)
-        scored = metric.function(Scene(clips.video[rows], made[rows], prompt_frames))
-        scores[metric.name] = float(np.mean(scored[""] if isinstance(scored, dict) else scored))
+        if metric.watch and metric.function is not None:
+            with suppress(Unavailable):
+                scored = metric.function(scene)
+                scores[metric.name] = float(np.mean(scored[""] if isinstance(scored, dict) else scored))
     return scores
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from rsjax.evaluation.registry import metrics
+from rsjax.evaluation.registry import ABSENT, Footnotes, metrics
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.report.curves import curves_svg
@@ -28,6 +28,16 @@ _SCORE_ROWS = (
     ("_repeat_first", "first frame repeated"),
     ("_tokenizer", "tokenizer's reconstruction"),
 )
+_DEPTH_ROWS = (
+    ("", "depth branch, in metres"),
+    ("_median_branch", "depth branch, median scale"),
+    ("_affine_disparity_branch", "depth branch, scale and shift of 1/depth"),
+    ("_l1_scale_branch", "depth branch, L1 scale"),
+    ("_median_estimator", "estimator, median scale"),
+    ("_affine_disparity_estimator", "estimator, scale and shift of 1/depth"),
+    ("_l1_scale_estimator", "estimator, L1 scale"),
+)
+_DEPTH_COLUMNS = (("depth_absrel{}", "AbsRel ↓", 4), ("depth_delta1{}", "δ₁ ↑", 3), ("depth_delta2{}", "δ₂ ↑", 3))
 _CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
 _CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
 
@@ -40,6 +50,7 @@ class Report:
         preset: the run's preset.
         metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` bound the 95 % interval of ``name``. The page
             lists all of them, and tabulates those of its columns.
+        reasons: why a metric is absent, by name; footnotes of its cells.
         clips: test clips; the first ones head the page.
         logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
         config: nested settings, JSON-ready.
@@ -51,6 +62,7 @@ class Report:
 
     preset: str
     metrics: Mapping[str, float]
+    reasons: Mapping[str, str] = field(default_factory=dict)
     clips: Sequence[ClipFigure] = ()
     logs: Mapping[str, Sequence[dict[str, Any]]] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
@@ -75,14 +87,16 @@ def write_report(path: Path, report: Report) -> None:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["duration"] = duration
+    columns = [(f"{m.name}{{}}", m.heading, m.decimals) for m in metrics().values() if m.column]
+    notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
         headline=_HEADLINE_CLIPS,
         clips=[_clip_pictures(clip) for clip in report.clips],
-        scores=_table(
-            report.metrics, _SCORE_ROWS, [(f"{m.name}{{}}", m.heading, m.decimals) for m in metrics().values()]
-        ),
-        control=_table(report.metrics, _CONTROL_ROWS, _CONTROL_COLUMNS),
+        scores=_table(report, notes, _SCORE_ROWS, columns),
+        depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
+        control=_table(report, notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
+        notes=notes.texts,
         verdicts=judge(report.metrics) if report.show_targets else [],
         curves={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
@@ -101,26 +115,31 @@ def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
     }
 
 
-def _table(metrics: Mapping[str, float], rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
-    """Returns the header and the cells (value, interval) of the rows and columns with at least one metric."""
-    columns = [column for column in columns if any(column[0].format(suffix) in metrics for suffix, _ in rows)]
-    rows = [row for row in rows if any(key.format(row[0]) in metrics for key, _, _ in columns)]
-    if not columns:
+def _table(report: Report, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
+    """Returns the header and the cells of the rows and columns with a metric or a reason; None without any metric."""
+    if not any(key.format(suffix) in report.metrics for key, _, _ in columns for suffix, _ in rows):
         return None
+    known = {*report.metrics, *report.reasons}
+    columns = [column for column in columns if any(column[0].format(suffix) in known for suffix, _ in rows)]
+    rows = [row for row in rows if any(key.format(row[0]) in known for key, _, _ in columns)]
     return {
         "header": [header for _, header, _ in columns],
         "rows": [
-            {"label": label, "cells": [_cell(metrics, key.format(suffix), digits) for key, _, digits in columns]}
+            {"label": label, "cells": [_cell(report, notes, key, suffix, digits) for key, _, digits in columns]}
             for suffix, label in rows
         ],
     }
 
 
-def _cell(metrics: Mapping[str, float], key: str, digits: int) -> dict[str, str]:
-    bounds = [metrics.get(f"{key}_{side}") for side in ("low", "high")]
-    value = metrics.get(key)
+def _cell(report: Report, notes: Footnotes, key: str, suffix: str, digits: int) -> dict[str, str]:
+    name = key.format(suffix)
+    value = report.metrics.get(name)
+    if value is None:
+        reason = report.reasons.get(name) or report.reasons.get(key.format(""))
+        return {"value": ABSENT + notes.mark(reason), "interval": ""}
+    bounds = [report.metrics.get(f"{name}_{side}") for side in ("low", "high")]
     interval = "" if None in bounds else " – ".join(f"{bound:.{digits}f}" for bound in bounds)
-    return {"value": "–" if value is None else f"{value:.{digits}f}", "interval": interval}
+    return {"value": f"{value:.{digits}f}", "interval": interval}
 
 
 def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tuple[str, Any]]]:

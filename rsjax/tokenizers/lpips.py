@@ -88,8 +88,11 @@ def lpips(params: dict[str, Any], one: Float[Array, "*B H W 3"], other: Float[Ar
     return distance.reshape(batch)
 
 
-def load_lpips(path: str | Path) -> dict[str, Any]:
+def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
     """Loads the weights of a file as a nested dict, such as ``["backbone"]["0"]["weight"]``.
+
+    Args:
+        wanted_net: the network that the file has to be of; any if empty.
 
     Raises:
         LpipsError: the file is missing or damaged, or a tensor is missing, unexpected or of another shape.
@@ -105,6 +108,8 @@ def load_lpips(path: str | Path) -> dict[str, Any]:
         raise LpipsError(f"{path}: {instead}") from error
     if net not in NETS:
         raise LpipsError(f"{path}: its metadata name the net {net!r}, not one of {', '.join(NETS)}; make it again")
+    if wanted_net not in ("", net):
+        raise LpipsError(f"{path}: these LPIPS weights are of {net}, not of {wanted_net}; name the other file")
     wanted = lpips_shapes(net)
     for name in sorted(wanted.keys() | tensors.keys()):
         shape = tensors[name].shape if name in tensors else "missing"

@@ -27,18 +27,16 @@ from rsjax.ablation.table import (
 from rsjax.evaluation.registry import metrics
 from tests.ablation import toy
 
-COLUMNS = tuple(metrics().values())
+COLUMNS = tuple(column for column in metrics().values() if column.column)
 PSNR = metrics()["psnr"]
 GRID = toy.grid("model.use_depth=True,False", "model.loss.use_keypoints=True,False", seeds=(0, 1, 2))
 RUNS = list(runs_of(GRID, Path("out"), Path("data")).values())
 
 
-def rows_of(metrics: Mapping[int, Mapping[str, float]]) -> list[Row]:
+def rows_of(metrics: Mapping[int, Mapping[str, float]], reasons: Mapping[int, dict[str, str]] = {}) -> list[Row]:
     """The table of cells of which these are finished with their metrics, and the others are not."""
-    results = (
-        Result(run, "finished", "", metrics[i]) if i in metrics else Result(run, "missing", "its reason", {})
-        for i, run in enumerate(RUNS)
-    )
+    finished = {i: Result(RUNS[i], "finished", "", numbers, reasons.get(i, {})) for i, numbers in metrics.items()}
+    results = (finished.get(i) or Result(run, "missing", "its reason", {}) for i, run in enumerate(RUNS))
     return tabulate(results, GRID.fields)
 
 
@@ -102,6 +100,21 @@ def test_markdown_shows_means_spreads_counts_absences_and_the_best() -> None:
     assert len({len(line) for line in text.splitlines() if line.startswith("|")}) == 1
     assert text.count("- model.use_depth=") == 9
     assert "- model.use_depth=False,model.loss.use_keypoints=False,seed=2: missing (its reason)" in text
+
+
+def test_an_absent_metric_has_its_reason_as_a_footnote() -> None:
+    metrics = {0: {"psnr": 20.0, "lpips_alex": 0.1}, 4: {"psnr": 21.0}, 2: {"psnr": 22.0, "depth_absrel": 0.3}}
+    weights = dict.fromkeys(("lpips_alex", "lpips_vgg", "depth_absrel_l1_scale_estimator"), "no weights")
+    rows = rows_of(metrics, {0: {"depth_absrel": "no depth"}, 2: weights, 4: {"depth_absrel": "no depth"}})
+    text = as_markdown(rows)
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert lines[0][3:] == ["PSNR, dB ↑", "LPIPS, AlexNet ↓", "LPIPS, VGG ↓", "depth AbsRel ↓"]
+    assert lines[2][3:] == ["20.50 ± 0.71", "0.1000", "–", "–¹"]
+    assert lines[3][3:] == ["–"] * 4, "not finished"
+    assert lines[4][3:] == ["**22.00**", "–²", "–²", "0.3000"]
+    assert "\n\n¹ no depth\n\n² no weights\n" in text
+    assert [column.name for column in shown_columns(rows)] == ["psnr", "lpips_alex", "depth_absrel"]
+    assert as_json(rows)["cells"][0]["reasons"] == {"depth_absrel": "no depth"}
 
 
 def test_a_whole_table_names_no_cell() -> None:

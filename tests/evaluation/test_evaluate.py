@@ -10,6 +10,7 @@ from rsjax.data.store import Store, StoreError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, evaluate
 from rsjax.evaluation.metrics.delta_psnr import other_clips
+from rsjax.evaluation.registry import metrics
 from rsjax.models.trained import TrainedModel
 from tests.pipeline import toy
 
@@ -89,6 +90,12 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
     assert set(deltas.values()) == {0.0}
 
 
+def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> None:
+    assert {name for name in metrics() if name in result.metrics} == metrics().keys() - result.reasons.keys()
+    assert {name for name in result.reasons if "estimator" not in name} == {"lpips_alex", "lpips_vgg"}
+    assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
+
+
 def test_shown_clips_are_successes_and_failures_by_turns(result: Evaluation) -> None:
     assert result.shown["clip"].tolist() == [2, 0, 4]
     assert result.shown["success"].tolist() == [True, False, True]
@@ -101,7 +108,7 @@ def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, t
     path = tmp_path / "result.msgpack"
     evaluation.save(path, result)
     again = evaluation.load(path)
-    assert again.metrics == result.metrics
+    assert (again.metrics, again.reasons) == (result.metrics, result.reasons)
     for name, array in result.shown.items():
         np.testing.assert_array_equal(again.shown[name], array)
     path.write_bytes(path.read_bytes()[:-1])

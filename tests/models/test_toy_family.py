@@ -56,7 +56,9 @@ def test_a_toy_family_trains_generates_and_is_evaluated(config: Config, tmp_path
 
     metrics = json.loads((run.directory / "metrics.json").read_text())
     assert {"psnr", "ssim", "delta_psnr", "drift", "drift_low", "drift_repeat_first"} <= metrics.keys()
-    assert not {name for name in metrics if "depth" in name or name.endswith("_tokenizer")}
+    assert not {name for name, value in metrics.items() if name.endswith("_tokenizer")}
+    assert {value for name, value in metrics.items() if "depth" in name} == {None}
+    assert metrics["reasons"]["depth_absrel"] == "the model generates no depth"
     assert "brightness drift, levels ↓" in (run.directory / "report.html").read_text()
     rows = [json.loads(line) for line in (run.directory / "world_model" / "log.jsonl").read_text().splitlines()]
     assert any("validation/psnr" in row for row in rows)

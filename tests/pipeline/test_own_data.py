@@ -158,17 +158,11 @@ def test_depth_is_scored_where_clips_have_it_and_nothing_else_changes(tmp_path: 
 
 
 def test_a_store_without_any_depth_has_no_scores_of_it(tmp_path: Path) -> None:
-    whole = toy.store(tmp_path / "whole")
-    splits = {
-        name: [source[i] | {"depth": None} for i in range(len(source))]
-        for name in whole.splits
-        if (source := whole.source(name))
-    }
-    meta = {name: value for name, value in whole.manifest.items() if name not in ("splits", "format", "kind")}
-    write_store(tmp_path / "blind", "clips", splits, meta | {"depth_range": None})
-    blind = open_store(tmp_path / "blind")
+    blind = toy.store(tmp_path / "blind", depth=False)
     found = evaluation.evaluate(toy.trained(blind), blind)
     assert not [name for name in found.metrics if "depth" in name]
+    reasons = {reason for name, reason in found.reasons.items() if name.startswith("depth") and "estimator" not in name}
+    assert reasons == {"no test clip has depth in metres"}
     assert "predicted_depth" not in found.shown
     assert np.isfinite(found.metrics["psnr"])
 

@@ -9,6 +9,7 @@ import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -40,7 +41,7 @@ def files(run: Path) -> dict[Path, tuple[int, int]]:
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in found}
 
 
-def metrics(run: Path) -> dict[str, float]:
+def metrics(run: Path) -> dict[str, Any]:
     return json.loads((run / "metrics.json").read_text())
 
 
@@ -60,6 +61,9 @@ def test_the_whole_job_leaves_a_report_and_metrics(debug: Path) -> None:
     assert output.rstrip().splitlines()[-1].endswith("report.html")
     assert not re.search(r"robosuite|macro|UserWarning|DeprecationWarning|Traceback", output), output
     scores = metrics(debug)
+    reasons = scores.pop("reasons")
+    assert {"lpips_alex", "depth_absrel_median_estimator"} <= reasons.keys()
+    assert [scores.pop(name) for name in reasons] == [None] * len(reasons)
     assert set(WANTED.split()) <= scores.keys()
     assert all(isinstance(value, float) and np.isfinite(value) for value in scores.values())
     seconds = [json.loads((debug / stage / "stage.json").read_text())["seconds"] for stage in STAGES[:-1]]
@@ -67,6 +71,7 @@ def test_the_whole_job_leaves_a_report_and_metrics(debug: Path) -> None:
     assert not list(debug.rglob("*.tmp")) + list(debug.rglob("*.building"))
     page = (debug / "report.html").read_text()
     assert "test clip" in page
+    assert "–¹" in page and f"¹ {reasons['lpips_alex']}" in page
     assert "data:image/webp;base64," in page
 
 
@@ -147,8 +152,9 @@ def test_a_part_that_is_switched_off_is_gone_and_the_rest_runs(
     assert skipped(done.stdout) == list(STAGES[:3])
     before, after = (read_log(place / "world_model")[-1].keys() for place in (debug, run))
     assert before - after == gone
-    assert scores_gone == {name for name in scores_gone if name not in metrics(run)}
-    assert metrics(debug).keys() - metrics(run).keys() >= scores_gone
+    without = metrics(run)
+    assert scores_gone == {name for name in scores_gone if without[name] is None and without["reasons"][name]}
+    assert all(metrics(debug)[name] is not None for name in scores_gone)
     assert "test clip" in (run / "report.html").read_text()
 
 

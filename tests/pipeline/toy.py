@@ -58,13 +58,15 @@ def clip(number: int, success: bool = False) -> Clip:
     )
 
 
-def store(path: Path) -> Store:
+def store(path: Path, depth: bool = True) -> Store:
     """A store of clips."""
     train, test = [clip(i) for i in range(TRAIN)], [clip(TRAIN + i, SUCCESS[i]) for i in range(TEST)]
     actions = np.concatenate([c.actions[1:] for c in train])
+    if not depth:
+        train, test = ([replace(c, depth=None) for c in clips] for clips in (train, test))
     meta = {
         "key": "toy",
-        "depth_range": list(DEPTH_RANGE),
+        "depth_range": list(DEPTH_RANGE) if depth else None,
         "action_mean": actions.mean(0).tolist(),
         "action_std": actions.std(0).tolist(),
         "success_share": 0.25,

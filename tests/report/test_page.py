@@ -108,6 +108,17 @@ def test_tables_show_each_number_in_its_row(full_page):
     assert "episode <0>" in page.text
 
 
+def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
+    weights = dict.fromkeys(("lpips_alex", "depth_absrel_median_estimator"), "no <weights>")
+    report = Report("tiny", _METRICS | {"depth_absrel_median_branch": 0.0123}, weights | {"depth_delta1": "no depth"})
+    write_report(tmp_path / "r.html", report)
+    page = _Page(tmp_path / "r.html")
+    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "–¹", "0.0213", "–²", "–¹", "2.75"] in page.cells
+    assert ["depth branch, median scale", "0.0123", "–²"] in page.cells
+    assert ["estimator, median scale", "–¹", "–²"] in page.cells
+    assert "¹ no <weights>." in page.text and "² no depth." in page.text
+
+
 def test_missing_parts_are_left_out(tmp_path, make_clip):
     write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")

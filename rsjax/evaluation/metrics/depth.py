@@ -5,15 +5,24 @@ estimator is known up to a scale, or a scale and a shift, which are fitted to th
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rsjax.evaluation.registry import Scene, metric
+from rsjax.evaluation.registry import PerClip, Scene, Unavailable, metric
 
 Alignment = Literal["none", "median", "affine_disparity", "l1_scale"]
 DepthSource = Literal["branch", "estimator"]
+Measure = Literal["absrel", "delta1", "delta2"]
+Depths: TypeAlias = Float[np.ndarray, "B T H W"]
+
+# Title, better values and decimals of each score.
+_MEASURES: dict[Measure, tuple[str, Literal["higher", "lower"], int]] = {
+    "absrel": ("depth AbsRel", "lower", 4),
+    "delta1": ("depth δ₁", "higher", 3),
+    "delta2": ("depth δ₂", "higher", 3),
+}
 
 _MIN_PREDICTION = 1e-3
 _L1_STEPS = 10
@@ -60,34 +69,53 @@ class DepthScores:
     delta2: Float[np.ndarray, " B"]
     weight: Float[np.ndarray, " B"]
 
-    def mean(self) -> dict[str, float]:
-        """Returns the data set's scores, by metric name as in :func:`result_key`."""
-        values = {"absrel": self.abs_rel, "delta1": self.delta1, "delta2": self.delta2}
-        return {name: float(np.average(value, weights=self.weight)) for name, value in values.items()}
+    def per_clip(self, measure: Measure) -> Float[np.ndarray, " B"]:
+        """Returns each video's score, such that their plain mean is the data set's score."""
+        scores = {"absrel": self.abs_rel, "delta1": self.delta1, "delta2": self.delta2}[measure]
+        return scores * (self.weight / self.weight.mean())
 
 
-@metric("depth_absrel", "depth AbsRel", better="lower", decimals=4, needs=("depth",), watch=True)
-def absrel_score(scene: Scene) -> Float[np.ndarray, " B"]:
-    """Scores AbsRel of the depth branch in metres, unaligned."""
-    return _branch_scores(scene).abs_rel
+def _register(measure: Measure, alignment: Alignment, source: DepthSource) -> None:
+    """Registers one score under one protocol; tables have a column for metres, and for WorldArena's protocol."""
+    title, better, decimals = _MEASURES[measure]
+    plain = result_key(measure, alignment, source) == f"depth_{measure}"
+
+    @metric(
+        result_key(measure, alignment, source),
+        title if plain else f"{title}, {source}, {alignment.replace('_', ' ')}",
+        better=better,
+        decimals=decimals,
+        watch=plain and measure == "absrel",
+        interval=measure == "absrel",
+        column=plain or (alignment, source) == ("median", "estimator"),
+    )
+    def score(scene: Scene) -> PerClip:
+        return scene.shared(_scores, alignment, source).per_clip(measure)
 
 
-@metric("depth_delta1", "depth δ₁", better="higher", decimals=3, needs=("depth",), interval=False)
-def delta1_score(scene: Scene) -> Float[np.ndarray, " B"]:
-    """Scores δ₁ of the depth branch in metres, unaligned."""
-    return _branch_scores(scene).delta1
+def _scores(scene: Scene, alignment: Alignment, source: DepthSource) -> DepthScores:
+    truth, predicted = _branch_depth(scene) if source == "branch" else _estimated_depth(scene)
+    first = scene.prompt_frames
+    try:
+        return depth_scores(truth[:, first:], predicted[:, first:], alignment)
+    except ValueError as error:
+        raise Unavailable(str(error)) from error
 
 
-@metric("depth_delta2", "depth δ₂", better="higher", decimals=3, needs=("depth",), interval=False)
-def delta2_score(scene: Scene) -> Float[np.ndarray, " B"]:
-    """Scores δ₂ of the depth branch in metres, unaligned."""
-    return _branch_scores(scene).delta2
+def _branch_depth(scene: Scene) -> tuple[Depths, Depths]:
+    """Returns recorded and generated depth of the clips with recorded depth."""
+    rows = scene.truth.has_depth
+    if scene.truth.depth is None or not rows.any():
+        raise Unavailable("no test clip has depth in metres")
+    if scene.prediction.depth is None:
+        raise Unavailable("the model generates no depth")
+    return scene.truth.depth[rows], scene.prediction.depth[rows]
 
 
-def _branch_scores(scene: Scene) -> DepthScores:
-    truth, predicted, first = scene.truth.depth, scene.prediction.depth, scene.prompt_frames
-    assert truth is not None and predicted is not None
-    return depth_scores(truth[:, first:], predicted[:, first:], alignment="none")
+def _estimated_depth(scene: Scene) -> tuple[Depths, Depths]:
+    if scene.estimated is None:
+        raise Unavailable("no estimator: --eval.depth-estimator NETWORK:FIELD=PATH (docs/evaluation.md)")
+    return scene.estimated.truth, scene.estimated.prediction
 
 
 def abs_rel(truth: Float[np.ndarray, "..."], prediction: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -201,3 +229,11 @@ def result_key(metric: str, alignment: Alignment = "none", source: DepthSource =
     """
     plain = alignment == "none" and source == "branch"
     return f"depth_{metric}" if plain else f"depth_{metric}_{alignment}_{source}"
+
+
+for _measure in get_args(Measure):
+    _register(_measure, "none", "branch")
+for _source in get_args(DepthSource):
+    for _alignment in ("median", "affine_disparity", "l1_scale"):
+        for _measure in get_args(Measure):
+            _register(_measure, _alignment, _source)

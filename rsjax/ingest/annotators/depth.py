@@ -94,13 +94,17 @@ def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
     Raises:
         ValueError: a value is not finite.
     """
-    low, high = _extent(inverse)
+    extent = _extent(inverse)
+    return DepthMaps(ConvertedDepths(inverse, lambda part: stretch(part, extent)), "relative", extent)
 
-    def stretch(part: Float32[np.ndarray, "n H W"]) -> Float32[np.ndarray, "n H W"]:
-        position = (part - low) / (high - low) if high > low else np.zeros_like(part)
-        return (1 / (_NEAR_SHARE + (1 - _NEAR_SHARE) * position)).astype(np.float32)
 
-    return DepthMaps(ConvertedDepths(inverse, stretch), "relative", (low, high))
+def stretch(inverse: Float32[np.ndarray, "n H W"], extent: tuple[float, float]) -> Float32[np.ndarray, "n H W"]:
+    """Returns the relative depth of a network's 1/depth: 1 at the greatest value of ``extent``, ``RELATIVE_FAR`` at its
+    least, and even in 1/depth beyond them, up to 1000.
+    """
+    low, high = extent
+    position = (inverse - low) / (high - low) if high > low else np.zeros_like(inverse)
+    return (1 / np.maximum(_NEAR_SHARE + (1 - _NEAR_SHARE) * position, 1e-3)).astype(np.float32)
 
 
 def inverse_of(maps: DepthMaps, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:

@@ -1,9 +1,14 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsjax.clip import Video
+from rsjax.evaluation.metrics import depth
 from rsjax.evaluation.metrics.depth import abs_rel, align, depth_scores, result_key, within
+from rsjax.evaluation.registry import EstimatedDepth, Scene, Unavailable, metrics
 
 
 def _videos(seed=0, shape=(2, 3, 4, 5)):
@@ -96,10 +101,10 @@ def test_averaging_differs_as_the_protocols_say():
     prediction[:, 0] = 2.0
     per_pixel = depth_scores(truth, prediction, "none")
     np.testing.assert_allclose(per_pixel.abs_rel, [1 / 5, 1 / 2])
-    np.testing.assert_allclose(per_pixel.mean()["absrel"], (1 / 5 + 1 / 2) / 2)
+    np.testing.assert_allclose(per_pixel.per_clip("absrel").mean(), (1 / 5 + 1 / 2) / 2)
     pooled = depth_scores(truth, prediction, "l1_scale")
     np.testing.assert_allclose(pooled.weight, [5, 8])
-    np.testing.assert_allclose(pooled.mean()["absrel"], (5 * pooled.abs_rel[0] + 8 * pooled.abs_rel[1]) / 13)
+    np.testing.assert_allclose(pooled.per_clip("absrel").mean(), (5 * pooled.abs_rel[0] + 8 * pooled.abs_rel[1]) / 13)
     by_frame = depth_scores(truth, prediction, "affine_disparity")
     aligned = align(truth[0], prediction[0], truth[0] > 0, "affine_disparity")
     frames = [abs_rel(d[d > 0], a[d > 0]).mean() for d, a in zip(truth[0], aligned, strict=True)]
@@ -127,3 +132,81 @@ def test_keys_tell_the_protocols_apart():
     assert len(keys) == 8
     assert "depth_absrel" in keys
     assert "depth_absrel_median_estimator" in keys
+
+
+def _scene(**changes):
+    """Four clips of four frames, the first of which is the prompt, as recorded, generated, and by an estimator."""
+    rng = np.random.default_rng(5)
+    truth, prediction, estimated, other = (rng.uniform(0.5, 3.0, (4, 4, 6, 7)).astype(np.float32) for _ in range(4))
+    rgb = np.zeros((4, 4, 6, 7, 3), np.uint8)
+    scene = Scene(Video(rgb, truth), Video(rgb, prediction), 1, estimated=EstimatedDepth(estimated, other))
+    return dataclasses.replace(scene, **changes)
+
+
+def _by_hand(truth, prediction, alignment):
+    """AbsRel, δ₁ and δ₂ of all videos, pixel by pixel; all pixels of random depth count."""
+    scores = []
+    for d, p in zip(truth[:, 1:].astype(np.float64), prediction[:, 1:].astype(np.float64), strict=True):
+        if alignment == "median":
+            fitted = p * np.median(d) / np.median(p)
+        elif alignment == "affine_disparity":
+            slope, offset = np.polyfit(1 / p.ravel(), 1 / d.ravel(), 1)
+            fitted = 1 / np.maximum(slope / p + offset, 1e-3)
+        else:
+            scale = np.mean(d) / np.mean(p)
+            for _ in range(10):
+                weights = [1 / (abs(scale * b - a) + 1e-8) for a, b in zip(d.ravel(), p.ravel(), strict=True)]
+                scale = np.average((d / p).ravel(), weights=np.array(weights) * p.ravel() ** 2)
+            fitted = scale * p
+        ratio = np.maximum(fitted / d, d / fitted)
+        scores.append([np.mean(np.abs(fitted - d) / d), np.mean(ratio < 1.25), np.mean(ratio < 1.5625)])
+    return dict(zip(("absrel", "delta1", "delta2"), np.mean(scores, 0), strict=True))
+
+
+@pytest.mark.parametrize("source", ["branch", "estimator"])
+@pytest.mark.parametrize("alignment", ["median", "affine_disparity", "l1_scale"])
+def test_registered_scores_are_their_definitions_over_predicted_frames(alignment, source):
+    scene = _scene()
+    pair = (
+        (scene.truth.depth, scene.prediction.depth)
+        if source == "branch"
+        else (scene.estimated.truth, scene.estimated.prediction)
+    )
+    for measure, expected in _by_hand(*pair, alignment).items():
+        scored = metrics()[result_key(measure, alignment, source)].function(scene)
+        assert np.mean(scored) == pytest.approx(expected, rel=1e-5), measure
+
+
+def test_the_branch_is_scored_where_recorded_depth_is_in_metres():
+    scene = _scene()
+    blind = scene.truth.depth.copy()
+    blind[[0, 2]] = np.nan
+    part = dataclasses.replace(scene, truth=Video(scene.truth.rgb, blind))
+    function = metrics()["depth_absrel_median_branch"].function
+    np.testing.assert_array_equal(function(part), function(scene)[[1, 3]])
+    estimated = metrics()["depth_absrel_median_estimator"].function
+    np.testing.assert_array_equal(estimated(part), estimated(scene))
+
+
+def test_scores_share_one_fit(monkeypatch):
+    fits = []
+    monkeypatch.setattr(depth, "align", lambda *args: fits.append(args) or align(*args))
+    scene = _scene()
+    for measure in ("absrel", "delta1", "delta2"):
+        metrics()[f"depth_{measure}_median_branch"].function(scene)
+    assert len(fits) == 4, "one for each video"
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "reason"),
+    [
+        ("depth_absrel", {"prediction": Video(_scene().truth.rgb)}, "the model generates no depth"),
+        ("depth_delta1_median_branch", {"truth": Video(_scene().truth.rgb)}, "no test clip has depth in metres"),
+        ("depth_delta2_l1_scale_estimator", {"estimated": None}, "no estimator: --eval.depth-estimator"),
+        ("depth_absrel", {"prediction": Video(_scene().truth.rgb, np.full((4, 4, 6, 7), np.nan))}, "are not finite"),
+        ("depth_absrel_l1_scale_branch", {"truth": Video(_scene().truth.rgb, np.full((4, 4, 6, 7), 80.0))}, "70.0 met"),
+    ],
+)
+def test_what_cannot_be_scored_has_a_reason(name, changes, reason):
+    with pytest.raises(Unavailable, match=reason):
+        metrics()[name].function(_scene(**changes))

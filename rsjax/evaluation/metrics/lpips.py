@@ -1,0 +1,52 @@
+"""LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and with VGG16; the paper does not say which it takes.
+
+The weights are files that ``python -m rsjax.convert lpips`` makes; without one, the metric is unavailable.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rsjax.clip import Array
+from rsjax.evaluation.registry import PerClip, Scene, Unavailable, metric
+from rsjax.evaluation.statistics import over_predicted_frames
+from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
+
+_PAIRS = 8  # frames at a time, for memory: VGG's first layers hold 64 channels of full size
+
+
+@metric("lpips_alex", "LPIPS, AlexNet", better="lower", decimals=4)
+def alex_score(scene: Scene) -> PerClip:
+    """Scores the mean over each clip's predicted frames."""
+    return _score(scene, "alexnet", scene.settings.lpips_alex_weights, "--eval.lpips-alex-weights")
+
+
+@metric("lpips_vgg", "LPIPS, VGG", better="lower", decimals=4)
+def vgg_score(scene: Scene) -> PerClip:
+    """Scores the mean over each clip's predicted frames."""
+    return _score(scene, "vgg16", scene.settings.lpips_vgg_weights, "--eval.lpips-vgg-weights")
+
+
+def _score(scene: Scene, net: str, path: str, option: str) -> PerClip:
+    if not path:
+        raise Unavailable(f"no weights: {option} FILE (python -m rsjax.convert lpips makes it)")
+    params, side = load_lpips(path, net), min(scene.truth.rgb.shape[2:4])
+    if side < min_size(params):
+        raise Unavailable(f"frames of {side} pixels; LPIPS with {net} needs {min_size(params)}")
+    pairs = zip(scene.truth.rgb, scene.prediction.rgb, strict=True)
+    return over_predicted_frames(np.stack([distances(params, *pair) for pair in pairs]), scene.prompt_frames)
+
+
+@jax.jit
+def distances(
+    params: dict[str, Any], truth: UInt8[Array, "T H W 3"], prediction: UInt8[Array, "T H W 3"]
+) -> Float[Array, " T"]:
+    """Returns the LPIPS of each frame, in float32 on every device; values 0–255."""
+
+    def distance(pair: tuple[Array, Array]) -> Array:
+        return lpips(params, *(frame.astype(np.float32) / 127.5 - 1 for frame in pair))
+
+    with jax.default_matmul_precision("highest"):
+        return jax.lax.map(distance, (truth, prediction), batch_size=_PAIRS)

@@ -1,0 +1,108 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from rsjax.clip import Video
+from rsjax.config import EvalConfig
+from rsjax.evaluation.evaluate import check_files
+from rsjax.evaluation.registry import Scene, Unavailable, metrics
+from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
+
+FIELDS = {"alexnet": ("lpips_alex", "lpips_alex_weights"), "vgg16": ("lpips_vgg", "lpips_vgg_weights")}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Random weights of both networks, of the published sizes."""
+    paths = {net: tmp_path_factory.mktemp("lpips") / f"{net}.safetensors" for net in FIELDS}
+    for net, path in paths.items():
+        rng, tensors = np.random.default_rng(0), {}
+        for name, shape in lpips_shapes(net).items():
+            scale = np.sqrt(2 / np.prod(shape[1:])) if "backbone" in name and len(shape) > 1 else 0.1
+            values = rng.normal(scale=scale, size=shape).astype(np.float32)
+            tensors[name] = np.abs(values) if "head" in name else values
+        save_file(tensors, path, metadata={"net": net})
+    return paths
+
+
+def with_file(field: str, path: Path) -> EvalConfig:
+    settings: dict[str, Any] = {field: str(path)}
+    return EvalConfig(**settings)
+
+
+def scene(settings: EvalConfig, side: int = 32) -> Scene:
+    rng = np.random.default_rng(1)
+    truth = rng.integers(0, 256, (2, 3, side, side + 6, 3), np.uint8)
+    noise = rng.integers(-60, 60, truth.shape)
+    return Scene(Video(truth), Video(np.clip(truth + noise, 0, 255).astype(np.uint8)), settings=settings)
+
+
+def plain_torch(net: str, path: Path, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The public definition in torch's own layers, in the order of torchvision's ``features``; (N, H, W, 3), 0–255."""
+    torch = pytest.importorskip("torch")
+    nn, weights = torch.nn, {name: torch.from_numpy(x) for name, x in load_file(path).items()}
+    if net == "alexnet":
+        layers = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(64, 192, 5, padding=2)]
+        layers += [nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()]
+        layers += [nn.Conv2d(384, 256, 3, padding=1), nn.ReLU(), nn.Conv2d(256, 256, 3, padding=1), nn.ReLU()]
+        taps = (1, 4, 7, 9, 11)
+    else:
+        layers, width = [], 3
+        for size in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512):
+            layers += [nn.Conv2d(width, size, 3, padding=1), nn.ReLU()] if size else [nn.MaxPool2d(2, 2)]
+            width = size or width
+        taps = (3, 8, 15, 22, 29)
+    features = nn.Sequential(*layers)
+    features.load_state_dict({n.removeprefix("backbone."): x for n, x in weights.items() if n.startswith("backbone")})
+
+    def tapped(images: np.ndarray) -> list:
+        x = torch.from_numpy(images).permute(0, 3, 1, 2).double() / 255 * 2 - 1
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x, outputs = (x - shift[:, None, None]) / scale[:, None, None], []
+        for number, layer in enumerate(features.double()):
+            x = layer(x)
+            if number in taps:
+                outputs.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+        return outputs
+
+    with torch.no_grad():
+        pairs = enumerate(zip(tapped(one), tapped(other), strict=True))
+        terms = [
+            nn.functional.conv2d((a - b) ** 2, weights[f"head.{k}.weight"].double()).mean((1, 2, 3))
+            for k, (a, b) in pairs
+        ]
+    return sum(terms).numpy()
+
+
+@pytest.mark.parametrize("net", FIELDS)
+def test_the_metric_is_the_public_definition_over_predicted_frames(net: str, files: dict[str, Path]) -> None:
+    name, field = FIELDS[net]
+    given = scene(with_file(field, files[net]))
+    function = metrics()[name].function
+    assert function is not None
+    truth, predicted = (video.rgb[:, 1:].reshape(-1, 32, 38, 3) for video in (given.truth, given.prediction))
+    expected = plain_torch(net, files[net], truth, predicted).reshape(2, 2).mean(1)
+    np.testing.assert_allclose(np.asarray(function(given)), expected, rtol=1e-4)
+    np.testing.assert_array_equal(function(Scene(given.truth, given.truth, settings=given.settings)), 0)
+
+
+@pytest.mark.parametrize("net", FIELDS)
+def test_without_weights_or_room_there_is_a_reason_and_no_number(net: str, files: dict[str, Path]) -> None:
+    name, field = FIELDS[net]
+    function, flag = metrics()[name].function, f"--eval.{field.replace('_', '-')} FILE"
+    assert function is not None
+    with pytest.raises(Unavailable, match=rf"^no weights: {flag} \(python -m rsjax.convert lpips"):
+        function(scene(EvalConfig()))
+    with pytest.raises(Unavailable, match=f"frames of 15 pixels; LPIPS with {net} needs"):
+        function(scene(with_file(field, files[net]), side=15))
+
+
+def test_a_file_that_is_missing_or_of_the_other_network_is_refused_at_the_start(files: dict[str, Path]) -> None:
+    check_files(EvalConfig(lpips_alex_weights=str(files["alexnet"]), lpips_vgg_weights=str(files["vgg16"])))
+    with pytest.raises(LpipsError, match=r"vgg16.safetensors: these LPIPS weights are of vgg16, not of alexnet; name"):
+        check_files(EvalConfig(lpips_alex_weights=str(files["vgg16"])))
+    with pytest.raises(LpipsError, match="none.safetensors: no such LPIPS weights"):
+        check_files(EvalConfig(lpips_vgg_weights="none.safetensors"))
