@@ -12,6 +12,7 @@ OPTIONAL: dict[str, type] = {
     "quarantine": dict,
     "action_mean": list,
     "action_std": list,
+    "action_dimensions": list,
 }
 
 

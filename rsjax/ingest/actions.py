@@ -28,24 +28,28 @@ class Layout:
     """What the numbers of an action mean; readers store it in ``episode.meta["actions"]``.
 
     Attributes:
-        kind: absolute: where to be; delta: how far to go, or a velocity or torque of the step.
+        kind: absolute: where to be; delta: how far to go, or a velocity or torque of the step; undeclared: nobody says.
         quaternions: first of the four dimensions of each unit quaternion, x y z w.
         held: dimensions whose command stays in force until the next one, such as a gripper's open or closed, whatever
             ``kind`` says. They have no differences, and of several commands the last one counts.
+        unclear: which dimensions cannot be steps, and why, unless the data set declares what they are.
     """
 
-    kind: Kind = "delta"
+    kind: Kind | Literal["undeclared"] = "delta"
     quaternions: tuple[int, ...] = ()
     held: tuple[int, ...] = ()
+    unclear: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready."""
-        return asdict(self) | {"quaternions": list(self.quaternions), "held": list(self.held)}
+        """Returns the fields, JSON-ready; ``unclear`` only if anything is."""
+        values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        return values if self.unclear else {name: value for name, value in values.items() if name != "unclear"}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Layout":
         """The inverse of :meth:`to_json`; missing fields have their defaults."""
-        return cls(values.get("kind", "delta"), tuple(values.get("quaternions", ())), tuple(values.get("held", ())))
+        dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear"))
+        return cls(values.get("kind", "delta"), *dims)
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,28 @@ def check_layout(layout: Layout, width: int, where: Path | str) -> None:
             raise EpisodeError.at(where, problem, f"mend the option {name}")
 
 
+def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
+    """Raises :class:`EpisodeError` if nobody says what must be known to make a clip's actions.
+
+    Args:
+        layout: of the recorded actions.
+        skipped: most recorded rows between two frames of a clip.
+        config: how they become one.
+    """
+    needed = (skipped > 1 and config.compose == "join") or config.offset != 0 or config.kind != "recorded"
+    if not needed or layout.kind == "absolute" or (layout.kind == "delta" and not layout.unclear):
+        return
+    doubts = "; ".join(layout.unclear)
+    if layout.kind == "delta":
+        problem = f"declared as steps, which add up, but {doubts}"
+        cure = "list what are commands that stay in force, such as --option 'held=[6]' ('held=[]' if they are steps)"
+        raise EpisodeError(f"actions: {problem}; {cure}", option="--option held")
+    problem = f"{skipped} recorded rows become one, and nobody says whether they are steps, which add up, or targets"
+    cure = "say --option kind=delta or --option kind=absolute, and 'held=[…]' for grippers"
+    doubts = f"; no steps: {doubts}" if doubts else ""
+    raise EpisodeError(f"actions: {problem}; {cure}{doubts}", option="--option kind")
+
+
 def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float32[np.ndarray, "N A"]:
     """Aligns actions with the frame that each led into; row 0 becomes zeros.
 
@@ -110,7 +136,7 @@ def sampled_actions(
 
     Raises:
         ConfigError: the configuration wants absolute actions of deltas, or ``stack`` of unevenly spaced frames.
-        EpisodeError: the layout names dimensions that the actions do not have.
+        EpisodeError: the layout names dimensions that the actions do not have, or it must be declared what they are.
     """
     check_layout(layout, actions.shape[1], "meta.actions")
     if config.kind == "absolute" and layout.kind == "delta":
@@ -118,6 +144,7 @@ def sampled_actions(
     gaps = np.diff(frames)
     if config.compose == "stack" and len(set(gaps.tolist())) > 1:
         raise ConfigError(f"actions.compose is 'stack', but frames are {gaps.min()} to {gaps.max()} apart; say 'join'")
+    check_declared(layout, int(gaps.max(initial=1)), config)
     rows = _shifted(actions.astype(np.float64), config.offset, layout)
     differences = config.kind == "delta" and layout.kind == "absolute"
     if differences:

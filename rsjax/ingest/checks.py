@@ -133,7 +133,10 @@ def _actions(episode: Episode) -> Iterator[Problem]:
     rows = episode.actions[1:]
     if len(rows) and not rows.any():
         yield "action", "all are zero"
-    for first in Layout.from_json(episode.meta.get("actions", {})).quaternions:
+    layout = Layout.from_json(episode.meta.get("actions", {}))
+    for doubt in layout.unclear:
+        yield "action", f"{doubt}, so it is no step: declare kind and held"
+    for first in layout.quaternions:
         lengths = np.linalg.norm(rows[:, first : first + 4], axis=1)
         if (off := np.flatnonzero(np.abs(lengths - 1) > _TOLERANCE)).size:
             actual = f"of length {lengths[off[0]]:.3g} in frame {off[0] + 1} ({len(off)} such)"

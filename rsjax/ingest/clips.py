@@ -5,6 +5,8 @@ It reads the records of the annotation steps (:mod:`rsjax.ingest.annotate`), as 
 Axes: N recorded frames, T frames of a clip, N₀ tracks of a clip, S×S a clip's pixels.
 """
 
+import contextlib
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,16 +15,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from rsjax.config import content_key, require, to_dict
+from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
-from rsjax.ingest.actions import ActionConfig, Layout, sampled_actions
+from rsjax.ingest.actions import ActionConfig, Layout, check_declared, sampled_actions
 from rsjax.ingest.annotate import Annotated, FrameRecords, StoredDepths, camera_of
 from rsjax.ingest.annotators.categories import UNKNOWN, CategoryConfig
 from rsjax.ingest.annotators.depth import FilledDepths
 from rsjax.ingest.annotators.protocols import Tracked
 from rsjax.ingest.annotators.tracks import window_tracks
-from rsjax.ingest.episode import Episode, EpisodeError, Segment
+from rsjax.ingest.dimensions import describe_dimensions, flat_names
+from rsjax.ingest.episode import Episode, EpisodeError, EpisodeSource, Segment
 from rsjax.ingest.fit import Fit, Placement
 from rsjax.ingest.windows import (
     WindowConfig,
@@ -61,6 +64,22 @@ class ClipConfig:
         require(0 <= self.most_holes <= 1, f"most_holes is {self.most_holes}; it is a share of the pixels, 0 to 1")
 
 
+def check_first(source: EpisodeSource, config: ClipConfig) -> None:
+    """Reads the first episode, to find before anything is annotated that nobody says what its actions are.
+
+    Raises:
+        ConfigError: its rows of actions would have to be combined for that.
+    """
+    with contextlib.suppress(EpisodeError):  # what cannot be read is quarantined later
+        for ref in itertools.islice(source.episodes(), 1):
+            episode = source.read(ref)
+            step = check_rate(episode.fps, config.windows)
+            try:
+                check_declared(Layout.from_json(episode.meta.get("actions", {})), round(step), config.actions)
+            except EpisodeError as error:
+                raise ConfigError(str(error)) from error
+
+
 def clip_step(config: ClipConfig, needs: tuple[str, ...] = (), cpus: float = 1.0) -> Step:
     """Returns the step that cuts clips, after the annotation steps that it needs."""
     return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=3, cpus=cpus)
@@ -77,9 +96,9 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason), ``fit``
         (what became of the pictures, in words; "" where they are square), ``short`` (how many ``spans`` are too short
         for a window, the ``longest`` of all in recorded frames, how many a ``window`` takes, and the ``cure``, in
-        words), ``actions`` (statistics of the clips' actions), ``action_dim``, ``depth`` (its range), ``depth_unit``
-        ("metres" or "relative"; both None without depth), ``success`` (the number of clips that end in success; None
-        where the data set does not record it).
+        words), ``actions`` (statistics of the clips' actions), ``action_dim``, ``dimensions`` (a line for each),
+        ``depth`` (its range), ``depth_unit`` ("metres" or "relative"; both None without depth), ``success`` (the number
+        of clips that end in success; None where the data set does not record it).
 
     Raises:
         EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
@@ -97,6 +116,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     whole = abs(step - round(step)) < 0.01 * step  # otherwise sampled_actions says what to do
     stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows of each action
     layout = Layout.from_json(episode.meta.get("actions", {}))
+    names = flat_names(episode.meta.get("action_names"), episode.actions.shape[1])
     pictures = _Fitted(episode.cameras[camera].read, config)
     depths, unit = _depths(annotated, camera, config, pictures)
     stored = None if annotated.tracks is None else FrameRecords(annotated.tracks)
@@ -137,6 +157,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         "short": _short(index, spans, episode.fps, windows),
         "actions": statistics.to_json() if statistics else None,
         "action_dim": len(statistics.mean) if statistics else None,
+        "dimensions": describe_dimensions(layout, names, config.actions, len(statistics.mean)) if statistics else [],
         "depth": [near, far] if far > 0 else None,
         "depth_unit": unit if far > 0 else None,
         "success": succeeded if "success" in episode.meta else None,

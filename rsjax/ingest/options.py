@@ -97,7 +97,7 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     from rsjax.ingest.annotate import annotation_steps
     from rsjax.ingest.annotators.categories import CategoryConfig, parse_table
     from rsjax.ingest.annotators.choose import choose_annotators, choose_recorded
-    from rsjax.ingest.clips import ClipConfig, clip_step
+    from rsjax.ingest.clips import ClipConfig, check_first, clip_step
     from rsjax.ingest.formats import open_source
     from rsjax.ingest.selection import select
     from rsjax.ingest.work_items import IngestPlan
@@ -124,6 +124,7 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     episodes: EpisodeSource = open_source(source, path.absolute(), **settings)
     if options.selection is not None:
         episodes = select(episodes, options.selection)
+    check_first(episodes, config)
     reading = content_key(json.dumps(settings, sort_keys=True))
     meta = {"config": to_dict(config) | {"methods": methods, "source": settings}}
     return IngestPlan(episodes, steps, out, options.test_share, reading, meta)

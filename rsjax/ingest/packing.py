@@ -110,6 +110,7 @@ def pack(
     manifest = {
         "source": plan.source.name,
         **_statistics(plan, contents.splits["train"]),
+        "action_dimensions": _dimensions(plan, contents.splits["train"]),
         "depth_range": contents.depth_range,
         "depth_unit": contents.depth_unit,
         "episodes": {split: [cut.ref.id for cut in cuts] for split, cuts in contents.splits.items()},
@@ -154,6 +155,13 @@ def _records(
             record = source[number]
             yield record | changes | {"provenance": record["provenance"] | provenance}
         packed()
+
+
+def _dimensions(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> list[str]:
+    """Returns what most episodes say of each dimension of the actions."""
+    marks = (EpisodeWork(plan, cut.ref).done(CLIPS) for cut in cuts)
+    said = Counter(tuple(mark["summary"]["dimensions"]) for mark in marks if mark is not None)
+    return list(said.most_common(1)[0][0]) if said else []
 
 
 def _statistics(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> dict[str, Any]:

@@ -49,10 +49,7 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         deep += record.get("depth") is not None
     manifest = store.manifest
     episodes = {split: len(ids) for split, ids in manifest.get("episodes", {}).items()}
-    units = [
-        f"{mean:.3g}±{std:.2g}"
-        for mean, std in zip(manifest.get("action_mean", []), manifest.get("action_std", []), strict=False)
-    ]
+    named = _dimensions(manifest)
     lines = [("splits", _counted(store.counts()))]
     lines += [("tokens", f"{key}: {_counted(tokens.counts())}") for key, tokens in token_sets(store).items()]
     lines += [
@@ -64,7 +61,7 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
     lines += [(name, shape) for name, shape in ({} if damaged else store.shapes()).items() if shape != NO_ARRAY]
     lines += [
         ("actions", _ranges(actions)),
-        ("mean±std", ", ".join(units) if len(units) <= MOST_DIMENSIONS else ""),
+        *(named if len(named) <= MOST_DIMENSIONS else ()),
         ("depth", f"in {deep} of {len(tracks)} records read"),
         ("lengths", ", ".join(f"{length} frames {count}×" for length, count in sorted(lengths.items()))),
         ("tracks", histogram(tracks, TRACK_UNIT)),
@@ -169,6 +166,16 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
     if times := provenance.get("times"):
         return [f"uneven, about {(len(times) - 1) / (times[-1] - times[0]):.2g} Hz"]
     return [f"{fps:.4g} fps, every {f'{step:.3g} frames' if step != 1 else 'frame'} ({fps / step:.3g} Hz)"]
+
+
+def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Returns a line for each dimension of the actions where their names are known, otherwise one for all."""
+    figures = zip(manifest.get("action_mean", []), manifest.get("action_std", []), strict=False)
+    units = [f"{mean:.3g}±{std:.2g}" for mean, std in figures]
+    names = manifest.get("action_dimensions") or []
+    if len(names) != len(units):
+        return [("mean±std", ", ".join(units))]
+    return [(f"action {place}", f"{name} {unit}") for place, (name, unit) in enumerate(zip(names, units, strict=True))]
 
 
 def _ranges(actions: Sequence[np.ndarray]) -> str:

@@ -76,7 +76,7 @@ def folder_of_episodes(place: Path, count: int, copies: tuple[int, ...] = ()) ->
         for frame in range(12):
             cv2.imwrite(str(pictures / f"{frame:06d}.png"), rng.integers(0, 255, (24, 32, 3), np.uint8))
         np.save(pictures.parent / "actions.npy", rng.normal(size=(12, 2)).astype(np.float32))
-    (place / "dataset.json").write_text('{"task": "fold the towel", "fps": 10}')
+    (place / "dataset.json").write_text('{"task": "fold the towel", "fps": 10, "kind": "delta"}')
     return place
 
 
@@ -135,6 +135,21 @@ def test_recordings_that_are_too_short_are_reported_in_numbers_with_a_cure(comma
     assert "raise --windows.rate or lower --windows.frames" in text and QUARANTINE not in text
     cured = command(ingest, *line, "--windows.rate", 10, "--windows.frames", 12)
     assert "2 = 2 with clips" in cured
+
+
+def test_undeclared_actions_stop_an_ingest_before_it_annotates_and_inspect_names_dimensions(
+    command: Command, tmp_path: Path
+) -> None:
+    source = folder_of_episodes(tmp_path / "source", 2)
+    (source / "dataset.json").write_text('{"fps": 10}')
+    line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, "--shots", "none", "--windows.frames", 3]
+    text = command.refused(ingest, *line, "--windows.rate", 5)
+    assert "2 recorded rows become one" in text and "--option kind=delta" in text
+    assert not (tmp_path / "store.work").exists()
+    command(ingest, *line, "--windows.rate", 5, "--option", "kind=delta")
+    assert "action 0  action[0] (delta) " in command(inspect, tmp_path / "store")
+    command(ingest, *line, "--windows.rate", 0)
+    assert "action 1  action[1] (undeclared) " in command(inspect, tmp_path / "store")
 
 
 def test_a_store_is_split_and_merged(command: Command, tmp_path: Path) -> None:

@@ -78,6 +78,10 @@ def test_what_the_manifest_and_the_clips_say_of_their_origin_is_reported(tmp_pat
     ):
         assert line in lines
     assert not any("abc" in line for line in lines)  # tokens of other clips
+    named = {"action_dimensions": ["x (delta)", "grip (held)"]}
+    write_store(tmp_path / "c", "clips", {"train": records}, meta | named | {"key": "b", "counts": counts})
+    lines, _ = describe(open_store(tmp_path / "c"))
+    assert {"action 0  x (delta) 0.5±1", "action 1  grip (held) -1±2"} < {*lines}
     (speed,) = [line for line in lines if "px/s of a 256-pixel-wide picture" in line]
     assert speed.startswith("motion    1 ") and " 5 px/s" in speed and speed.endswith("median 3")
 

@@ -11,8 +11,9 @@ One folder per episode, whose name is the episode's::
 or, with one camera, flat: ``PATH/NAME.mp4``, ``PATH/NAME.csv`` and, optionally, ``PATH/NAME.json``.
 
 The columns of a table have names: ``timestamp`` (seconds), ``state…``, and ``action…``; if none begins with ``action``,
-all others are the action. A ``.npy`` array (N, A) contains actions alone. ``after`` says whether each frame was
-recorded after its row's action. Otherwise a row's action leads into the next frame, and the last row may be missing.
+all others are the action, but for those that count rows or time (``time``, ``frame``, ``index`` …). A ``.npy`` array
+(N, A) contains actions alone. ``after`` says whether each frame was recorded after its row's action. Otherwise a row's
+action leads into the next frame, and the last row may be missing.
 ``fps`` is needed with pictures and without timestamps; videos know their own.
 """
 
@@ -26,7 +27,8 @@ import pyarrow as pa
 from jaxtyping import Float, Float32
 
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Kind, Layout, align_actions, check_layout
+from rsjax.ingest.actions import Kind, align_actions, check_layout
+from rsjax.ingest.dimensions import layout_of
 from rsjax.ingest.episode import (
     MAX_FPS,
     Episode,
@@ -51,7 +53,8 @@ class FolderConfig:
         task: of episodes that name none.
         fps: frames per second; 0: as the videos or the timestamps say.
         after: whether each frame was recorded after the action of its row.
-        kind: see :class:`rsjax.ingest.actions.Layout`.
+        action: the columns that are the action, in order; none: by their names.
+        kind: see :class:`rsjax.ingest.actions.Layout`; None: nobody says, so rows of actions are not combined.
         held: likewise.
         quaternions: likewise.
     """
@@ -59,8 +62,9 @@ class FolderConfig:
     task: str = ""
     fps: float = 0.0
     after: bool = False
-    kind: Kind = "delta"
-    held: tuple[int, ...] = ()
+    action: tuple[str, ...] = ()
+    kind: Kind | None = None
+    held: tuple[int, ...] | None = None
     quaternions: tuple[int, ...] = ()
 
 
@@ -70,6 +74,7 @@ def open_source(
     task: str | None = None,
     fps: float | None = None,
     after: bool | None = None,
+    action: Sequence[str] | None = None,
     kind: Kind | None = None,
     held: Sequence[int] | None = None,
     quaternions: Sequence[int] | None = None,
@@ -84,7 +89,8 @@ def open_source(
     file = path / "dataset.json"
     values = read_json(file) if exists(file) else {}
     from_json(FolderConfig, values, file)
-    options = {"task": task, "fps": fps, "after": after, "kind": kind, "held": held, "quaternions": quaternions}
+    options: dict[str, object] = {"task": task, "fps": fps, "after": after, "action": action}
+    options |= {"kind": kind, "held": held, "quaternions": quaternions}
     config = from_json(FolderConfig, values | {k: v for k, v in options.items() if v is not None}, path)
     if not 0 <= config.fps <= MAX_FPS:
         raise SourceError(f"{path}: fps is {config.fps!r}, should be a number from 0 to {MAX_FPS:g}; mend it")
@@ -135,28 +141,33 @@ class Folder:
         json_path = place.with_name(f"{name}.json") if flat else place / "episode.json"
         task, own_fps, segments = parts.read_description(json_path, count)
         table, fps = parts.read_table(table_path), own_fps or config.fps
-        states = [column for column in table.column_names if column.startswith("state")]
-        actions = [column for column in table.column_names if column.startswith("action")]
-        actions = actions or [column for column in table.column_names if column not in ("timestamp", *states)]
-        commands = parts.columns(table, actions, table_path)
-        layout = Layout(config.kind, config.quaternions, config.held)
-        check_layout(layout, commands.shape[1], table_path)
+        chosen, others = parts.choose_columns(table, config.action, table_path)
+        actions, names = parts.columns(table, chosen, table_path)
         times = _times(table, cameras, fps, count, place)
         if len(times) != count:
             problem = f"{len(times)} timestamps for {count} pictures"
             raise EpisodeError.at(table_path, problem, "one row per frame", "length")
+        actions = _actions(actions, count, config.after, table_path)
+        measured = [column for column in table.column_names if column.startswith("state")]
+        states = parts.columns(table, measured, table_path)[0] if measured else None
+        layout = layout_of(actions, config.kind, config.held, config.quaternions, names, states)
+        check_layout(layout, actions.shape[1], table_path)
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
             task=config.task if task is None else task,
             fps=fps or _rate(times),
             timestamps=times - times[0],
-            actions=_actions(commands, count, config.after, table_path),
-            states=parts.columns(table, states, table_path) if states else None,
+            actions=actions,
+            states=states,
             cameras=cameras,
             depth=depth,
             segments=segments,
-            meta={"actions": layout.to_json(), "action_names": actions},
+            meta={
+                "actions": layout.to_json(),
+                "action_names": names,
+                "notes": {"not_taken_for_actions": others} if others else {},
+            },
         )
         return checked(episode, table_path)
 

@@ -1,5 +1,6 @@
 """The files of one episode in a folder of videos: its cameras, its table and its JSON."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from jaxtyping import Float32
 
+from rsjax.errors import did_you_mean
 from rsjax.ingest.episode import (
     LEAVE_OUT,
     MAX_FPS,
@@ -28,6 +30,11 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 PICTURES = (".png", ".jpg", ".jpeg")
 TABLES = (".csv", ".parquet", ".npy")
 _DEPTH = ".depth"
+# Columns that count rows or time, also as pandas names those that it adds.
+_COUNTING = re.compile(
+    r"|unnamed: \d+|((time|frame|row|step|episode|task)[ _]?)?(index|idx|id|number|count)|__index_level_\d+__"
+    r"|time([ _]?(stamps?|s|sec|seconds|ms|ns))?|t|frames?|rows?|steps?|seconds|sec|stamps?"
+)
 _MOST_BYTES = 2**28  # of a table that is text
 
 
@@ -124,11 +131,39 @@ def read_table(path: Path) -> pa.Table:
     return table
 
 
-def columns(table: pa.Table, names: Sequence[str], path: Path) -> Float32[np.ndarray, "N A"]:
-    """Returns columns side by side; :class:`EpisodeError` if there are none or they are not numbers."""
-    if not names:
-        raise EpisodeError(f"{path}: has no column of actions; it has {', '.join(table.column_names)}")
-    return np.concatenate([matrix(table, name, path) for name in names], 1)
+def choose_columns(table: pa.Table, asked: Sequence[str], path: Path) -> tuple[list[str], list[str]]:
+    """Returns the columns that are the action, and those that only count rows or time and so are taken for none.
+
+    Args:
+        asked: the columns that a user names; none: those that begin with ``action``, or else all that are left.
+
+    Raises:
+        EpisodeError: there is none, or not the one that is asked for.
+    """
+    there = table.column_names
+    if absent := [name for name in asked if name not in there]:
+        hint = did_you_mean(absent[0], there)
+        message = f"{path}: has no column {absent[0]!r}{hint}; it has {', '.join(there)}"
+        raise EpisodeError(message, option="--option action")
+    actions = list(asked) or [name for name in there if name.startswith("action")]
+    if actions:
+        return actions, []
+    left = [name for name in there if name != "timestamp" and not name.startswith("state")]
+    counting = [name for name in left if _COUNTING.fullmatch(name.lower())]
+    actions = [name for name in left if name not in counting]
+    if not actions:
+        raise EpisodeError(f"{path}: has no column of actions; it has {', '.join(there)}")
+    return actions, counting
+
+
+def columns(table: pa.Table, names: Sequence[str], path: Path) -> tuple[Float32[np.ndarray, "N A"], list[str]]:
+    """Returns columns side by side, and a name for each dimension; :class:`EpisodeError` if they are not numbers."""
+    parts = {name: matrix(table, name, path) for name in names}
+    dimensions: list[str] = []
+    for name, part in parts.items():
+        width = part.shape[1]
+        dimensions += [name] if width == 1 else [f"{name}[{place}]" for place in range(width)]
+    return np.concatenate([*parts.values()], 1), dimensions
 
 
 def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:

@@ -13,7 +13,8 @@ import pyarrow as pa
 from jaxtyping import Float
 
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Kind, Layout, align_actions, check_layout
+from rsjax.ingest.actions import Kind, align_actions, check_layout
+from rsjax.ingest.dimensions import Declared, flat_names, layout_of
 from rsjax.ingest.episode import (
     FETCH_AGAIN,
     Episode,
@@ -51,8 +52,8 @@ def open_source(
     *,
     action: str = "action",
     state: str = "observation.state",
-    kind: Kind = "absolute",
-    held: Sequence[int] = (),
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
     quaternions: Sequence[int] = (),
 ) -> "LeRobot":
     """Opens the data set at ``path``, the folder that contains ``meta``.
@@ -60,7 +61,8 @@ def open_source(
     Args:
         action: the column of actions.
         state: the column of states; if it is missing, episodes have none.
-        kind: what the actions are, which the format does not say; see :class:`rsjax.ingest.actions.Layout`.
+        kind: what the actions are, which the format does not say; see :class:`rsjax.ingest.actions.Layout`. None:
+            absolute, unless the names of the dimensions speak of deltas; then it must be said.
         held: likewise.
         quaternions: likewise.
 
@@ -71,7 +73,10 @@ def open_source(
     if action not in info.features:
         raise SourceError(f"{path}: has no column {action!r}; choose among {', '.join(info.features)}")
     tasks = _tasks(path / "meta", info.shared)
-    return LeRobot(path, info, tasks, Layout(kind, tuple(quaternions), tuple(held)), action, state)
+    names = str(info.features[action].get("names")).lower()
+    stay = None if held is None else tuple(held)
+    declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
+    return LeRobot(path, info, tasks, declared, action, state)
 
 
 class LeRobot:
@@ -79,8 +84,10 @@ class LeRobot:
 
     name = "lerobot"
 
-    def __init__(self, root: Path, info: Info, tasks: dict[int, str], layout: Layout, action: str, state: str) -> None:
-        self._root, self._info, self._tasks, self._layout = root, info, tasks, layout
+    def __init__(
+        self, root: Path, info: Info, tasks: dict[int, str], declared: Declared, action: str, state: str
+    ) -> None:
+        self._root, self._info, self._tasks, self._declared = root, info, tasks, declared
         self._action, self._state = action, state
 
     def episodes(self) -> Iterator[EpisodeRef]:
@@ -116,7 +123,10 @@ class LeRobot:
         times = seconds(table, "timestamp", path)
         self._check_rows(table, times, location, path)
         actions = matrix(table, self._action, path)
-        check_layout(self._layout, actions.shape[1], path)
+        dimensions = flat_names(self._info.features[self._action].get("names"), actions.shape[1])
+        states = matrix(table, self._state, path) if self._state in table.column_names else None
+        layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
+        check_layout(layout, actions.shape[1], path)
         tasks = self._task_of_rows(table, path)
         episode = Episode(
             id=ref.id,
@@ -125,10 +135,10 @@ class LeRobot:
             fps=self._info.fps,
             timestamps=times - times[0],
             actions=align_actions(actions),
-            states=matrix(table, self._state, path) if self._state in table.column_names else None,
+            states=states,
             cameras=self._cameras(location, times, path),
             segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
-            meta={"actions": self._layout.to_json(), "action_names": self._info.features[self._action].get("names")},
+            meta={"actions": layout.to_json(), "action_names": dimensions},
         )
         return checked(episode, path)
 
@@ -174,7 +184,7 @@ class LeRobot:
             for key in info.of_type("video")
         }
         paths = [location["data"], *(video["path"] for video in location["videos"].values())]
-        mark = fingerprint([inside(self._root, path) for path in paths], location, self._layout)
+        mark = fingerprint([inside(self._root, path) for path in paths], location, self._declared)
         return EpisodeRef(f"episode_{number:06d}", mark, location)
 
     def _check_rows(

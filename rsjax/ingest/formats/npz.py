@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Kind, Layout, align_actions, check_layout
+from rsjax.ingest.actions import Kind, align_actions, check_layout
+from rsjax.ingest.dimensions import layout_of
 from rsjax.ingest.episode import (
     MAX_FPS,
     MAX_PIXELS,
@@ -53,7 +54,7 @@ class Settings:
     fps: float
     after: bool
     kind: str
-    held: tuple[int, ...]
+    held: tuple[int, ...] | None
     quaternions: tuple[int, ...]
 
 
@@ -66,7 +67,7 @@ def open_source(
     fps: float = 0.0,
     after: bool = False,
     kind: Kind | None = None,
-    held: Sequence[int] = (),
+    held: Sequence[int] | None = None,
     quaternions: Sequence[int] = (),
 ) -> "NpzFolder":
     """Opens a folder of episodes, or a single one.
@@ -90,7 +91,8 @@ def open_source(
     files = [path] if path.is_file() else sorted(file for file in path.glob("**/*.npz") if file.is_file())
     if not files:
         raise SourceError(f"{path}: no *.npz files; give the folder with them")
-    settings = Settings(frames, actions, task, float(fps), after, kind or "", tuple(held), tuple(quaternions))
+    stay = None if held is None else tuple(held)
+    settings = Settings(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions))
     return NpzFolder(folder, tuple(str(file.relative_to(folder)) for file in files), settings)
 
 
@@ -127,7 +129,11 @@ class NpzFolder:
         if kind not in ("absolute", "delta"):
             says = f"kind is {kind!r}" if kind else "does not say what its actions are"
             raise EpisodeError.at(path, says, "add kind, 'absolute' or 'delta', to the file or as --option kind=…")
-        layout = Layout("absolute" if kind == "absolute" else "delta", how.quaternions, how.held)
+        actions = align_actions(commands, how.after)
+        states = _numbers(path, "state") if _header(path, "state") else None
+        layout = layout_of(
+            actions, "absolute" if kind == "absolute" else "delta", how.held, how.quaternions, (), states
+        )
         check_layout(layout, commands.shape[1], path)
         times = _times(path, count, how.fps)
         success = _array(path, "success")
@@ -137,8 +143,8 @@ class NpzFolder:
             task=_text(path, "task") or how.task,
             fps=1 / float(np.median(np.diff(times))) if count > 1 and (np.diff(times) > 0).all() else 1.0,
             timestamps=times - times[:1],
-            actions=align_actions(commands, how.after),
-            states=_numbers(path, "state") if _header(path, "state") else None,
+            actions=actions,
+            states=states,
             cameras={"main": frames},
             depth={"main": NpzFrames(path, "depth", depth=True)} if _header(path, "depth") else {},
             meta={"source": "npz", "file": ref.location["file"], "actions": layout.to_json()}

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from rsjax.data.codec import decode, encode
-from rsjax.ingest.actions import Layout
-from rsjax.ingest.episode import EpisodeError, SourceError
+from rsjax.ingest.actions import ActionConfig, Layout, sampled_actions
+from rsjax.ingest.episode import Episode, EpisodeError, SourceError
 from rsjax.ingest.formats import open_source
 from tests.ingest.formats.reading import error_of, read_all, read_first
 from tests.ingest.formats.videos import numbers_of, picture, write_video
@@ -206,6 +206,43 @@ def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> Non
     write_episode(tmp_path)
     message = error_of("folder", tmp_path, held=[2])
     assert "actions.csv: held names dimension 2, but actions have 2" in message
+
+
+def sampled(episode: Episode, step: int) -> np.ndarray:
+    layout = Layout.from_json(json.loads(json.dumps(episode.meta["actions"])))
+    return sampled_actions(episode.actions, np.arange(0, COUNT, step), ActionConfig(), layout)
+
+
+def test_rows_of_actions_are_not_combined_before_somebody_says_what_they_are(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    lines = [f"{row / 10},{0.1 * (-1) ** row},{int(row > 1)}" for row in range(COUNT)]
+    (place / "actions.csv").write_text("\n".join(["timestamp,action_x,action_switch", *lines]))
+    switch = r"dimension 1 \(action_switch\) is never anything but 0 or 1"
+    undeclared = read_first("folder", tmp_path)
+    np.testing.assert_array_equal(sampled(undeclared, 1), undeclared.actions)  # as recorded
+    with pytest.raises(EpisodeError, match=f"2 recorded rows become one.* --option kind=delta .*: {switch}") as raised:
+        sampled(undeclared, 2)
+    assert raised.value.option == "--option kind"
+    with pytest.raises(EpisodeError, match=rf"but {switch}; .*--option 'held=\[6\]'") as raised:
+        sampled(read_first("folder", tmp_path, kind="delta"), 2)
+    assert raised.value.option == "--option held"
+    # What is declared is believed.
+    assert sampled(read_first("folder", tmp_path, kind="delta", held=[1]), 2)[:, 1].max() == 1
+    assert sampled(read_first("folder", tmp_path, kind="delta", held=[]), 2)[:, 1].max() == 2
+    assert sampled(read_first("folder", tmp_path, kind="absolute"), 2)[:, 1].max() == 1
+
+
+def test_columns_that_count_rows_or_time_are_no_actions_unless_asked_for(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    names = ["", "Unnamed: 0", "time", "Frame", "index", "frame_index", "episode_id", "t", "x", "frameless"]
+    lines = [",".join(str(row) for _ in names) for row in range(COUNT)]
+    (place / "actions.csv").write_text("\n".join([",".join(names), *lines]))
+    episode = read_first("folder", tmp_path, fps=10)
+    assert episode.meta["action_names"] == ["x", "frameless"]
+    assert episode.meta["notes"] == {"not_taken_for_actions": names[:-2]}
+    assert read_first("folder", tmp_path, fps=10, action=["x", "time"]).meta["action_names"] == ["x", "time"]
+    with pytest.raises(EpisodeError, match=r"has no column 'tme'; did you mean 'time'"):
+        read_first("folder", tmp_path, fps=10, action=["tme"])
 
 
 def test_a_folder_of_nothing_is_reported(tmp_path: Path) -> None:
