@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -52,13 +53,25 @@ def read_json(path: Path, kind: type = dict, cure: str = "restore it, or delete 
         FileError: the file is missing, cannot be read, is not JSON in UTF-8, or holds another type.
     """
     try:
-        return parse_json(path.read_bytes(), kind)
+        return parse_json(regular(path).read_bytes(), kind)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileError(f"{path}: missing; {cure}") from error
     except OSError as error:
         raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
     except ValueError as error:
         raise FileError(f"{path}: {placeholder(path) or f'{error}; {cure}'}") from error
+
+
+def regular(path: Path) -> Path:
+    """Returns the same path, but refuses pipes and devices: opening or reading one may never end.
+
+    Raises:
+        OSError: it is a pipe or a device, or cannot be looked at.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
+    return path
 
 
 def placeholder(content: Path | bytes) -> str:
@@ -69,7 +82,7 @@ def placeholder(content: Path | bytes) -> str:
     """
     if isinstance(content, Path):
         try:
-            with content.open("rb") as file:
+            with regular(content).open("rb") as file:
                 content = file.read(_HEAD)
         except OSError:
             return ""

@@ -10,11 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsjax.config import presets
 from rsjax.convert.files import read_tensors
+from rsjax.data.labels import Labels
+from rsjax.data.quarantine import read_quarantine
+from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.files import holder, is_held, lock, making, placeholder, read_json
 from rsjax.ingest.annotators.networks.local import require_weights
+from rsjax.ingest.episode import SourceError
+from rsjax.ingest.selection import select
+from rsjax.pipeline.videos import Request, _foreign_actions
 from rsjax.tokenizers.lpips import load_lpips
+from rsjax.training.log import read_rows
+from tests.ingest.toy import Source
 
 
 @pytest.mark.parametrize(
@@ -44,6 +53,24 @@ def test_a_directory_and_a_loop_of_links_are_no_json_files(tmp_path: Path) -> No
     for path, message in ((tmp_path, "Is a directory"), (tmp_path / "loop", "Too many levels of symbolic links")):
         with pytest.raises(UserError, match=rf"{path}: cannot be read \({message}\)"):
             read_json(path)
+
+
+def test_a_pipe_is_refused_at_once_in_place_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "manifest.json"
+    os.mkfifo(path)
+    with pytest.raises(UserError, match=f"{path}: cannot be read .a pipe or device, not a file"):
+        read_json(path)
+    assert placeholder(path) == ""
+    with pytest.raises(UserError, match=f"{path}: cannot be read"):
+        open_store(tmp_path)
+    with pytest.raises(OSError, match="a pipe or device"):
+        Labels.read(path, {})
+    with pytest.raises(SourceError, match="a pipe or device"):
+        select(Source(1), path)
+    request = Request("test", (), None, path, None, {})
+    with pytest.raises(UserError, match=f"{path}: not a readable .npy file of numbers .*a pipe or device"):
+        _foreign_actions(request, [], presets.debug())  # type: ignore[arg-type]
+    assert read_rows(path) == read_quarantine(path) == []
 
 
 def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(

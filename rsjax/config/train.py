@@ -125,6 +125,7 @@ class LoopConfig:
             require(getattr(self, name) >= 0, f"{name} of a training loop is {getattr(self, name)}; it is at least 0")
         for name in ("ema", "max_damaged"):
             require(0 <= getattr(self, name) <= 1, f"{name} of a training loop is {getattr(self, name)}; it is 0 … 1")
+        require(self.steps < 2**31, f"steps of a training loop are {self.steps}; their counter ends at {2**31 - 1}")
         require(
             list(self.restarts) == sorted(set(self.restarts)) and all(step > 0 for step in self.restarts),
             f"restarts of a training loop are {self.restarts}; they are steps above 0, in their order",

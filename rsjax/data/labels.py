@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Int32
 
 from rsjax.data.codec import Record
+from rsjax.files import regular
 
 Words = dict[str, str]  # a record's word in each column
 Label = Callable[[Record], Words]  # the columns are always the same
@@ -66,7 +67,7 @@ class Labels:
             OSError: the file cannot be read.
             ValueError: it is damaged.
         """
-        payload = path.read_bytes()
+        payload = regular(path).read_bytes()
         if zlib.crc32(payload) != entry["crc32"]:
             raise ValueError("its checksum is wrong")
         codes = np.load(io.BytesIO(payload), allow_pickle=False)

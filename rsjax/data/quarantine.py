@@ -88,7 +88,7 @@ class Quarantine:
 
 def read_quarantine(path: Path) -> list[dict[str, Any]]:
     """Returns the rows of a list, each record once and torn lines left out; none if there is no list."""
-    return list(_rows(path.read_bytes()).values()) if path.exists() else []
+    return list(_rows(path.read_bytes()).values()) if path.is_file() else []
 
 
 def _key(row: dict[str, Any]) -> Key:

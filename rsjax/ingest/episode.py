@@ -9,7 +9,6 @@ Axes: N recorded frames, H×W pixels, A action dimensions, S state dimensions.
 import errno
 import hashlib
 import itertools
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.errors import UserError
-from rsjax.files import placeholder
+from rsjax.files import placeholder, regular
 
 _WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints take files up to the first whole, and both ends of larger ones
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
@@ -221,18 +220,6 @@ def checked(episode: Episode, where: Path | str) -> Episode:
     if not np.isfinite(episode.fps) or episode.fps <= 0:
         raise EpisodeError.at(where, f"fps is {episode.fps}", "it must be positive", "time")
     return episode
-
-
-def regular(path: Path) -> Path:
-    """Returns the same path, but refuses pipes and devices: opening or reading one may never end.
-
-    Raises:
-        OSError: it is a pipe or a device, or cannot be looked at.
-    """
-    mode = path.stat().st_mode
-    if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
-        raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
-    return path
 
 
 def data_file(path: Path) -> Path:

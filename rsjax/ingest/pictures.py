@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.files import placeholder
+from rsjax.files import placeholder, regular
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, reason
 
 _NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # JPEG markers of tables, between the markers of frame headers
@@ -173,6 +173,6 @@ def _jpeg_sides(payload: bytes) -> tuple[int, int] | None:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return regular(path).read_bytes()
     except OSError as error:
         raise EpisodeError.at(path, reason(error)) from error

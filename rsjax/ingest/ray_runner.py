@@ -7,6 +7,7 @@ folder under the same paths. Ray is an extra (``pip install -e '.[ray]'``).
 import asyncio
 import math
 import os
+import socket
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from rsjax.ingest.ingest import Settle, limit_threads
 from rsjax.ingest.work_items import EpisodeWork, IngestPlan, Mark, Step, run_item
 from rsjax.processes import MAX_DEATHS, WorkerDied
 
+ANSWER_SECONDS = 5.0  # for which a cluster's address may stay silent
 MAX_FAILED_STARTS = 3  # of an actor, until it is the installation and not a node
 MAX_WAITING = 16  # episodes between two steps
 OBJECT_STORE_BYTES = 100 * 2**20  # of a local cluster: messages are small
@@ -70,11 +72,27 @@ def _connect(ray: Any, plan: IngestPlan, address: str, cpus: float | None) -> No
             "include_dashboard": False,
             "object_store_memory": OBJECT_STORE_BYTES,
         }
+    check_answers(address)
     try:
         ray.init(address=address, log_to_driver=False, logging_level="error", **options)
     except Exception as error:  # Ray raises several types, and a bare Exception for a start that took too long
         message = " ".join(str(error).split())
         raise RayError(f"no Ray cluster at {address}: {message}; start it, or leave --ray-address out") from error
+
+
+def check_answers(address: str) -> None:
+    """Raises :class:`RayError` if nobody answers at ``HOST:PORT`` or ``ray://HOST:PORT``; Ray would try for minutes."""
+    if address == "auto":
+        address = os.environ.get("RAY_ADDRESS", address)
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdigit():  # Ray says what is wrong with it, or looks for a cluster itself
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise RayError(
+            f"no Ray cluster at {address}: nobody answers ({error}); start it, or leave --ray-address out"
+        ) from error
 
 
 def count_actors(steps: Sequence[Step], cluster: Mapping[str, float], most: int | None = None) -> dict[str, int]:

@@ -90,7 +90,7 @@ def data_fingerprints(run: Run) -> dict[str, Any]:
     stores |= {
         p.store: Path(p.store) for loop in loops for stage in loop.curriculum for p in stage.components if p.store
     }
-    return {name: _fingerprint(path) for name, path in stores.items() if (path / MANIFEST).exists()}
+    return {name: _fingerprint(path) for name, path in stores.items() if (path / MANIFEST).is_file()}
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:

@@ -1,13 +1,16 @@
 """The stages of the pipeline. Each reads the output of the previous one and can be run again."""
 
 from collections.abc import Callable
+from typing import Any, Literal
 
+from rsjax.config import Config, LoopConfig
 from rsjax.data.curriculum import check_stages
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_model
+from rsjax.pipeline.limits import check_batch, check_episodes
 from rsjax.pipeline.provenance import record_data, record_start
 from rsjax.pipeline.run import TRAINED, Run, link
 from rsjax.pipeline.setup import note_curriculum, starting, tokenizer_setup, world_model_setup
@@ -69,13 +72,19 @@ def _do(run: Run, name: str, work: Callable[[], None]) -> None:
 
 
 def _check_starts(run: Run) -> None:
-    """Raises for a wrong path, a missing package or a batch that does not divide, before hours of work."""
+    """Raises for a wrong path, a missing package or a batch that does not divide or fit, before hours of work."""
     cfg = run.config
-    trained = {"tokenizer": (cfg.tokenizer_train, TokenizerTraining.create), "world_model": (cfg.train, create_model)}
+    if not cfg.data.key and not run.finished("collect"):
+        check_episodes(cfg.sim, run.clips)
+    trained: dict[Literal["tokenizer", "world_model"], tuple[LoopConfig, Callable[[Config], Any]]] = {
+        "tokenizer": (cfg.tokenizer_train, TokenizerTraining.create),
+        "world_model": (cfg.train, create_model),
+    }
     for name, (loop, create) in trained.items():
         if name not in run.stages or run.finished(name):
             continue
         Sharding.create(loop)
+        check_batch(cfg, loop, name)
         starting(create(cfg), loop.start_from, name)
         if loop.wandb:
             find_wandb()

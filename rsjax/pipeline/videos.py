@@ -14,9 +14,10 @@ from rsjax.config import Config
 from rsjax.data.clips import Clips
 from rsjax.data.store import Record, Source
 from rsjax.errors import UserError
-from rsjax.files import placeholder
+from rsjax.files import placeholder, regular
 from rsjax.models.base import create_model
 from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.limits import check_rollout
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
@@ -104,7 +105,7 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
     if request.actions is None:
         return None
     try:
-        actions = np.load(request.actions, allow_pickle=False)
+        actions = np.load(regular(request.actions), allow_pickle=False)
     except (OSError, ValueError) as error:
         instead = placeholder(request.actions) or f"not a readable .npy file of numbers ({error})"
         raise UserError(f"{request.actions}: {instead}") from error
@@ -123,6 +124,7 @@ def _lasting(actions: Float[np.ndarray, "T A"], request: Request, config: Config
         return actions
     if request.frames <= config.prompt_frames:
         raise UserError(f"--frames is {request.frames}, but the prompt has {config.prompt_frames}; set it higher")
+    check_rollout(config, request.frames)
     turns = 1 + np.arange(request.frames - 1) % (len(actions) - 1)
     return actions[np.concatenate([[0], turns])]
 

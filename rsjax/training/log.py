@@ -29,7 +29,7 @@ MEASURED = frozenset(
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Reads a file of JSON lines. Returns [] if there is none; a torn last line is left out."""
     rows = []
-    for line in path.read_text().splitlines() if path.exists() else ():
+    for line in path.read_text().splitlines() if path.is_file() else ():
         try:
             rows.append(json.loads(line))
         except ValueError:

@@ -1,7 +1,7 @@
+import contextlib
 import dataclasses
 import io
 import json
-import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -84,19 +84,33 @@ def test_a_part_alone_measures_that_part() -> None:
     assert not [name for name in measured if name.startswith(("train_", "sample_", "tokenizer_", "matmul_"))]
 
 
-@pytest.mark.parametrize(("step_s", "batch_s", "low", "high"), [(0.0, 0.2, 0.5, 1.0), (0.2, 0.0, 0.0, 0.5)])
-def test_steps_wait_for_a_slow_loader_and_not_for_a_quick_one(
-    step_s: float, batch_s: float, low: float, high: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("step_s", "batch_s", "share"), [(1.0, 3.0, 0.75), (2.0, 0.0, 0.0)])
+def test_the_share_of_waiting_is_that_of_a_slow_loader(
+    step_s: float, batch_s: float, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """On a clock by which nothing but steps and batches takes time."""
+    clock = [0.0]
+
+    class Batches(contextlib.nullcontext):  # type: ignore[type-arg]
+        waited = 0.0
+
+        def __next__(self) -> Any:
+            clock[0] += batch_s
+            self.waited += batch_s
+            return SimpleNamespace(batch=None)
+
     def step(state: Any, batch: Any) -> tuple[Any, Any]:
-        time.sleep(step_s)
+        clock[0] += step_s
         return state, {}
 
-    sharding = SimpleNamespace(compile=lambda *_: step, put_batch=lambda batch: time.sleep(batch_s))
-    monkeypatch.setattr(parts.Sharding, "create", lambda loop: sharding)
+    batches = Batches()
+    batches.enter_result = batches
+    monkeypatch.setattr(parts, "Prefetch", lambda *_: batches)
+    monkeypatch.setattr(parts, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(parts.Sharding, "create", lambda loop: SimpleNamespace(compile=lambda *_: step))
     monkeypatch.setattr(parts, "create_state", lambda model, loop: 0)
     measured = bench(toy(), only=["feed"], budget=0.0)
-    assert low < measured["data_wait_share"] < high
+    assert measured["data_wait_share"] == share
     assert (measured["feed_steps"], measured["feed_batch"]) == (parts.LEAST, toy().train.batch_size)
 
 

@@ -1,4 +1,5 @@
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -14,7 +15,7 @@ import pytest
 from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.episode import EpisodeRef
 from rsjax.ingest.ingest import Runner, ingest, run_on_this_machine
-from rsjax.ingest.ray_runner import RayError, count_actors, run_on_ray
+from rsjax.ingest.ray_runner import RayError, check_answers, count_actors, run_on_ray
 from rsjax.ingest.summary import summarise
 from rsjax.ingest.work_items import IngestPlan, Step
 from tests.ingest.toy import Source, clip_plan, noting_plan, runs
@@ -88,6 +89,22 @@ def test_stores_are_the_same_from_ray_processes_and_this_process(tmp_path: Path,
         ingest(plan, run)
         stores.append({path.name: path.read_bytes() for path in plan.out.iterdir()})
     assert stores[0] == stores[1] == stores[2] and "manifest.json" in stores[0]
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://localhost:{}"])
+def test_an_address_that_nobody_answers_is_named_at_once(address: str) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # without listening
+        address = address.format(taken.getsockname()[1])
+        with pytest.raises(RayError, match=rf"no Ray cluster at {address}: nobody answers \(.*refused\); start it"):
+            check_answers(address)
+
+
+def test_an_address_that_answers_or_is_none_is_left_to_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{server.getsockname()[1]}")
+        for address in ("auto", "local", "nonsense"):
+            check_answers(address)
 
 
 class Holder:

@@ -105,7 +105,7 @@ if child:
 def test_a_forked_process_reads_files_of_its_own_and_ends(clip: Path) -> None:
     """The threads of FFmpeg's that its parent may have are not copied; Ray forks thus before it starts a command."""
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    subprocess.run([sys.executable, "-c", PROGRAM, str(clip)], env=environment, check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", PROGRAM, str(clip)], env=environment, check=True, timeout=600)
 
 
 def test_a_file_that_changes_is_scanned_again(tmp_path: Path) -> None:

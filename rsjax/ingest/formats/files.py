@@ -14,7 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, Float64, Int64
 
-from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, data_file, fingerprint, reason, regular
+from rsjax.files import regular
+from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, data_file, fingerprint, reason
 
 MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
 _MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share

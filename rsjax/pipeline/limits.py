@@ -1,0 +1,76 @@
+"""Refuses what cannot fit into memory or onto the disk, before it begins: each figure is less than what is needed."""
+
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+import jax
+
+from rsjax.config import Config, LoopConfig, SimConfig, TransformerConfig
+from rsjax.errors import UserError
+
+GIB = 2**30
+_CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def host_memory() -> int:
+    """Returns the bytes of memory that this process may use at most."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for path in map(Path, _CGROUPS):
+        with suppress(OSError, ValueError):  # "max" is no limit
+            limits.append(int(path.read_text()))
+    return min(limits)
+
+
+def device_memory() -> int:
+    """Returns the bytes of memory of each of this process's devices; on a CPU, its share of the host's."""
+    devices = jax.local_devices()
+    limits = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in devices]
+    return min(limits) or host_memory() // len(devices)
+
+
+def check_batch(config: Config, loop: LoopConfig, stage: Literal["tokenizer", "world_model"]) -> None:
+    """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
+    clips = loop.batch_size / (loop.accumulate * jax.device_count())
+    needed, there = int(clips * _clip_bytes(config, stage)), device_memory()
+    if needed > there:
+        section = "tokenizer_train" if stage == "tokenizer" else "train"
+        raise UserError(
+            f"{section}.batch_size is {loop.batch_size}, whose activations take more than {needed / GIB:,.0f} GiB on "
+            f"each of {jax.device_count()} devices with {there / GIB:,.0f} GiB; lower it, or raise "
+            f"{section}.accumulate (experiments.describe estimates the bytes of a clip)"
+        )
+
+
+def _clip_bytes(config: Config, stage: str) -> int:
+    """Returns bytes of a clip that the backward pass reads at least: features of one layer, or the input of a block."""
+    if stage == "tokenizer":
+        cells = (config.clips.image_size // config.tokenizer.patch_size) ** 2
+        return 2 * config.tokenizer_train.frames_per_clip * cells * config.tokenizer.channels
+    if not isinstance(config.model, TransformerConfig):
+        return config.clips.frames * config.clips.image_size**2
+    return 2 * config.model.blocks * config.clips.frames * config.grid**2 * config.model.width
+
+
+def check_rollout(config: Config, frames: int) -> None:
+    """Raises :class:`UserError` if a generated video of one clip cannot fit into memory."""
+    pixel_bytes = 3 + 4 * config.model.uses_depth
+    needed, there = frames * config.clips.image_size**2 * pixel_bytes, host_memory()
+    if needed > there:
+        raise UserError(
+            f"--frames is {frames}, a video of {needed / GIB:,.0f} GiB; this machine has {there / GIB:,.0f} GiB of "
+            f"memory; generate fewer"
+        )
+
+
+def check_episodes(config: SimConfig, out: Path) -> None:
+    """Raises :class:`UserError` if simulated episodes cannot fit onto the disk: a byte a pixel is the least."""
+    place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    needed, free = config.episodes * config.frames * config.image_size**2, shutil.disk_usage(place).free
+    if needed > free:
+        raise UserError(
+            f"sim.episodes is {config.episodes}, which takes more than {needed / GIB:,.0f} GiB; {place} has "
+            f"{free / GIB:,.0f} GiB free; lower it, or choose another --data-dir"
+        )
