@@ -22,13 +22,13 @@ def on_store(config: Config, path: Path) -> Config:
     if manifest.get("kind") != "clips" or not manifest.get("key"):
         raise StoreError(
             f"{where}: is of {manifest.get('kind')}, key {manifest.get('key')}; name a store of clips that "
-            f"experiments.ingest made"
+            f"experiments.ingest or rsjax.write_store made"
         )
     counts = {split: len(store.source(split)) if split in store.splits else 0 for split in ("train", "test")}
     if not counts["train"] or counts["test"] < 2:
         raise StoreError(
             f"{where}: {counts['train']} train and {counts['test']} test clips; training takes one and two at least: "
-            f"ingest it with a larger --test-share, or more episodes"
+            f"make it with a larger --test-share (test_share of rsjax.write_store), or more episodes"
         )
     clip = first_clip(store)
     data = DataConfig(

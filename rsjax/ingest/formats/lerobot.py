@@ -121,7 +121,7 @@ class LeRobot:
         names = ("timestamp", "frame_index", "episode_index", "index", "task_index", self._action, self._state)
         path, table = read_rows(self._root, self._info.data_path, location, names)
         times = seconds(table, "timestamp", path)
-        self._check_rows(table, times, location, path)
+        notes = self._check_rows(table, times, location, path)
         actions = matrix(table, self._action, path)
         dimensions = flat_names(self._info.features[self._action].get("names"), actions.shape[1])
         states = matrix(table, self._state, path) if self._state in table.column_names else None
@@ -138,7 +138,7 @@ class LeRobot:
             states=states,
             cameras=self._cameras(location, times, path),
             segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
-            meta={"actions": layout.to_json(), "action_names": dimensions},
+            meta={"actions": layout.to_json(), "action_names": dimensions} | ({"notes": notes} if notes else {}),
         )
         return checked(episode, path)
 
@@ -189,18 +189,24 @@ class LeRobot:
 
     def _check_rows(
         self, table: pa.Table, times: Float[np.ndarray, " N"], location: dict[str, Any], path: Path
-    ) -> None:
-        """Raises :class:`EpisodeError` if the rows are not this episode's frames, in order and evenly spaced."""
+    ) -> dict[str, str]:
+        """Raises :class:`EpisodeError` if the rows are not this episode's frames, in order and evenly spaced.
+
+        Returns:
+            A note if the metadata have another range of rows, which nothing but this check reads.
+        """
         count, number = len(times), location["episode"]
         if count != location["length"]:
             problem = f"{count} rows of episode {number}, metadata say {location['length']}"
             raise EpisodeError.at(path, problem, kind="length")
         expected = {"episode_index": np.full(count, number), "frame_index": np.arange(count)}
+        notes = {}
         if "rows" in location:
-            first, end = location["rows"]
-            if end - first != count:
-                raise EpisodeError.at(path, f"episode {number} is {first} … {end} of the rows, but has {count}")
-            expected["index"] = np.arange(first, end)
+            first = int(integers(table, "index", path)[0])
+            expected["index"] = np.arange(first, first + count)
+            if location["rows"] != [first, first + count]:
+                says = " … ".join(map(str, location["rows"]))
+                notes["range"] = f"rows {first} … {first + count}, where the metadata say {says}"
         for name, values in expected.items():
             column = integers(table, name, path)
             if (wrong := np.flatnonzero(column != values)).size:
@@ -211,6 +217,7 @@ class LeRobot:
             row = uneven[0]
             step = f"{times[row + 1] - times[row]:.4f} s after the one before, at {self._info.fps:g} fps"
             raise EpisodeError.at(path, f"timestamp of row {row + 1} comes {step}", kind="time")
+        return notes
 
     def _task_of_rows(self, table: pa.Table, path: Path) -> list[str]:
         if "task_index" not in table.column_names or not self._tasks:

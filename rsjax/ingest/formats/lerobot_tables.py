@@ -22,8 +22,9 @@ _ALL = [("episode_index", ">=", 0)]  # a shared file may have more rows than the
 def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequence[str]) -> tuple[Path, pa.Table]:
     """Reads the rows of an episode.
 
-    LeRobot's converter to v3 names the file before for the first episode of every further file. So where the file that
-    the metadata name has no row of the episode, the others are searched, the next one first.
+    LeRobot's converter to v3 names the file before for the first episode of every further file, and no file that exists
+    if the very first episode alone exceeds a file's size. So where the file that the metadata name is missing or has no
+    row of the episode, the others are searched, the next one first.
 
     Args:
         template: of the tables' paths.
@@ -37,11 +38,19 @@ def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequ
         EpisodeError: the named file cannot be read, or no file has a row of the episode.
     """
     named, number = inside(root, location["data"]), location["episode"]
-    for path in (named, *(_others(root, template, named, number) if "rows" in location else ())):
-        table = parquet_columns(path, columns, _only(location))
-        if table.num_rows:
-            return path, table
-    raise EpisodeError.at(named, f"has no row of episode {number}, nor has any other file", kind="length")
+    failure = EpisodeError.at(named, f"has no row of episode {number}, nor has any other file", kind="length")
+    shared = "rows" in location
+    for path in (named, *(_others(root, template, named, number) if shared else ())):
+        try:
+            table = parquet_columns(path, columns, _only(location))
+        except EpisodeError as error:
+            if not (shared and isinstance(error.__cause__, FileNotFoundError)):
+                raise
+            failure = error
+        else:
+            if table.num_rows:
+                return path, table
+    raise failure
 
 
 def _others(root: Path, template: str, named: Path, number: int) -> Iterator[Path]:

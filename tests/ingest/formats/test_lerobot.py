@@ -152,12 +152,28 @@ def test_rows_are_searched_where_the_metadata_name_the_file_before(tmp_path: Pat
         assert numbers[0] == numbers[1]
 
 
+def test_a_range_that_the_metadata_have_wrong_is_noted(tmp_path: Path) -> None:
+    root = write_v3(tmp_path)
+    meta = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(meta)
+    place = table.column_names.index("dataset_from_index")
+    pq.write_table(table.set_column(place, "dataset_from_index", pa.array([0, 5, 15])), meta)
+    notes = [episode.meta.get("notes") for episode in read_all("lerobot", root)]
+    assert notes == [None, {"range": "rows 6 … 15, where the metadata say 5 … 15"}, None]
+
+
+def test_rows_are_searched_where_the_named_table_is_missing(tmp_path: Path) -> None:
+    root = write_v3(tmp_path)
+    (root / "data/chunk-000/file-000.parquet").rename(root / "data/chunk-000/file-002.parquet")
+    assert [len(episode.actions) for episode in read_all("lerobot", root)] == list(LENGTHS)
+
+
 def test_rows_that_no_table_has_are_reported_for_the_named_file(tmp_path: Path) -> None:
     misname(write_v3(tmp_path))
     (tmp_path / "data/chunk-000/file-001.parquet").write_bytes(b"damaged")
     source = open_source("lerobot", tmp_path)
     *_, last = source.episodes()
-    with pytest.raises(EpisodeError, match="file-000.parquet: has no row of episode 2, nor has any other file"):
+    with pytest.raises(EpisodeError, match="file-000.parquet: has no row of episode 2, nor has any other"):
         source.read(last)
 
 

@@ -47,9 +47,9 @@ def test_a_wrong_column_is_named(tmp_path: Path, column: str, values: Any, messa
 def test_shared_files_are_checked_against_the_ranges(tmp_path: Path) -> None:
     root = write_v3(tmp_path)
     meta = root / "meta/episodes/chunk-000/file-000.parquet"
-    rewrite(meta, "dataset_from_index", [0, 5, 15])
-    assert "episode 1 is 5 … 15 of the rows, but has 9" in error_of("lerobot", root, 1)
-    rewrite(meta, "dataset_from_index", [0, 6, 15])
+    rewrite(root / "data/chunk-000/file-000.parquet", "index", [*range(12), *range(13, 16)])
+    assert "index of row 6 is 13, should be 12" in error_of("lerobot", root, 1)
+    rewrite(root / "data/chunk-000/file-000.parquet", "index", list(range(15)))
     rewrite(meta, "length", [6, 8, 5])
     assert "9 rows of episode 1, metadata say 8" in error_of("lerobot", root, 1)
     rewrite(meta, "length", [6, 9, 5])
