@@ -5,12 +5,13 @@ import os
 from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
 
 from rsjax.command import main_errors as main_errors  # every command imports both from here
+from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
 from rsjax.config.curriculum import format_stage, parse_stage
 from rsjax.config.leaves import leaves
@@ -109,6 +110,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         print(f"{usage}\n{description}\nOptions and common fields: {prog} tiny --help; every field: --help-all")
         raise SystemExit(0)
     name, *argv = argv
+    refuse_repeated(argv, _adding(options))
     prog, preset = f"{prog} {name}", presets.get(name)
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
     preset = preset_options.apply(preset)
@@ -131,7 +133,14 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:
     """Parses the arguments of a command without a preset. Arguments and errors as in :func:`parse`."""
+    refuse_repeated(argv, _adding(options))
     return _parse({"options": options}, argv, prog, description).options
+
+
+def _adding(options: Any) -> list[str]:
+    """Returns the names of the options that may be repeated, as their values add up."""
+    hints = get_type_hints(type(options), include_extras=True)
+    return [name.replace("_", "-") for name, hint in hints.items() if tyro.conf.UseAppendAction in get_args(hint)]
 
 
 def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: str, rest: bool = False) -> Any:

@@ -81,7 +81,7 @@ def main() -> None:
         console.print(table, soft_wrap=False)
     reasons, total = diagnosis.reasons(), len(diagnosis.refs)
     bad = sum(name in reasons for name, _ in diagnosis.refs)
-    common = [kind for kind, count in counts.items() if count == total]
+    common = diagnosis.usual()
     for kind in common:
         console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")
     console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
@@ -92,8 +92,8 @@ def main() -> None:
         kept, out = write_selection(options.fix, about, diagnosis.refs, reasons)
         line = f"{options.fix}: keeps {kept}, leaves out {out}"
         if not kept:
-            cure = " ".join(common) or "the kinds that are as they should be"
-            line += f"; nothing is left to ingest: --ignore {cure}, and write it again"
+            cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
+            line += f"; nothing is left to ingest: {cure}, and write it again"
         console.print(line)
     if findings:
         raise SystemExit(1)

@@ -6,7 +6,7 @@ from pathlib import Path
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
 from rsjax.ingest.formats import FORMATS
-from rsjax.ingest.options import IngestOptions, make_plan, make_runner
+from rsjax.ingest.options import RECIPES, IngestOptions, make_plan, make_runner, unfiltered
 
 PROG = "python -m experiments.ingest"
 ABOUT = f"""Reads, annotates, cuts and packs episodes.
@@ -26,6 +26,9 @@ def main() -> None:
         )
     source, path, rest = ("", "", argv) if wants_help else (argv[0], argv[1], argv[2:])
     options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, IngestOptions())
+    if options.recipe:  # again, since options change the recipe's settings
+        recipe = IngestOptions(recipe=options.recipe, windows=RECIPES[options.recipe])
+        options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, recipe)
     plan, runner = make_plan(source, Path(path), options), make_runner(options)
 
     from rsjax.ingest.ingest import count_steps, ingest, is_up_to_date, list_episodes
@@ -51,6 +54,8 @@ def main() -> None:
         note("nothing is quarantined that could be tried again")
     else:
         print(*lines(summary), sep="\n")
+        if missing := unfiltered(options.windows):
+            print(f"filters   off: {missing}; --recipe paper turns them on (§2.2)")
         if tables := summary.tables():
             print(f"what was left out, and why: {tables} in {plan.folder}")
     print(f"store: {plan.out}")

@@ -4,12 +4,33 @@ import contextlib
 import errno
 import io
 import os
+import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 from rsjax.errors import Preempted, UserError
 from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
+
+
+def refuse_repeated(argv: Sequence[str], repeatable: Collection[str] = ()) -> None:
+    """Refuses an option that is given twice; parsers would take the last one without a word.
+
+    Args:
+        argv: the arguments of a command. ``--no-x`` and ``--x`` are one option.
+        repeatable: names of options that add up, without dashes in front.
+
+    Raises:
+        UserError: one is repeated.
+    """
+    given: set[str] = set()
+    for word in argv:
+        if not re.match(r"--\w", word):
+            continue
+        name = re.sub(r"(^|\.)no-", r"\1", word[2:].partition("=")[0].replace("_", "-"))
+        if name in given and name not in repeatable:
+            raise UserError(f"--{name} is given twice; give it once, with all its values")
+        given.add(name)
 
 
 @contextlib.contextmanager

@@ -36,7 +36,7 @@ def read(*argv: str) -> tuple[Config, Options]:
 
 
 def message(*argv: str) -> str:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(UserError) as caught:
         read(*argv)
     assert "\n" not in str(caught.value)
     return str(caught.value)
@@ -103,6 +103,10 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),
         (["tiny", "--train.steps"], "--train.steps: its value is missing"),
         (["tiny", "--store"], "--store: its value is missing"),
+        (["tiny", "--train.steps", "3", "--train.batch_size=4", "--train.steps=5"], "--train.steps is given twice"),
+        (["tiny", "--model.max_frames", "16", "--model.max-frames", "16"], "--model.max-frames is given twice"),
+        (["tiny", "--resume", "--no-resume"], "--resume is given twice; give it once, with all its values"),
+        (["tiny", "--store", "a", "--store", "b"], "--store is given twice"),
         (["tiny", "--model.sample.unmask", "worst"], "--model.sample.unmask: 'worst' is none of random, greedy"),
         (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
         (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
@@ -122,6 +126,17 @@ def test_options_without_a_preset() -> None:
         parse_options(["a/run", "--clip", "2"], "generate", "", NeedsRun(tyro.MISSING))
     with pytest.raises(ConfigError, match="missing RUN-DIR"):
         parse_options([], "generate", "", NeedsRun(tyro.MISSING))
+
+
+def test_only_options_that_add_up_may_be_repeated() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Adds:
+        grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+        only: tuple[str, ...] = ()
+
+    assert parse_options(["--grid", "a=1", "--grid", "b=2"], "ablation", "", Adds()) == Adds(("a=1", "b=2"))
+    with pytest.raises(UserError, match="--only is given twice"):
+        parse_options(["--only", "a", "--only", "b"], "ablation", "", Adds())
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rsjax.command import main_errors
+from rsjax.command import main_errors, refuse_repeated
 
 PROG = "python -m rsjax.convert"
 
@@ -37,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
 @main_errors()
 def main(argv: Sequence[str]) -> None:
     """Converts and prints what was written."""
+    refuse_repeated(argv)
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.convert import commands

@@ -7,7 +7,7 @@ Axes: N recorded frames, T frames of a clip, N₀ tracks of a clip, S×S a clip'
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -28,6 +28,7 @@ from rsjax.ingest.dimensions import describe_dimensions, flat_names
 from rsjax.ingest.episode import Episode, EpisodeError, EpisodeSource, Segment
 from rsjax.ingest.fit import Fit, Placement
 from rsjax.ingest.windows import (
+    Span,
     WindowConfig,
     WindowIndex,
     check_rate,
@@ -82,7 +83,7 @@ def check_first(source: EpisodeSource, config: ClipConfig) -> None:
 
 def clip_step(config: ClipConfig, needs: tuple[str, ...] = (), cpus: float = 1.0) -> Step:
     """Returns the step that cuts clips, after the annotation steps that it needs."""
-    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=3, cpus=cpus)
+    return Step(CLIPS, partial(_cut_episode, config), content_key(to_dict(config)), needs, version=4, cpus=cpus)
 
 
 def _cut_episode(config: ClipConfig, episode: Episode, inputs: Inputs) -> Records:
@@ -154,7 +155,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         "windows": tally(reasons),
         "left_out": starts_by_reason(index, reasons),
         "fit": pictures.placement.words if pictures.placement else "",
-        "short": _short(index, spans, episode.fps, windows),
+        "short": _short(index, spans, episode.fps, windows, annotated.shots),
         "actions": statistics.to_json() if statistics else None,
         "action_dim": len(statistics.mean) if statistics else None,
         "dimensions": describe_dimensions(layout, names, config.actions, len(statistics.mean)) if statistics else [],
@@ -164,15 +165,19 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     }
 
 
-def _short(index: WindowIndex, spans: list[tuple[int, int]], fps: float, windows: WindowConfig) -> dict[str, Any]:
+def _short(
+    index: WindowIndex, spans: list[Span], fps: float, windows: WindowConfig, shots: Sequence[Span]
+) -> dict[str, Any]:
     faster = "raise --windows.rate or " if 0 < windows.rate < fps else ""
     at = f" at {windows.rate:g} Hz" if windows.rate else ""
     span = round((windows.frames - 1) * check_rate(fps, windows)) + 1
+    uncut = len(shots) > 1 and shots[-1][1] >= span
+    whole = "the video was cut between shots, so --shots none if it was not edited, or " if uncut else ""
     return {
         "spans": index.short,
         "longest": max((end - first for first, end in spans), default=0),
         "window": f"{windows.frames} frames{at} take {span} of {fps:g} fps",
-        "cure": f"{faster}lower --windows.frames",
+        "cure": f"{whole}{faster}lower --windows.frames",
     }
 
 
@@ -186,6 +191,7 @@ def _words(
     provenance = {
         "source": episode.meta.get("source", ""),
         "episode": episode.id,
+        "origin": episode.meta.get("origin", {}),
         "fingerprint": episode.fingerprint,
         "camera": camera,
         "fit": config.fit,

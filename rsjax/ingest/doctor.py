@@ -33,11 +33,13 @@ class Diagnosis:
         refs: every episode's id and fingerprint, in order.
         findings: in the order of the episodes.
         mended: id and notes of each episode in which the reader mended something.
+        unread: ids of the episodes that the reader refuses.
     """
 
     refs: tuple[tuple[str, str], ...]
     findings: tuple[Finding, ...]
     mended: tuple[tuple[str, str], ...] = ()
+    unread: frozenset[str] = frozenset()
 
     def counts(self) -> dict[str, int]:
         """Counts the episodes that have each kind of finding, in the order of :data:`KINDS`."""
@@ -46,6 +48,11 @@ class Diagnosis:
         for name, kind in {(finding.episode, finding.kind) for finding in self.findings}:
             affected[kind] += episodes[name]
         return {kind: affected[kind] for kind in KINDS if affected[kind]}
+
+    def usual(self) -> list[str]:
+        """Returns the kinds that every episode has, though each can be read and decoded: perhaps it should be so."""
+        kinds = {} if self.unread else self.counts()
+        return [kind for kind, count in kinds.items() if count == len(self.refs) and kind != "undecodable"]
 
     def reasons(self) -> dict[str, list[str]]:
         """Returns the findings of each episode that has some, as text by its id."""
@@ -103,12 +110,15 @@ def diagnose(
     findings: dict[str, list[Finding]] = {}  # by episode, in their order
     stats: dict[str, EpisodeStats] = {}
     mended: list[tuple[str, str]] = []
+    unread = set[str]()
     for ref, problems, own, notes in _check_all(source, limits, workers, progress):
         if ref.id in findings:
             findings[ref.id].append(Finding(ref.id, "duplicate", "another episode has the same id"))
         findings.setdefault(ref.id, []).extend(problems)
         if own is not None:
             stats.setdefault(ref.id, own)
+        else:
+            unread.add(ref.id)
         if notes:
             mended.append((ref.id, notes))
         refs.append((ref.id, ref.fingerprint))
@@ -117,7 +127,7 @@ def diagnose(
     for finding in compare(stats, limits.unusual):
         findings[finding.episode].append(finding)
     kept = (finding for one in findings.values() for finding in one if finding.kind not in ignored)
-    return Diagnosis(tuple(refs), tuple(kept), tuple(mended))
+    return Diagnosis(tuple(refs), tuple(kept), tuple(mended), frozenset(unread))
 
 
 def _check_all(

@@ -174,6 +174,7 @@ def _pack(
     contents = choose_contents(cuts, plan.test_share)
     summary = replace(
         summarise(plan, [ref for ref in refs if ref.id not in odd], refused),
+        test_clips=sum(cut.records for cut in contents.splits["test"]),
         depth_left_out=contents.depth_left_out(),
         this_run=this_run,
     )

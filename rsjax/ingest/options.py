@@ -26,6 +26,8 @@ class IngestOptions:
     """The store; data/SOURCE by default."""
     option: tuple[str, ...] = ()
     """The source's own settings, such as keys=bridge or fps=5, as docs/formats.md lists them; lists as JSON."""
+    recipe: Literal["paper"] | None = None
+    """paper: keep only windows of one action with a key frame and clear motion (§2.2), as docs/ingest.md says."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     actions: ActionConfig = field(default_factory=ActionConfig)
     image_size: int = 64
@@ -86,6 +88,21 @@ class IngestOptions:
             for name in ("ray_address", "cpus", "gpus"):
                 flag, default = f"--{name.replace('_', '-')}", type(self).__dataclass_fields__[name].default
                 require(getattr(self, name) == default, f"{flag} is for Ray alone; add --runner ray or leave it out")
+
+
+# What the paper keeps (§2.2). It gives no bounds of motion: these keep all of BridgeData (3 to 41 px/s) and leave out
+# still pictures and those in which a twentieth moves by the picture's width each second.
+RECIPES = {"paper": WindowConfig(within_segments=True, key_frame=True, least_motion=2.0, most_motion=256.0)}
+
+
+def unfiltered(windows: WindowConfig) -> str:
+    """Names the paper's filters of windows that these settings leave out."""
+    filters = {
+        "windows of one action": windows.within_segments,
+        "a key frame in each": windows.key_frame,
+        "clear motion": windows.least_motion > 0 or windows.most_motion < float("inf"),
+    }
+    return ", ".join(name for name, is_on in filters.items() if not is_on)
 
 
 def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
@@ -158,6 +175,7 @@ def source_options(words: Sequence[str]) -> dict[str, Any]:
         name, equals, value = word.partition("=")
         if not (name and equals):
             raise ConfigError(f"--option {word!r}: write NAME=VALUE, such as fps=5")
+        require(name not in settings, f"--option {name} is given twice, the second time as {value}; give it once")
         try:
             settings[name] = json.loads(value)
         except ValueError:

@@ -35,6 +35,8 @@ class IngestSummary:
         steps: of each, how many work items are done and failed, their seconds on a worker and on its cores, and the
             clips per second of such a worker.
         fits: episodes by what became of their pictures, in words, if they were not square.
+        cut: episodes of more than one shot.
+        test_clips: of the store; None while it is not packed.
         depth_left_out: clips that lost their depth because its unit is not the store's.
         this_run: ``items`` (work items that were run), ``clips``, ``seconds`` and ``clips_per_second`` of the last
             run alone.
@@ -47,6 +49,8 @@ class IngestSummary:
     windows: dict[str, int]
     steps: dict[str, dict[str, Any]]
     fits: dict[str, int]
+    cut: int = 0
+    test_clips: int | None = None
     depth_left_out: int = 0
     this_run: dict[str, float] | None = None
 
@@ -81,7 +85,7 @@ def summarise(
     steps: dict[str, dict[str, Any]] = {
         step.name: {"done": 0, "failed": 0, "seconds": 0.0, "cpu_seconds": 0.0} for step in plan.steps
     }
-    done = clips = 0
+    done = clips = cut = 0
     for ref in refs:
         work, last = EpisodeWork(plan, ref), Mark()
         for step in plan.steps:
@@ -93,6 +97,7 @@ def summarise(
             row["seconds"] += mark["seconds"]
             row["cpu_seconds"] += mark["cpu_seconds"]
             last = mark
+            cut += step.name == "shots" and mark.get("summary", {}).get("shots", 1) > 1
             if mark["status"] == "failed":
                 quarantined.append({name: mark.get(name, "") for name in _ROW})
                 break
@@ -116,7 +121,7 @@ def summarise(
     for name, why in short.items():
         most = longest[why["window"], why["cure"]]
         filtered[name] = f"shorter than a window ({why['window']}; the longest has {most}): {why['cure']}"
-    return IngestSummary(len(refs) + len(refused), done, filtered, quarantined, dict(windows), steps, dict(fits))
+    return IngestSummary(len(refs) + len(refused), done, filtered, quarantined, dict(windows), steps, dict(fits), cut)
 
 
 def _left_out(windows: dict[str, int]) -> list[str]:
@@ -162,6 +167,10 @@ def lines(summary: IngestSummary) -> list[str]:
         f"{len(summary.quarantined)} quarantined",
         " + ".join([f"windows   {sum(windows.values())} = {windows['kept']} kept", *_left_out(windows)]),
     ]
+    if summary.cut:
+        text.append(f"cuts      in {summary.cut} episodes, which no window crosses; --shots none if they are none")
+    if summary.test_clips == 0:
+        text.append("testing   no clip is left for it, and training needs two: raise --test-share or add episodes")
     text += [f"pictures  of {number} episodes, {how}" for how, number in summary.fits.items()]
     if summary.depth_left_out:
         text.append(f"depth     left out of {summary.depth_left_out} clips: metres and relative depth do not mix")

@@ -12,7 +12,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +216,11 @@ def _records(work: EpisodeWork, step: Step) -> Records:
         if mark is None:
             raise FileNotFoundError(f"{work.output(name)}: the output of {name} is missing; run again")
         inputs[name] = work.records(name, mark["records"])
-    return (yield from step.work(work.plan.source.read(work.ref), inputs))
+    episode = work.plan.source.read(work.ref)
+    origin = {name: value for name, value in work.ref.location.items() if isinstance(value, str | int)}
+    # Names of files need not be text, which records have to be.
+    named = {k: v if isinstance(v, int) else v.encode(errors="backslashreplace").decode() for k, v in origin.items()}
+    return (yield from step.work(replace(episode, meta=episode.meta | {"origin": named}), inputs))
 
 
 def _write(path: Path, records: Records) -> tuple[int, Summary]:

@@ -1,6 +1,7 @@
 """The command, from files to files."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,7 @@ def test_an_export_that_stops_leaves_no_settings(tmp_path: Path, monkeypatch: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr(commands, "write_safetensors", stop)
+    monkeypatch.setattr("rsjax.command.exit_now", sys.exit)  # which would end the tests
     with pytest.raises(SystemExit) as stopped:
         convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")
     assert stopped.value.code == 130

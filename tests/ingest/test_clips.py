@@ -246,6 +246,15 @@ def test_a_short_episode_gives_nothing_and_says_so() -> None:
     }
 
 
+def test_an_episode_that_only_its_cuts_make_too_short_names_them() -> None:
+    kept, summary = clips(episode("a", count=20), shots=[(0, 9), (9, 20)])
+    assert not kept and summary["short"]["longest"] == 11
+    assert summary["short"]["cure"] == (
+        "the video was cut between shots, so --shots none if it was not edited, or raise --windows.rate or lower "
+        "--windows.frames"
+    )
+
+
 @pytest.mark.parametrize(
     ("config", "annotations", "match"),
     [

@@ -1,6 +1,7 @@
 """``experiments.ingest``, ``experiments.inspect`` and ``experiments.store``, as a user types them."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -96,6 +97,34 @@ def test_what_the_doctor_leaves_out_is_quarantined_with_its_reasons(command: Com
     manifest = open_store(tmp_path / "store").manifest
     assert "left out by the list" in manifest["quarantine"]["episode_02"]
     assert "episodes  4 = 4 with clips" in command(ingest, *line)
+
+
+def test_the_papers_recipe_filters_windows_and_the_default_says_what_it_leaves_out(
+    command: Command, tmp_path: Path
+) -> None:
+    """Nothing moves, so no window passes but by an option after the recipe."""
+    source = folder_of_episodes(tmp_path / "source", 1)
+    for picture in (source / "episode_00" / "front").glob("*.png"):
+        cv2.imwrite(str(picture), np.full((24, 32, 3), 90, np.uint8))
+    line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL, "--shots", "none"]
+    text = command(ingest, *line)
+    assert "filters   off: windows of one action, a key frame in each, clear motion; --recipe paper turns them" in text
+    assert "testing   no clip is left for it" in text
+    assert "pictures  of 1 episodes, 32 × 24 cropped to the middle square" in text
+    assert "9 still" in command.refused(ingest, *line, "--recipe", "paper")
+    text = command(ingest, *line, "--recipe=paper", "--windows.least-motion", 0, "--windows.no-key-frame")
+    assert "windows   9 = 9 kept" in text and "filters   off: a key frame in each; --recipe" in text
+    assert "cuts" not in text
+
+
+def test_a_clip_keeps_the_original_name_of_its_episode(command: Command, tmp_path: Path) -> None:
+    source = folder_of_episodes(tmp_path / "source", 1)
+    name = os.fsdecode("Falten und Öffnen 折る ".encode() + b"\xff")
+    (source / "episode_00").rename(source / name)
+    command(ingest, "folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL)
+    provenance = open_store(tmp_path / "store").source("train")[0]["provenance"]
+    assert provenance["origin"] == {"name": "Falten und Öffnen 折る \\udcff", "flat": False}
+    assert provenance["episode"].isascii()
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])

@@ -328,6 +328,16 @@ def test_a_fix_that_keeps_nothing_says_what_to_do(
     assert f"{tmp_path / 'm.json'}: keeps 2, leaves out 0\n" in capsys.readouterr().out
 
 
+def test_what_makes_everything_unreadable_is_never_to_be_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bridge(tmp_path / "data", [b"\xff", b"\xff\xff"])
+    assert run(monkeypatch, "rlds", tmp_path / "data", "--fix", tmp_path / "m.json") == 1
+    printed = capsys.readouterr().out
+    assert "unreadable" in printed and "--ignore" not in printed
+    assert "keeps 0, leaves out 2; nothing is left to ingest: mend what is wrong, and write it again" in printed
+
+
 def test_a_missing_list_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="m.json: not there"):
         select(source(), tmp_path / "m.json")

@@ -46,10 +46,14 @@ def parse_table(field: str, rows: tuple[str, ...]) -> Table:
     Raises:
         ConfigError: a row is not of this form.
     """
-    table = []
+    table: list[tuple[str, str]] = []
     for row in rows:
         pattern, equals, label = row.rpartition("=")
         if not (equals and pattern and label):
             raise ConfigError(f"{field} {row!r}: write PATTERN=WORD, such as 'pick*=simple'")
+        if pattern in dict(table):
+            raise ConfigError(
+                f"{field} {row!r}: {pattern!r} has the word {dict(table)[pattern]!r} already; give it once"
+            )
         table.append((pattern, label))
     return tuple(table)

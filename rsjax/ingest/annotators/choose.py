@@ -68,6 +68,8 @@ def choose(stage: str, text: str) -> Any:
         if key not in fields or not equals:
             takes = ", ".join(f"{field}=…" for field in fields)
             raise ConfigError(f"{stage} {name}: no field {setting!r}{did_you_mean(key, fields)}; it takes {takes}")
+        if key in values:
+            raise ConfigError(f"{stage} {name}: {key} is given twice; give it once")
         values[key] = _parse(f"{stage} {name}: {key}", fields[key].type, value)
     missing = [key for key, field in fields.items() if key not in values and field.default is dataclasses.MISSING]
     if missing:
