@@ -22,9 +22,9 @@ class KeyMap:
         fps: steps per second, > 0; RLDS does not store it.
         state: features that make up the state, in order.
         task: features of text; the first that is not empty counts.
-        kind: what the numbers of the action are, as in :class:`rsjax.ingest.actions.Layout`.
+        kind: what the numbers of the action are, as in :class:`rsjax.ingest.actions.Layout`; None: nobody says.
         quaternions: likewise.
-        held: likewise.
+        held: likewise; None: nobody says.
         after: whether a step's observation was recorded after its action, against the convention.
         depth: the feature of each camera's depth maps, by the camera's name.
         depth_scale: metres that a depth map of whole numbers counts as 1; floats are metres.
@@ -36,9 +36,9 @@ class KeyMap:
     fps: float
     state: tuple[str, ...] = ()
     task: tuple[str, ...] = ("language_instruction",)
-    kind: Kind = "delta"
+    kind: Kind | None = "delta"
     quaternions: tuple[int, ...] = ()
-    held: tuple[int, ...] = ()
+    held: tuple[int, ...] | None = ()
     after: bool = False
     depth: Mapping[str, str] = field(default_factory=dict)
     depth_scale: float = 0.001

@@ -9,7 +9,7 @@
 ``success``     one value or [T]         optional: whether the task is done
 ``fps``         one number               frames per second
 ``task``        text                     optional
-``kind``        text                     ``absolute`` or ``delta``, as in :class:`rsjax.ingest.actions.Layout`
+``kind``        text                     optional: ``absolute`` or ``delta``, see :class:`rsjax.ingest.actions.Layout`
 ==============  =======================  ===============================================================================
 """
 
@@ -126,14 +126,12 @@ class NpzFolder:
         if not how.after and len(commands) == count - 1:  # the last row leads nowhere
             commands = np.concatenate([commands, commands[-1:]])
         kind = _text(path, "kind") or how.kind
-        if kind not in ("absolute", "delta"):
-            says = f"kind is {kind!r}" if kind else "does not say what its actions are"
-            raise EpisodeError.at(path, says, "add kind, 'absolute' or 'delta', to the file or as --option kind=…")
+        if kind not in ("absolute", "delta", ""):
+            raise EpisodeError.at(path, f"kind is {kind!r}, should be 'absolute' or 'delta'", _SAVE)
         actions = align_actions(commands, how.after)
         states = _numbers(path, "state") if _header(path, "state") else None
-        layout = layout_of(
-            actions, "absolute" if kind == "absolute" else "delta", how.held, how.quaternions, (), states
-        )
+        declared: dict[str, Kind] = {"absolute": "absolute", "delta": "delta"}
+        layout = layout_of(actions, declared.get(kind), how.held, how.quaternions, (), states)
         check_layout(layout, commands.shape[1], path)
         times = _times(path, count, how.fps)
         success = _array(path, "success")

@@ -18,7 +18,8 @@ from jaxtyping import Float32
 
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Layout, align_actions, check_layout
+from rsjax.ingest.actions import Kind, align_actions, check_layout
+from rsjax.ingest.dimensions import layout_of
 from rsjax.ingest.episode import (
     LEAVE_OUT,
     MAX_FPS,
@@ -40,7 +41,14 @@ from rsjax.progress import note
 _SHARD = re.compile(r"(?P<name>.+)-(?P<split>[^-]+)\.tfrecord-(?P<number>\d+)-of-(?P<shards>\d+)")
 
 
-def open_source(path: Path, keys: str = "", split: str = "", fps: float = 0.0) -> "RldsSource":
+def open_source(
+    path: Path,
+    keys: str = "",
+    split: str = "",
+    fps: float = 0.0,
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+) -> "RldsSource":
     """Opens an RLDS data set.
 
     Args:
@@ -49,6 +57,8 @@ def open_source(path: Path, keys: str = "", split: str = "", fps: float = 0.0) -
             ``features.json``, which is printed; "": the one for the data set's name.
         split: the only one to read; "": all.
         fps: steps per second, in place of the key map's; 0: the key map's.
+        kind: of the actions, likewise; None: the key map's.
+        held: likewise.
 
     Raises:
         SourceError: there are no shards, or the key map does not fit ``features.json``.
@@ -62,11 +72,16 @@ def open_source(path: Path, keys: str = "", split: str = "", fps: float = 0.0) -
     features = step_features(described, _read_object(described))
     if keys == "auto":
         keymap = propose(described, features, fps)
-        cure = "save it as a .json file and mend it if it is wrong (--option keys=FILE)"
-        note(f"{folder}: taking {keymap.kind} actions by the key map {json.dumps(keymap.to_json())}; {cure}")
+        cure = "mend what is wrong in it as a file of your own (--option keys=FILE.json)"
+        note(f"{folder}: key map {json.dumps(keymap.to_json())}; {cure}")
     else:
         keymap = key_map(keys, info.get("name") or _split_name(shards[0])[0], folder)
-    keymap = replace(keymap, fps=fps) if fps else keymap
+    keymap = replace(
+        keymap,
+        fps=fps or keymap.fps,
+        kind=kind or keymap.kind,
+        held=keymap.held if held is None else tuple(held),
+    )
     check_keys(keymap, described, features)
     shapes = {key: features[key].shape for key in keymap.depth.values() if key in features}
     sides = {key: shape[:2] for key, shape in shapes.items() if shape and len(shape) > 1}
@@ -127,8 +142,10 @@ class RldsSource:
         if not cameras:
             raise EpisodeError.at(example.where, f"{', '.join(blank)} hold placeholders of one colour", LEAVE_OUT)
         count = len(next(iter(cameras.values())))
-        actions = _joined(example, self.keys.action, count)
-        layout = Layout(self.keys.kind, self.keys.quaternions, self.keys.held)
+        keys = self.keys
+        actions = align_actions(_joined(example, keys.action, count), keys.after)
+        states = _joined(example, keys.state, count) if keys.state else None
+        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, (), states)
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
         segments = [segment for segment in runs(texts) if segment.text]
@@ -138,8 +155,8 @@ class RldsSource:
             task=next((text for text in texts if text), ""),
             fps=self.keys.fps,
             timestamps=np.arange(count) / self.keys.fps,
-            actions=align_actions(actions, self.keys.after),
-            states=_joined(example, self.keys.state, count) if self.keys.state else None,
+            actions=actions,
+            states=states,
             cameras=cameras,
             depth={name: self._depth(example, key) for name, key in self.keys.depth.items() if name in cameras},
             segments=tuple(segments) if len({segment.text for segment in segments}) > 1 else (),

@@ -78,7 +78,7 @@ def _features(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Feature]:
 
 
 def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
-    """Returns a key map by the features' names, kinds and shapes; whether actions are deltas remains a guess.
+    """Returns a key map by the features' names, kinds and shapes, which do not say what the actions' numbers are.
 
     Args:
         path: of ``features.json``, for messages.
@@ -102,14 +102,14 @@ def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
     observed = [key for key, one in features.items() if key.startswith("observation/") and one.is_row]
     own = [key for key in observed if key == "observation/state"]
     texts = [key for key, one in features.items() if one.kind == "text" and _TEXT.search(key)]
-    gripper = whole is not None and whole.shape == (7,)
     return KeyMap(
         cameras=cameras,
         action=tuple(action),
         fps=fps,
         state=tuple(own or [key for key in observed if _STATE.search(key)]),
         task=tuple(sorted(texts, key=len)),
-        held=(6,) if gripper and action == ["action"] else (),
+        kind=None,
+        held=None,
         depth=_pairs(cameras, maps),
     )
 

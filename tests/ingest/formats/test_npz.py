@@ -75,7 +75,6 @@ def test_other_names_and_options(tmp_path: Path) -> None:
         ({"task": 3}, "task is int64"),
         ({"fps": 0}, "fps is array"),
         ({"fps": None}, "does not say how fast its pictures are; add fps to it, or say --option fps"),
-        ({"kind": None}, "does not say what its actions are; add kind, 'absolute' or 'delta'"),
         ({"kind": "relative"}, "kind is 'relative'"),
         ({"timestamps": np.zeros(COUNT)}, "timestamps do not increase at frame 1"),
         ({"success": [True]}, r"success is bool \(1,\)"),

@@ -304,16 +304,17 @@ def test_a_proposed_key_map_reads_pictures_depth_and_texts(
     described = tensor(8, 8, 1) if kind == "tensor" else image(8, 8, 1, dtype=kind)
     values = VALUES | {"steps/observation/front_depth": maps}
     write_kitchen(tmp_path / "set", OBSERVED | {"front_depth": described}, STEPS, values)
-    episode = read_first("rlds", tmp_path / "set", keys="auto", fps=4)
+    episode = read_first("rlds", tmp_path / "set", keys="auto", fps=4, kind="delta", held=[6])
     assert list(episode.cameras) == ["front_rgb", "wrist_rgb"] and list(episode.depth) == ["front_rgb"]
     np.testing.assert_allclose(episode.depth["front_rgb"].read([2, 0])[:, 3, 3], [1.5, 1])
     assert episode.depth["front_rgb"].read([0]).dtype == np.float32
     assert (episode.fps, episode.task, episode.actions.shape) == (4, "fold", (3, 7))
     assert episode.states is not None and episode.states.shape == (3, 6)
     printed = capsys.readouterr().out
-    assert "taking delta actions by the key map" in printed and "--option keys=FILE" in printed
+    assert "--option keys=FILE.json" in printed
     proposed = json.loads(printed[printed.index("{") : printed.rindex("}") + 1])
-    (tmp_path / "map.json").write_text(json.dumps(proposed))
+    assert proposed["kind"] is None and proposed["held"] is None
+    (tmp_path / "map.json").write_text(json.dumps(proposed | {"kind": "delta", "held": [6]}))
     again = read_first("rlds", tmp_path / "set", keys=str(tmp_path / "map.json"))
     assert list(again.depth) == ["front_rgb"] and again.meta["actions"] == episode.meta["actions"]
 
@@ -356,7 +357,9 @@ def test_the_example_of_the_page_is_a_key_map(tmp_path: Path) -> None:
 def test_the_proposal_for_bridge_is_its_named_map(tmp_path: Path) -> None:
     proposed, named = (open_source("rlds", BRIDGE, keys=keys, fps=5) for keys in ("auto", "bridge"))
     assert isinstance(proposed, RldsSource) and isinstance(named, RldsSource)
-    assert proposed.keys == named.keys
+    assert proposed.keys == dataclasses.replace(named.keys, kind=None, held=None)
+    first, second = (source.read(next(source.episodes())) for source in (proposed, named))
+    assert first.meta["actions"]["kind"] == "undeclared" and second.meta["actions"]["held"] == [6]
 
 
 @needs_bridge
