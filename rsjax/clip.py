@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 Array = Any  # JAX or numpy
+UNKNOWN = "unknown"  # the task or label of a clip whose data set does not name it
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Clip:
             centre of pixel column i is (i + 0.5) / W. May leave [0, 1] when the point leaves the image.
         visible: whether the point is inside the image and not occluded. True in frame 0.
         success: the simulator's success predicate at each frame.
-        task: the robot's task, in words.
+        task: the robot's task, in words; ``unknown`` if the data set does not say.
         provenance: the clip's origin (source, seed, episode, camera, expert's settings …), JSON-ready.
     """
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordWriter
 
-from rsjax.clip import Clip
+from rsjax.clip import UNKNOWN, Clip
 from rsjax.data.codec import Record, encode
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
@@ -21,7 +21,6 @@ from rsjax.errors import did_you_mean
 from rsjax.files import disk_guard
 
 TRACKS = 256  # of clips without tracks
-UNKNOWN = "unknown"
 _LABELS = ("difficulty", "scene", "segment", "skill")
 _FIELDS = (*(field.name for field in dataclasses.fields(Clip)), "episode", "fps", *_LABELS)
 
@@ -161,7 +160,7 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         "tracks": tracks,
         "visible": visible,
         "success": np.broadcast_to(success, (count,)).copy(),
-        "task": str(clip.get("task") or ""),
+        "task": str(clip.get("task") or UNKNOWN),
         "provenance": origin | words | timing | unit | {"episode": str(clip.get("episode", origin["episode"]))},
     }
 

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
 from rsjax.ingest.actions import ActionConfig, Layout, check_declared, sampled_actions
 from rsjax.ingest.annotate import Annotated, FrameRecords, StoredDepths, camera_of
-from rsjax.ingest.annotators.categories import UNKNOWN, CategoryConfig
+from rsjax.ingest.annotators.categories import CategoryConfig
 from rsjax.ingest.annotators.depth import FilledDepths
 from rsjax.ingest.annotators.protocols import Tracked
 from rsjax.ingest.annotators.tracks import window_tracks
@@ -208,7 +209,7 @@ def _words(
         provenance["times"] = times.tolist()  # seconds; elsewhere they follow from frames and fps
     if annotated.motion is not None:
         provenance["motion"] = float(np.mean(annotated.motion[frames[0] + 1 : frames[-1] + 1]))
-    return {"task": task, "provenance": provenance}
+    return {"task": task or UNKNOWN, "provenance": provenance}
 
 
 def clip_labels(record: Record) -> dict[str, str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from rsjax.clip import UNKNOWN
 from rsjax.data.clips import first_clip, readable
 from rsjax.data.codec import Record
 from rsjax.data.quarantine import NAME as QUARANTINE
@@ -133,8 +134,8 @@ def token_record(codec: Codec, clip: Record) -> Record:
 
 def labels(record: Record) -> dict[str, str]:
     """Returns the labels by which a curriculum selects token records."""
-    scene = record["provenance"].get("scene") or "unknown"
-    return {"task": record["task"], "difficulty": record["difficulty"], "scene": scene}
+    scene = record["provenance"].get("scene") or UNKNOWN
+    return {"task": record["task"] or UNKNOWN, "difficulty": record["difficulty"], "scene": scene}
 
 
 def fingerprint(params: Params) -> str:

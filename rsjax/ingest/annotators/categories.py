@@ -3,9 +3,9 @@
 import fnmatch
 from dataclasses import dataclass
 
+from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError
 
-UNKNOWN = "unknown"
 Table = tuple[tuple[str, str], ...]  # pattern (a shell's, any case) and label; the first match counts
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Layout, align_actions
-from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, reason
+from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, reason, words_of
 from rsjax.ingest.formats.agibot_proprio import Proprio
 from rsjax.ingest.formats.files import broken, exists, inside, location_of, media, read_json, subfolders
 from rsjax.ingest.formats.hdf5 import open_file
@@ -126,8 +126,8 @@ class AgiBot:
             "task": task,
             "episode": identity,
             "told": bool(entry),  # the fingerprint depends on this name
-            "name": str(entry.get("task_name") or ""),
-            "scene": str(entry.get("init_scene_text") or ""),
+            "name": words_of(entry.get("task_name")),
+            "scene": words_of(entry.get("init_scene_text")),
             "segments": segments if isinstance(segments, list) else [],
         }
         videos = self._root / "observations" / task / identity / "videos"
@@ -158,7 +158,7 @@ def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list
             start, end = int(entry["start_frame"]), min(int(entry["end_frame"]), count)
             if not 0 <= start < end:
                 raise ValueError(f"{start} … {end}")
-            good.append(Segment(start, end, str(entry.get("action_text") or ""), str(entry.get("skill") or "")))
+            good.append(Segment(start, end, words_of(entry.get("action_text")), words_of(entry.get("skill"))))
         except (KeyError, TypeError, ValueError):
             bad.append(entry)
     return tuple(sorted(good, key=lambda segment: segment.start)), bad

@@ -155,7 +155,7 @@ class Folder:
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=config.task if task is None else task,
+            task=task or config.task.strip(),
             fps=fps or _rate(times),
             timestamps=times - times[0],
             actions=actions,

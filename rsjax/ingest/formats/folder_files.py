@@ -21,6 +21,7 @@ from rsjax.ingest.episode import (
     SourceError,
     data_file,
     reason,
+    words_of,
 )
 from rsjax.ingest.formats.files import exists, load_npy, matrix, media, parquet_columns, read_json
 from rsjax.ingest.pictures import PictureFiles
@@ -38,8 +39,8 @@ _COUNTING = re.compile(
 _MOST_BYTES = 2**28  # of a table that is text
 
 
-def read_description(path: Path, count: int) -> tuple[str | None, float, tuple[Segment, ...]]:
-    """Reads task, rate and segments of an episode's JSON, if there is one; None and 0 if it does not name them.
+def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment, ...]]:
+    """Reads task, rate and segments of an episode's JSON, if there is one; "" and 0 if it does not name them.
 
     Args:
         count: the episode's frames.
@@ -57,12 +58,12 @@ def read_description(path: Path, count: int) -> tuple[str | None, float, tuple[S
         raise EpisodeError(str(error)) from error
     except (AttributeError, TypeError, ValueError) as error:
         raise EpisodeError.at(path, f"task, fps or segments are wrong ({error})", "mend the file") from error
-    return task, fps, tuple(sorted(segments, key=lambda segment: segment.start))
+    return words_of(task), fps, tuple(sorted(segments, key=lambda segment: segment.start))
 
 
 def _segment(path: Path, place: int, entry: Any, count: int) -> Segment:
     try:
-        segment = Segment(int(entry["start"]), int(entry["end"]), str(entry["text"]), str(entry.get("skill") or ""))
+        segment = Segment(int(entry["start"]), int(entry["end"]), words_of(entry["text"]), words_of(entry.get("skill")))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise EpisodeError.at(path, f"segment {place}: field missing or wrong ({error})", "mend it") from error
     if not 0 <= segment.start < segment.end <= count:

@@ -25,6 +25,7 @@ from rsjax.ingest.episode import (
     checked,
     fingerprint,
     runs,
+    words_of,
 )
 from rsjax.ingest.formats.files import (
     broken,
@@ -172,7 +173,7 @@ class LeRobot:
             return {name: int(row[f"{prefix}/{name}"]) for name in _PLACES}
 
         location: dict[str, Any] = {"episode": number, "length": length}
-        location["tasks"] = [str(task) for task in row.get("tasks") or ()]
+        location["tasks"] = [text for task in row.get("tasks") or () if (text := words_of(task))]
         location["data"] = fill(info.data_path, **fields("data"))
         if info.shared:
             location["rows"] = [int(row["dataset_from_index"]), int(row["dataset_to_index"])]
@@ -240,10 +241,10 @@ class LeRobot:
 def _tasks(meta: Path, shared: bool) -> dict[int, str]:
     try:
         if not shared:
-            return {int(row["task_index"]): str(row["task"]) for _, row in json_lines(meta / "tasks.jsonl")}
+            return {int(row["task_index"]): words_of(row["task"]) for _, row in json_lines(meta / "tasks.jsonl")}
         names = ("task_index", "task", "__index_level_0__")  # where pandas leaves an index of its own
         rows = parquet_rows(meta / "tasks.parquet", names)
-        return {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__", ""))) for row in rows}
+        return {int(row["task_index"]): words_of(row.get("task", row.get("__index_level_0__"))) for row in rows}
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{meta}: its table of tasks is damaged ({error}); fetch the file again") from error
 

@@ -138,7 +138,7 @@ class NpzFolder:
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=_text(path, "task") or how.task,
+            task=(_text(path, "task") or how.task).strip(),
             fps=1 / float(np.median(np.diff(times))) if count > 1 and (np.diff(times) > 0).all() else 1.0,
             timestamps=times - times[:1],
             actions=actions,

@@ -28,6 +28,7 @@ from rsjax.ingest.episode import (
     SourceError,
     checked,
     fingerprint,
+    words_of,
 )
 from rsjax.ingest.formats.files import broken, inside, location_of
 from rsjax.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
@@ -184,7 +185,7 @@ class DemoSource:
                 "source": how.name,
                 "file": ref.location["file"],
                 "demo": ref.location["demo"],
-                "environment": str(settings.get("env_name", "")),
+                "environment": words_of(settings.get("env_name")),
                 "notes": {"flipped": flipped} if flipped else {},
                 "actions": Layout("delta", held=grippers).to_json(),
             },
@@ -291,9 +292,9 @@ def _task(group: Any, settings: dict[str, Any], path: Path, how: Convention) -> 
     instruction = instruction or settings.get("language_instruction")
     if isinstance(instruction, list):
         instruction = instruction[0] if instruction else ""
-    if instruction:
-        return str(instruction).strip('" ')
-    return path.stem.removesuffix("_demo").replace("_", " ") if how.after else str(settings.get("env_name", ""))
+    if text := words_of(instruction).strip('" '):
+        return text
+    return path.stem.removesuffix("_demo").replace("_", " ") if how.after else words_of(settings.get("env_name"))
 
 
 def _number(demo: str) -> tuple[int, str]:

@@ -12,10 +12,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.clip import UNKNOWN
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
 from rsjax.ingest.actions import Layout
-from rsjax.ingest.episode import LEAVE_OUT, Episode, EpisodeError, EpisodeRef, SourceError, checked, fingerprint
+from rsjax.ingest.episode import (
+    LEAVE_OUT,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    fingerprint,
+    words_of,
+)
 from rsjax.ingest.pictures import ArrayFrames
 
 FPS = 5.0  # of a clip that does not say how it was made
@@ -93,7 +103,7 @@ class StoreSource:
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=str(record.get("task", "")),
+            task="" if record.get("task") == UNKNOWN else words_of(record.get("task")),
             fps=fps,
             timestamps=timestamps,
             actions=record["actions"].astype(np.float32),
