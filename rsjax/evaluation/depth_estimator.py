@@ -18,11 +18,15 @@ from rsjax.progress import Progress
 _CAMERA = "rgb"
 
 
-def choose_estimator(settings: EvalConfig) -> DepthEstimator | None:
-    """Returns the network that ``eval.depth_estimator`` names; None if it is empty. Nothing is loaded yet.
+def choose_estimator(settings: EvalConfig, load: bool = False) -> DepthEstimator | None:
+    """Returns the network that ``eval.depth_estimator`` names; None if it is empty.
+
+    Args:
+        load: load it now, and not at its first call.
 
     Raises:
         ConfigError: no such network or field, or a file that it names is missing.
+        AnnotationError: it cannot be loaded: a package or a device is missing, or a file is damaged.
     """
     if not settings.depth_estimator:
         return None
@@ -33,6 +37,8 @@ def choose_estimator(settings: EvalConfig) -> DepthEstimator | None:
             require(not isinstance(value, Path) or value.exists(), f"{name} {value} does not exist; mend the path")
     except ConfigError as error:
         raise ConfigError(f"eval.depth_estimator: {error}") from error
+    if load:
+        estimator.load()
     found: DepthEstimator = estimator
     return found
 

@@ -21,6 +21,7 @@ from rsjax.evaluation.metrics import delta_psnr
 from rsjax.evaluation.registry import Metric, Scene, Unavailable, metrics
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
+from rsjax.ingest.annotators.protocols import DepthEstimator
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tokenizers.lpips import load_lpips
@@ -66,11 +67,12 @@ def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
         StoreError: a test clip is damaged.
         UserError: a file of weights is missing, damaged or of another network, or the depth estimator cannot run.
     """
-    check_files(trained.config.eval)
     source, config = store.source("test"), trained.config
+    check_files(config.eval)
+    estimator = choose_estimator(config.eval, load=True)
     numbers = spread(source, config.eval.clips)
     clips = Clips.stacked([source[number] for number in numbers], numbers)
-    scenes = _scenes(trained, clips, _generate_all(trained, clips, store))
+    scenes = _scenes(trained, clips, _generate_all(trained, clips, store), estimator)
 
     scores: dict[str, float] = {}
     reasons: dict[str, str] = {}
@@ -127,14 +129,15 @@ def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: b
     return Video(rgb, np.concatenate(unknown)[: len(actions)])
 
 
-def _scenes(trained: TrainedModel, clips: Clips, videos: dict[str, list[Video]]) -> dict[str, Scene]:
+def _scenes(
+    trained: TrainedModel, clips: Clips, videos: dict[str, list[Video]], estimator: DepthEstimator | None
+) -> dict[str, Scene]:
     """Returns the prediction's scene as "", and those of both baselines by their suffix of names."""
     settings, prompt, truth = trained.config.eval, trained.config.prompt_frames, clips.metric_video
     alternatives = dict(videos)
     shown = {"": alternatives.pop("own")[0], "_repeat_first": _repeat_first(truth, prompt)}
     if (reconstruction := trained.model.reconstruct(trained.assets, clips.video)) is not None:
         shown["_tokenizer"] = reconstruction
-    estimator = choose_estimator(settings)
     rgb = {suffix: video.rgb for suffix, video in shown.items()}
     estimated = estimate_depth(estimator, truth.rgb, rgb) if estimator else {}
     return {

@@ -9,7 +9,7 @@ from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
 from rsjax.ingest.annotators.depth import metric_depth, relative_depth
-from rsjax.ingest.annotators.protocols import DepthMaps
+from rsjax.ingest.annotators.protocols import AnnotationError, DepthMaps
 from rsjax.ingest.episode import Episode
 from tests.ingest.annotators.networks.checkouts import check_out
 from tests.pipeline import toy
@@ -56,7 +56,7 @@ def test_relative_depth_of_both_videos_is_stretched_as_the_recorded_one() -> Non
 def test_a_model_without_depth_on_clips_without_depth_has_the_estimators_scores(
     metric: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluation, "choose_estimator", lambda settings: Brightness(metric))
+    monkeypatch.setattr(evaluation, "choose_estimator", lambda settings, load=False: Brightness(metric))
     blind = toy.store(tmp_path / "clips", depth=False)
     found = evaluation.evaluate(toy.trained(blind, toy.with_model(toy.config(), use_depth=False)), blind)
     depth = {name: value for name, value in found.metrics.items() if "depth" in name}
@@ -81,6 +81,9 @@ def test_the_configured_network_is_loaded_from_its_files(tmp_path: Path) -> None
     truth, made = videos(0, 60, 200), videos(1, 60, 200)
     both = [estimate_depth(network, truth, {"": made})[""] for network in (estimator, Brightness(metric=False))]
     np.testing.assert_allclose(both[0].prediction, both[1].prediction, rtol=1e-3)
+    (tmp_path / "w").write_bytes(b"not weights")
+    with pytest.raises(AnnotationError, match="not the weights of Video Depth Anything"):
+        choose_estimator(EvalConfig(depth_estimator=f"{word},input_size=14"), load=True)
     for name in [name for name in sys.modules if name.startswith("video_depth_anything")]:
         del sys.modules[name]  # other tests have checkouts of their own
 
