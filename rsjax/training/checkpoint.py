@@ -16,7 +16,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import FileError, disk_guard
+from rsjax.files import FileError, disk_guard, placeholder
 from rsjax.progress import note
 from rsjax.training.checksums import find_fault, read_metric, write_checksums
 from rsjax.training.distributed import agree, is_lead, on_lead
@@ -282,6 +282,9 @@ def _flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
 
 
 def _misfit(path: Path, error: Exception) -> CheckpointError:
+    for file in sorted(path.rglob("*")):
+        if instead := placeholder(file):
+            return CheckpointError(f"{file}: {instead}")
     return CheckpointError(
         f"{path}: does not fit this configuration or is damaged ({first_line(error)}); use the configuration it was "
         f"made with, or another run directory, or delete it"

@@ -113,3 +113,7 @@ def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> 
     truncate_largest(path)
     with pytest.raises(CheckpointError, match=rf"{path}: .*damaged"):
         load_weights(path, like)
+    for file in filter(Path.is_file, path.rglob("*")):
+        file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n")
+    with pytest.raises(CheckpointError, match=rf"{path}/.*: a Git-LFS pointer .* git lfs pull"):
+        load_weights(path, like)
