@@ -87,7 +87,7 @@ def test_unknown_formats_are_reported(tmp_path: Path) -> None:
         ("folder", {"after": "yes"}, "option after is 'yes', should be true or false$"),
         ("robomimic", {"depth": 1}, "option depth is 1, should be true or false$"),
         ("rlds", {"split": 1}, "option split is 1, should be text$"),
-        ("folder", {"xyz": 3}, "no option 'xyz'; it has task, fps, after, kind, held, quaternions"),
+        ("folder", {"xyz": 3}, "no option 'xyz'; it has task, fps, after, action, kind, held, quaternions"),
     ],
 )
 def test_options_are_checked(tmp_path: Path, name: str, options: dict[str, Any], message: str) -> None:
