@@ -128,7 +128,9 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
     if keys in MAPS:
         return MAPS[keys]
     if keys.endswith(".json"):
-        keymap = from_json(KeyMap, read_json(Path(keys)), keys)
+        values = read_json(Path(keys))
+        undeclared = {"kind": None, "held": None}  # the defaults are for the maps above, whose actions are known
+        keymap = from_json(KeyMap, undeclared | values if isinstance(values, dict) else values, keys)
         if not 0 < keymap.fps <= MAX_FPS:
             raise SourceError(f"{keys}: fps is {keymap.fps!r}, should be a number above 0 and at most {MAX_FPS:g}")
         if keymap.depth_scale <= 0:

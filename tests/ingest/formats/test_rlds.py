@@ -104,6 +104,15 @@ def test_a_key_map_that_does_not_fit_is_reported(tmp_path: Path, change: dict, m
         open_source("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
 
 
+def test_a_key_map_that_does_not_say_what_actions_are_leaves_them_undeclared(tmp_path: Path) -> None:
+    write_bridge(tmp_path / "data", [bridge_episode()])
+    keys: dict[str, Any] = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2}
+    for more, kind in (({}, "undeclared"), ({"kind": "delta", "held": []}, "delta")):
+        (tmp_path / "map.json").write_text(json.dumps(keys | more))
+        episode = read_first("rlds", tmp_path / "data", keys=str(tmp_path / "map.json"))
+        assert episode.meta["actions"]["kind"] == kind
+
+
 def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> None:
     write_bridge(tmp_path / "data", [bridge_episode()])
     keys = {"cameras": {"a": "observation/image_0"}, "action": ["action"], "fps": 2, "quaternions": [99]}
