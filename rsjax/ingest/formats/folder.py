@@ -196,14 +196,20 @@ class Folder:
 def _times(
     table: pa.Table, cameras: Mapping[str, Frames], fps: float, count: int, place: Path
 ) -> Float[np.ndarray, " N"]:
-    """Returns the seconds of the table, or those of the given rate, or the first video's own."""
+    """Returns the seconds of the table, or those of the given rate, or the videos' own, which must go together."""
     if "timestamp" in table.column_names:
         return seconds(table, "timestamp", place)
     if fps:
         return np.arange(count) / fps
-    for frames in cameras.values():
-        if isinstance(frames, VideoFrames):
-            return scan(frames.path).times()
+    clocks = {name: scan(f.path).times() for name, f in cameras.items() if isinstance(f, VideoFrames)}
+    for name, times in clocks.items():
+        first, own = next(iter(clocks.items()))
+        apart = np.abs((times - times[0]) - (own - own[0])) if len(times) == len(own) else np.zeros(1)
+        if apart.max() > np.diff(own).max(initial=1e-3):
+            problem = f"its frame {int(apart.argmax())} is shown {apart.max():.2g} s away from that of {first}"
+            raise EpisodeError.at(place / name, problem, "give timestamps in the table, or fps", "time")
+    if clocks:
+        return next(iter(clocks.values()))
     raise EpisodeError(f"{place}: how fast are its pictures? Give fps in dataset.json or timestamps")
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Layout, align_actions, continuous_signs
+from rsjax.ingest.actions import Kind, Layout, align_actions, continuous_signs
 from rsjax.ingest.episode import (
     LEAVE_OUT,
     MAX_FPS,
@@ -187,7 +187,7 @@ class DemoSource:
                 "demo": ref.location["demo"],
                 "environment": words_of(settings.get("env_name")),
                 "notes": {"flipped": flipped} if flipped else {},
-                "actions": Layout("delta", held=grippers).to_json(),
+                "actions": Layout(_kind(settings), held=grippers).to_json(),
             },
         )
 
@@ -280,6 +280,13 @@ def _fps(settings: dict[str, Any], path: Path) -> float:
     if not isinstance(fps, int | float) or not 0 <= fps <= MAX_FPS:
         raise EpisodeError.at(path, f"control_freq in data.env_args is {fps!r}, should be steps per second", "mend it")
     return float(fps)
+
+
+def _kind(settings: dict[str, Any]) -> Kind:
+    """Returns what the arms' commands are: targets if robosuite's controller says so, by its older or newer name."""
+    arguments = settings.get("env_kwargs")
+    text = json.dumps(arguments.get("controller_configs") if isinstance(arguments, dict) else None)
+    return "absolute" if '"control_delta": false' in text or '"input_type": "absolute"' in text else "delta"
 
 
 def _task(group: Any, settings: dict[str, Any], path: Path, how: Convention) -> str:

@@ -96,8 +96,8 @@ class StoreSource:
         steps = int(self.store.manifest.get("config", {}).get("control_steps", 1))
         fps, timestamps = _times(provenance, len(record["rgb"]), steps)
         width = record["actions"].shape[1]
-        grippers: tuple[int, ...] = ()
-        if "control_hz" in provenance and width % steps == 0:  # the last dimension of each control step of a simulator
+        ours, grippers = "control_hz" in provenance, tuple[int, ...]()
+        if ours and width % steps == 0:  # the last dimension of each control step of a simulator
             grippers = tuple(range(width // steps - 1, width, width // steps))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
         return Episode(
@@ -114,7 +114,7 @@ class StoreSource:
                 "source": self.store.manifest.get("source", "sim"),
                 "clip": place,
                 "provenance": provenance,
-                "actions": Layout(held=grippers).to_json(),
+                "actions": Layout("delta" if ours else "undeclared", held=grippers).to_json(),
                 "success": np.asarray(record.get("success", []), bool).tolist(),
             },
         )

@@ -278,6 +278,15 @@ def test_settings_that_cannot_be(tmp_path: Path) -> None:
         open_source("folder", tmp_path / "gone")
 
 
+def test_cameras_that_drift_apart_are_reported(tmp_path: Path) -> None:
+    for name, fps in (("front", 10), ("wrist", 5)):
+        write_video(tmp_path / f"one/{name}.mp4", range(COUNT), fps)
+    np.save(tmp_path / "one/actions.npy", ACTIONS)
+    assert "wrist: its frame 7 is shown 0.7 s away from that of front; give" in error_of("folder", tmp_path)
+    (episode,) = read_all("folder", tmp_path, fps=10)
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
+
+
 def test_times_that_count_from_1970(tmp_path: Path) -> None:
     place = write_episode(tmp_path)
     lines = ["timestamp,x", *(f"{1.7e9 + row / 10:.3f},{row}" for row in range(COUNT))]

@@ -159,3 +159,19 @@ def test_a_file_without_demos_is_one_entry(tmp_path: Path) -> None:
     (ref,) = source.episodes()
     with pytest.raises(EpisodeError, match=r"a.hdf5: its group data has no demos"):
         source.read(ref)
+
+
+@pytest.mark.parametrize(
+    ("controller", "kind"),
+    [
+        ({"type": "OSC_POSE", "control_delta": True}, "delta"),
+        ({"type": "OSC_POSE", "control_delta": False}, "absolute"),
+        ([{"control_delta": False}], "absolute"),
+        ({"body_parts": {"right": {"input_type": "absolute"}}}, "absolute"),
+        (None, "delta"),
+    ],
+)
+def test_the_controller_says_whether_commands_are_steps(tmp_path: Path, controller: object, kind: str) -> None:
+    arguments = {"env_kwargs": {"controller_configs": controller}}
+    path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()}, env_args=arguments)
+    assert read_first("robomimic", path).meta["actions"] == {"kind": kind, "held": [6], "quaternions": []}
