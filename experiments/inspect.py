@@ -23,7 +23,8 @@ class Options:
     records: int = 200
     """How many records to read, spread evenly; counts, tasks and difficulties are of all."""
     sheet: Path | None = None
-    """File for the sheet of pictures; STORE-sheet.png beside the store if not given."""
+    """File for the sheet of pictures, .png, .jpg, .webp or .html. Default: STORE-sheet.png beside the store, or .html
+    where no font of this machine has all letters of the captions."""
     clips: int = 12
     """How many clips to show on the sheet and in the viewer."""
     rerun: bool = False
@@ -37,22 +38,32 @@ def main() -> None:
     """Prints the contents and writes a sheet of pictures."""
     options = parse_options(sys.argv[1:], PROG, "Shows counts, shapes, histograms and a sheet of pictures.", Options())
     place = options.store
-    if options.sheet and options.sheet.suffix.lower() not in (".png", ".jpg", ".webp"):
-        raise ConfigError(f"--sheet is {options.sheet}; name a .png, .jpg or .webp file")
+    if options.sheet and options.sheet.suffix.lower() not in (".png", ".jpg", ".webp", ".html"):
+        raise ConfigError(f"--sheet is {options.sheet}; name a .png, .jpg, .webp or .html file")
     from PIL import Image
 
     from rsjax.data.store import open_store
-    from rsjax.files import disk_guard
-    from rsjax.report.contents import contact_sheet, describe
+    from rsjax.files import disk_guard, write_file
+    from rsjax.report.contents import describe
+    from rsjax.report.lettering import lacks_letters
     from rsjax.report.rerun_view import rerun_view
+    from rsjax.report.sheet import sheet_page, sheet_picture, sheet_rows
 
     store = open_store(place)
     lines, damaged = describe(store, options.records)
     print(f"store     {place.absolute()} ({store.manifest.get('kind')})", *lines, sep="\n")
     if store.manifest.get("kind") == "clips":
-        sheet = (options.sheet or place.absolute().with_name(f"{place.absolute().name}-sheet.png")).absolute()
+        rows = list(sheet_rows(store, options.clips))
+        unwritable = any(lacks_letters(caption) for caption, _ in rows)
+        name = f"{place.absolute().name}-sheet.{'html' if unwritable else 'png'}"
+        sheet = (options.sheet or place.absolute().with_name(name)).absolute()
         with disk_guard(sheet):
-            Image.fromarray(contact_sheet(store, options.clips)).save(sheet)
+            if sheet.suffix.lower() == ".html":
+                write_file(sheet, sheet_page(rows, place.absolute().name).encode())
+            else:
+                Image.fromarray(sheet_picture(rows)).save(sheet)
+                if unwritable:
+                    print("letters   no font here has all letters of the captions; --sheet NAME.html shows them")
         print(f"sheet: {sheet}")
     if options.rerun or options.rerun_file:
         for message in rerun_view(store, options.clips, options.rerun_file):

@@ -190,6 +190,7 @@ def _shown(clips: Clips, scenes: dict[str, Scene], count: int) -> dict[str, np.n
         "prediction": own.rgb[rows],
         "other_actions": other.rgb[rows],
         "has_depth": clips.has_depth[rows],
+        "metric": clips.metric[rows],
         "true_depth": clips.depth[rows],
         "tracks": clips.tracks[rows],
         "visible": clips.visible[rows],

@@ -54,7 +54,8 @@ def _figure(shown: dict[str, np.ndarray], row: int, config: Config) -> ClipFigur
     title = f"test clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
     if shown["success"].any():  # otherwise success may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
-    return ClipFigure(title=title, prompt_frames=config.prompt_frames, **arrays)
+    unit = "metres" if shown.get("metric", shown["has_depth"])[row] else "relative"
+    return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, **arrays)
 
 
 def _versions(run: Run) -> dict[str, str]:

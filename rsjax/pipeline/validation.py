@@ -67,6 +67,7 @@ class WorldModelValidation:
                 prediction=made.rgb[row],
                 true_depth=None if depth is None else clips.depth[row],
                 predicted_depth=depth,
+                depth_unit="metres" if clips.metric[row] else "relative",
                 prompt_frames=cfg.prompt_frames,
             )
             pictures[f"clip_{number:03d}"] = filmstrip(figure)

@@ -148,4 +148,5 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
 def _side_by_side(clip: Record, made: Video, number: int) -> UInt8[np.ndarray, "T H W 3"]:
     shown = len(made.rgb[0])
     depth = {} if made.depth is None else {"true_depth": clip["depth"][:shown], "predicted_depth": made.depth[0]}
-    return animation(ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth))
+    figure = ClipFigure(title=f"clip {number}", truth=clip["rgb"][:shown], prediction=made.rgb[0], **depth)
+    return animation(dataclasses.replace(figure, depth_unit=clip["provenance"].get("depth_unit") or "metres"))

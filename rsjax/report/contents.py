@@ -1,25 +1,16 @@
-"""The contents of a store: counts, shapes and histograms as text, and clips as a sheet of pictures.
-
-Axes: T frames, H×W pixels, n pictures.
-"""
+"""The contents of a store: counts, shapes and histograms as text."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from rsjax.data.codec import Record
-from rsjax.data.depth_color import depth_to_color
 from rsjax.data.store import NO_ARRAY, Store, StoreError
 from rsjax.data.token_sets import token_sets
 
 BARS = " ▁▂▃▄▅▆▇█"
-GAP = 4  # pixels between pictures
-CAPTION = 16  # pixels high
-BACKGROUND = 30
 MOST_DIMENSIONS = 32  # of actions whose means are listed one by one
 MOST_WORDS = 10  # of a column's labels
 TRACK_UNIT = "% of a side per frame"
@@ -99,27 +90,6 @@ def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:
     levels = np.ceil(heights / max(heights.max(), 1) * (len(BARS) - 1)).astype(int)
     bars = "".join(BARS[level] for level in levels)
     return f"{edges[0]:.3g} {bars} {edges[-1]:.3g} {unit}, median {np.median(values):.3g}"
-
-
-def contact_sheet(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a picture with ``frames`` frames of some clips, a row for each clip and one below it for its depth.
-
-    The clips are spread evenly over the store. Above each stands its split, its number there and its task.
-
-    Raises:
-        StoreError: the store holds tokens, or no clip can be read.
-    """
-    rows: list[np.ndarray] = []
-    for split, number, record in clips_of(store, clips, []):
-        times = np.linspace(0, len(record["rgb"]) - 1, frames).round().astype(int)
-        pictures = _row(record["rgb"][times], side)
-        rows += [_caption(f"{split} {number}: {record['task']}", pictures.shape[1]), pictures]
-        if record.get("depth") is not None:
-            depth = record["depth"]
-            near, far = float(depth.min()), float(depth.max())
-            colors = depth_to_color(depth[times], near, max(far, near * 1.001), "inverse")
-            rows.append(_row(colors.astype(np.uint8), side))
-    return np.concatenate(rows)
 
 
 def clips_of(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
@@ -202,21 +172,6 @@ def _ranked(words: Counter[str]) -> str:
     return ", ".join(f"{word!r} {count}×" for word, count in words.most_common(MOST_WORDS)) + (
         f", {more} more" if more > 0 else ""
     )
-
-
-def _row(pictures: UInt8[np.ndarray, "n H W 3"], side: int) -> UInt8[np.ndarray, "h w 3"]:
-    height = max(1, round(side * pictures.shape[1] / pictures.shape[2]))
-    small = [cv2.resize(picture, (side, height), interpolation=cv2.INTER_AREA) for picture in pictures]
-    framed = [np.pad(one, ((0, GAP), (0, GAP), (0, 0)), constant_values=BACKGROUND) for one in small]
-    return np.concatenate(framed, axis=1)
-
-
-def _caption(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a line of small text, cut off at the width; question marks stand for letters that OpenCV lacks."""
-    strip = np.full((CAPTION, width, 3), BACKGROUND, np.uint8)
-    shown = " ".join(text.split()).encode("ascii", "replace").decode()
-    cv2.putText(strip, shown, (GAP, CAPTION - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (230, 230, 230), 1, cv2.LINE_AA)
-    return strip
 
 
 def _counted(numbers: Mapping[str, int]) -> str:

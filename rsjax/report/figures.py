@@ -5,17 +5,17 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
-from matplotlib import font_manager
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
-from rsjax.report.video import depth_to_colors, resize
+from rsjax.report.depth_view import SCALE, depth_range, depth_scale, depth_to_colors
+from rsjax.report.lettering import font
+from rsjax.report.video import resize
 
 _BACKGROUND = (24, 26, 30)  # dark, which suits light and dark pages alike
 _TEXT = (222, 225, 230)
 _FAINT = (120, 126, 136)
 _GAP = 6
 _TRAILS = matplotlib.colormaps["plasma"]
-_FONT = font_manager.findfont("DejaVu Sans")
 
 _CELL_ANIMATION = 192  # approximate side of a frame in pixels
 _CELL_FILMSTRIP = 128
@@ -33,8 +33,9 @@ class ClipFigure:
         prediction: frames generated from the prompt and the clip's own actions.
         reconstruction: the truth, encoded and decoded by the tokenizer: an upper bound on any prediction's quality.
         other_actions: frames generated from the same prompt and another clip's actions.
-        true_depth: metres.
-        predicted_depth: metres, from the depth branch.
+        true_depth: metres, or relative; 0 or NaN where there is none.
+        predicted_depth: likewise, from the depth branch.
+        depth_unit: "metres" or "relative".
         tracks: keypoints, x and y in 0–1 as in :class:`rsjax.clip.Clip`.
         visible: as in :class:`rsjax.clip.Clip`.
         selected: indices of the top-K tracks by motion.
@@ -55,6 +56,7 @@ class ClipFigure:
     visible: Bool[np.ndarray, "N0 T"] | None = None
     selected: Int[np.ndarray, " K"] | None = None
     prompt_frames: int = 1
+    depth_unit: str = "metres"
 
     def __post_init__(self) -> None:
         shape = self.truth.shape
@@ -66,12 +68,15 @@ class ClipFigure:
             raise ValueError(f"visible of clip {self.title!r} must have its tracks' shape {self.tracks.shape[:2]}")
 
     def depth_range(self) -> tuple[float, float]:
-        """Returns the depths in metres of the first and last colour: 1st and 99th percentile, of the truth if known."""
+        """Returns the depths of the first and last colour, of the truth if known."""
         depth = self.true_depth if self.true_depth is not None else self.predicted_depth
         if depth is None:
             raise ValueError(f"clip {self.title!r} has no depth")
-        near, far = np.nanpercentile(depth, [1, 99])
-        return float(near), float(max(far, near + 1e-3))
+        return depth_range(depth)
+
+    def has_depth(self) -> bool:
+        """Returns whether rows of depth, and their scale, are drawn."""
+        return self.true_depth is not None or self.predicted_depth is not None
 
     def rows(self) -> list[tuple[str, UInt8[np.ndarray, "T H W 3"]]]:
         """Returns the label (up to two lines) and the RGB frames of each row."""
@@ -98,17 +103,21 @@ def filmstrip(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
     scale = _scale(clip, _CELL_FILMSTRIP)
     height, width = (side * scale for side in clip.truth.shape[1:3])
     top, left = filmstrip_cell(clip, len(rows), len(times))
-    sheet, draw = _sheet(left, top)
+    sheet, draw = _sheet(left, top + (SCALE + _GAP if clip.has_depth() else 0))
     for j, t in enumerate(times):
         y, x = filmstrip_cell(clip, 0, j)
         name = f"frame {t + 1}" + (", prompt" if t < clip.prompt_frames else "")
-        draw.text((x + width // 2, y - 6), name, fill=_FAINT, font=_font(13), anchor="ms")
+        draw.text((x + width // 2, y - 6), name, fill=_FAINT, font=font(13), anchor="ms")
     for i, (label, frames) in enumerate(rows):
         y, x = filmstrip_cell(clip, i, 0)
-        draw.text((x - 10, y + height // 2), label, fill=_TEXT, font=_font(14), anchor="rm", align="right")
+        draw.text((x - 10, y + height // 2), label, fill=_TEXT, font=font(14), anchor="rm", align="right")
         for j, frame in enumerate(resize(frames[times], scale)):
             y, x = filmstrip_cell(clip, i, j)
             sheet.paste(Image.fromarray(frame), (x, y))
+    if clip.has_depth():
+        first = filmstrip_cell(clip, 0, 0)[1]
+        draw.text((first - 10, top + _GAP + 6), "depth", fill=_TEXT, font=font(14), anchor="rm")
+        sheet.paste(Image.fromarray(_depth_scale(clip, left - _GAP - first)), (first, top + _GAP))
     return np.asarray(sheet)
 
 
@@ -125,10 +134,15 @@ def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
     height, width = (side * scale for side in clip.truth.shape[1:3])
     top, bottom = 46, 30
     cells = [resize(frames, scale) for _, frames in rows]
-    empty, draw = _sheet(_GAP + len(rows) * (width + _GAP), top + height + bottom)
+    low = SCALE + _GAP if clip.has_depth() else 0
+    empty, draw = _sheet(_GAP + len(rows) * (width + _GAP), top + height + low + bottom)
     for i, (label, _) in enumerate(rows):
         x = _GAP + i * (width + _GAP)
-        draw.text((x + width // 2, top // 2), label, fill=_TEXT, font=_font(14), anchor="mm", align="center")
+        draw.text((x + width // 2, top // 2), label, fill=_TEXT, font=font(14), anchor="mm", align="center")
+    if clip.has_depth():
+        shown = [i for i, (label, _) in enumerate(rows) if label.endswith("depth")]
+        x, end = (_GAP + i * (width + _GAP) for i in (shown[0], shown[-1] + 1))
+        empty.paste(Image.fromarray(_depth_scale(clip, end - _GAP - x)), (x, top + height + _GAP))
     count = len(clip.truth)
     sheets = []
     for t in range(count):
@@ -136,9 +150,9 @@ def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
         for i, frames in enumerate(cells):
             sheet.paste(Image.fromarray(frames[t]), (_GAP + i * (width + _GAP), top))
         draw = ImageDraw.Draw(sheet)
-        y = top + height + bottom // 2
+        y = top + height + low + bottom // 2
         name = f"frame {t + 1} of {count}" + (", prompt" if t < clip.prompt_frames else "")
-        draw.text((_GAP, y), name, fill=_FAINT, font=_font(13), anchor="lm")
+        draw.text((_GAP, y), name, fill=_FAINT, font=font(13), anchor="lm")
         start, end = 170, sheet.width - _GAP
         draw.line((start, y, end, y), fill=(60, 64, 70), width=3)
         draw.line((start, y, start + (end - start) * (t + 1) // count, y), fill=_TEXT, width=3)
@@ -182,10 +196,10 @@ def _scale(clip: ClipFigure, target: int) -> int:
     return max(1, round(target / clip.truth.shape[1]))
 
 
+def _depth_scale(clip: ClipFigure, width: int) -> UInt8[np.ndarray, "h w 3"]:
+    return depth_scale(*clip.depth_range(), width, clip.depth_unit, _BACKGROUND)
+
+
 def _sheet(width: int, height: int) -> tuple[Image.Image, ImageDraw.ImageDraw]:
     sheet = Image.new("RGB", (width, height), _BACKGROUND)
     return sheet, ImageDraw.Draw(sheet)
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.truetype(_FONT, size)

@@ -1,4 +1,4 @@
-"""Encodes frames as MP4 and GIF files and WebP data URIs, and colours depth for viewing."""
+"""Encodes frames as MP4 and GIF files and WebP data URIs."""
 
 import base64
 import io
@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 import av
-import matplotlib
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
 from rsjax.files import write_file
@@ -19,7 +18,6 @@ Resample = Literal["nearest", "bicubic"]
 _FILTERS = {"nearest": Image.Resampling.NEAREST, "bicubic": Image.Resampling.BICUBIC}
 _HOLD = 4  # the last frame of a looping animation lasts this many times longer
 _H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
-_TURBO = np.round(matplotlib.colormaps["turbo"](np.linspace(1, 0, 256))[:, :3] * 255).astype(np.uint8)
 
 
 def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
@@ -79,21 +77,6 @@ def resize(
         return frames
     height, width = (side * scale for side in frames.shape[1:3])
     return np.stack([np.asarray(Image.fromarray(f).resize((width, height), _FILTERS[resample])) for f in frames])
-
-
-def depth_to_colors(depth: Float[np.ndarray, "..."], near: float, far: float) -> UInt8[np.ndarray, "... 3"]:
-    """Colours depth in metres with the turbo map: red at ``near`` and closer, violet at ``far`` and farther.
-
-    Colour is linear in 1/depth, which resolves close depths best. NaN (unknown) counts as far. For viewing only: the
-    tokenizer sees the colours of :mod:`rsjax.data.depth_color`.
-
-    Raises:
-        ValueError: not 0 < ``near`` < ``far``.
-    """
-    if not 0 < near < far:
-        raise ValueError(f"depth colours need 0 < near < far, not near = {near} m and far = {far} m")
-    share = (1 / near - 1 / np.clip(np.nan_to_num(depth, nan=far), near, far)) / (1 / near - 1 / far)
-    return _TURBO[np.round(share * 255).astype(np.uint8)]
 
 
 def _check(frames: UInt8[np.ndarray, "T H W 3"], fps: float) -> None:

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from rsjax.data.store import StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokens_key
-from rsjax.report.contents import contact_sheet, describe, histogram, motion_of, sampled
+from rsjax.report.contents import describe, histogram, motion_of, sampled
+from rsjax.report.depth_view import SCALE, depth_to_colors
+from rsjax.report.lettering import lacks_letters
+from rsjax.report.sheet import CAPTION, sheet_page, sheet_picture, sheet_rows
 from tests.data.clips import clip, clip_store
-
-CAPTION = 16  # pixels above each clip
 
 
 def test_counts_labels_and_shapes_are_those_of_the_store(tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_a_damaged_record_is_reported_and_the_others_are_shown(tmp_path: Path) -
     shard.write_bytes(payload)
     lines, damaged = describe(store)
     assert "test-00000" in damaged[0] and f"damaged   {damaged[0]}" in lines
-    assert len(contact_sheet(store)) > 0
+    assert list(sheet_rows(store))
 
 
 def test_what_the_manifest_and_the_clips_say_of_their_origin_is_reported(tmp_path: Path) -> None:
@@ -98,16 +99,18 @@ def test_a_merged_store_shows_what_was_left_out_of_its_parts(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("depth_range", [None, [1.0, 2.0]])
 def test_the_sheet_shows_the_clips_frames(tmp_path: Path, depth_range: list[float] | None) -> None:
-    sheet = contact_sheet(clip_store(tmp_path / "a", depth_range=depth_range), clips=3, frames=2, side=10)
-    rows = 3 if depth_range is None else 6
-    assert sheet.shape == (rows * 14 + 3 * CAPTION, 2 * 14, 3) and sheet.dtype == np.uint8
+    sheet = sheet_picture(list(sheet_rows(clip_store(tmp_path / "a", depth_range=depth_range), 3, 2, 10)))
+    height = 14 if depth_range is None else 2 * 14 + SCALE
+    assert sheet.shape == (3 * (height + CAPTION), 2 * 14, 3) and sheet.dtype == np.uint8
     assert sheet[CAPTION, 0].tolist() == [0, 0, 0]
-    assert sheet[-14 if depth_range is None else -28, 0].tolist() == [91, 91, 91]
+    assert sheet[-height, 0].tolist() == [91, 91, 91]
+    if depth_range is not None:
+        assert sheet[-height + 14, 0].tolist() == depth_to_colors(np.array(1.0), 1.0, 1.001).tolist()
 
 
 def test_each_row_of_the_sheet_is_captioned_with_its_own_number_and_task(tmp_path: Path) -> None:
     store = clip_store(tmp_path / "a", count=4, depth_range=[1.0, 2.0])
-    sheet = contact_sheet(store, clips=6, frames=3)
+    sheet = sheet_picture(list(sheet_rows(store, clips=6, frames=3)))
     height = len(sheet) // 6
     captions = [sheet[row * height : row * height + CAPTION] for row in range(6)]
     assert len({caption.tobytes() for caption in captions}) == 6 and all(caption.max() > 200 for caption in captions)
@@ -115,6 +118,15 @@ def test_each_row_of_the_sheet_is_captioned_with_its_own_number_and_task(tmp_pat
     assert places == [("train", 0), ("train", 1), ("train", 2), ("train", 3), ("test", 0), ("test", 1)]
     for split, number, record in sampled(store, 6, []):
         assert record["provenance"]["number"] == number + (90 if split == "test" else 0)
+
+
+def test_captions_are_drawn_in_a_font_with_their_letters_or_shown_by_a_page() -> None:
+    assert not lacks_letters("Fülle den Топf mit ναρό") and lacks_letters("\U0010fffd")
+    row = np.zeros((4, 200, 3), np.uint8)
+    pictures = [sheet_picture([(text, row)]).tobytes() for text in ("ж", "я", "?")]
+    assert len(set(pictures)) == 3
+    page = sheet_page([("折る <b>", row), ("fold", row)], "a & b")
+    assert "折る &lt;b&gt;" in page and "<title>a &amp; b</title>" in page and page.count("data:image/webp") == 2
 
 
 @given(st.lists(st.floats(0, 100)))
@@ -126,4 +138,4 @@ def test_a_histogram_is_one_line(values: list[float]) -> None:
 
 def test_a_store_without_a_readable_clip_has_no_sheet(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"no clip can be read"):
-        contact_sheet(clip_store(tmp_path / "a"), clips=0)
+        list(sheet_rows(clip_store(tmp_path / "a"), clips=0))

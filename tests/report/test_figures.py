@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from rsjax.report.depth_view import SCALE, depth_to_colors
 from rsjax.report.figures import animation, filmstrip, filmstrip_cell, keypoints
 from rsjax.report.video import resize
 
@@ -22,7 +23,12 @@ def test_filmstrip_cells_are_the_frames(make_clip):
         for j, t in enumerate(times):
             y, x = filmstrip_cell(clip, i, j)
             np.testing.assert_array_equal(sheet[y : y + 128, x : x + 128], resize(frames[t : t + 1], 4)[0])
-    assert sheet.shape[:2] == filmstrip_cell(clip, 6, 8)
+    height, width = filmstrip_cell(clip, 6, 8)
+    assert sheet.shape[:2] == (height + SCALE + 6, width)
+    near, far = depth_to_colors(np.array(clip.depth_range()), *clip.depth_range())
+    scale = sheet[height + 6 + 4]
+    first = filmstrip_cell(clip, 0, 0)[1]
+    np.testing.assert_array_equal(scale[[first, width - 7]], [near, far])
 
 
 def test_a_short_clip_shows_each_frame_once(make_clip):
@@ -38,6 +44,10 @@ def test_animation_has_every_frame_and_row(make_clip):
         for i, (_, frames) in enumerate(clip.rows()):
             x = 6 + i * (192 + 6)
             np.testing.assert_array_equal(sheets[t, 46 : 46 + 192, x : x + 192], resize(frames[t : t + 1], 6)[0])
+    x = 6 + 4 * (192 + 6)
+    bar = sheets[:, 46 + 192 + 6 + 4, [x, x + 2 * 192 + 5]]
+    np.testing.assert_array_equal(bar[0], depth_to_colors(np.array([1.0, 2.0]), 1.0, 2.0))
+    assert (bar == bar[0]).all()
 
 
 def test_missing_rows_are_left_out(make_clip):
@@ -51,6 +61,9 @@ def test_missing_rows_are_left_out(make_clip):
 def test_both_depths_share_the_true_range(make_clip):
     clip = make_clip()
     assert clip.depth_range() == (1.0, 2.0)
+    unknown = make_clip(true_depth=np.where(clip.true_depth == 1, 0, clip.true_depth))
+    assert unknown.depth_range()[0] == 2.0
+    assert dict(unknown.rows())["true depth"][0, 10, 6].tolist() == [0, 0, 0]
     rows = dict(clip.rows())
     np.testing.assert_array_equal(rows["predicted depth"][0, 0, 0], rows["true depth"][0, 0, 0])  # both beyond far
     assert (rows["predicted depth"][0, 10, 6] != rows["true depth"][0, 10, 6]).any()

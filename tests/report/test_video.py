@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rsjax.report.video import animation_uri, depth_to_colors, resize, webp_uri, write_gif, write_mp4
+from rsjax.report.video import animation_uri, resize, webp_uri, write_gif, write_mp4
 
 _COLORS = np.array([[200, 40, 40], [40, 180, 60], [40, 60, 200], [220, 220, 220], [20, 20, 20]], np.uint8)
 
@@ -67,21 +67,6 @@ def test_uris_decode_to_their_images():
 def test_nearest_enlargement_repeats_pixels():
     frames = np.random.default_rng(0).integers(0, 256, (2, 3, 4, 3)).astype(np.uint8)
     np.testing.assert_array_equal(resize(frames, 3, "nearest"), frames.repeat(3, axis=1).repeat(3, axis=2))
-
-
-def test_depth_colours_run_from_red_to_violet_and_clip():
-    colors = depth_to_colors(np.array([0.1, 0.5, 1.0, 2.0, 9.0, np.nan]), near=0.5, far=2.0).astype(int)
-    np.testing.assert_array_equal(colors[0], colors[1])
-    np.testing.assert_array_equal(colors[3], colors[4])
-    np.testing.assert_array_equal(colors[3], colors[5])
-    assert colors[1, 0] > colors[1, 2]
-    assert colors[3, 2] > colors[3, 1]
-    assert len(np.unique(colors[1:4], axis=0)) == 3
-    middle = 1 / ((1 / 0.5 + 1 / 2.0) / 2)
-    np.testing.assert_array_equal(depth_to_colors(np.array(middle), 0.5, 2.0), depth_to_colors(np.array(1.5), 1.2, 2.0))
-    for near in (2.0, 0.0):
-        with pytest.raises(ValueError, match="0 < near < far"):
-            depth_to_colors(np.ones(3), near, 2.0)
 
 
 @pytest.mark.parametrize(
