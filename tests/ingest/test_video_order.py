@@ -108,7 +108,7 @@ def test_the_doctor_compares_seeking_with_decoding_in_order(tmp_path: Path, monk
     def kinds() -> set[str]:
         video_index._scan.cache_clear()
         close_videos()
-        source = open_source("folder", tmp_path, task="go", kind="delta")
+        source = open_source("folder", tmp_path, task="go", kind="delta", held=[])
         findings, _ = checks.check_episode(source.read(next(source.episodes())), checks.Thresholds(frames=2))
         return {finding.kind for finding in findings}
 
@@ -128,7 +128,7 @@ def test_uneven_videos_give_clips_at_one_rate(tmp_path: Path, name: str, ending:
     (tmp_path / "one").mkdir()
     check_order(write(tmp_path / f"one/main.{ending}", name, stamps))
     np.save(tmp_path / "one/actions.npy", np.ones((COUNT, 2)))
-    source = open_source("folder", tmp_path, task="go", kind="delta")
+    source = open_source("folder", tmp_path, task="go", kind="delta", held=[])
     episode = source.read(next(source.episodes()))
     np.testing.assert_allclose(episode.timestamps, stamps / 30, atol=1e-3)
     clips = list(cut(Annotated(episode), ClipConfig(WindowConfig(frames=3, rate=5), image_size=32, tracks=1)))
