@@ -262,7 +262,7 @@ class _Fitted:
         config: ClipConfig,
         pictures: "_Fitted | None" = None,
     ) -> None:
-        self._read, self._config, self._pictures = read, config, pictures or self
+        self._read, self._config, self._pictures = read, config, pictures
         self.placement: Placement | None = None
         self._kept: dict[int, np.ndarray] = {}
 
@@ -276,7 +276,8 @@ class _Fitted:
         return np.stack([self._kept[frame] for frame in frames])
 
     def _fitted(self, picture: np.ndarray) -> np.ndarray:
-        if self._pictures.placement is None:
+        leading = self._pictures or self  # kept in a field, a reference to itself would keep its pictures in memory
+        if leading.placement is None:
             height, width = picture.shape[:2]
-            self._pictures.placement = Placement.create(self._config.fit, height, width, self._config.image_size)
-        return self._pictures.placement.picture(picture)
+            leading.placement = Placement.create(self._config.fit, height, width, self._config.image_size)
+        return leading.placement.picture(picture)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from experiments.cli import main_errors, parse
-from tests.soak.runs import Options, Soak
+from tests.soak.runs import Options, Soak, without
 from tests.soak.soak import run_soak
 from tests.soak.table import markdown, passed
 
@@ -29,13 +29,7 @@ def main() -> None:
 def training_arguments(argv: Sequence[str]) -> tuple[str, ...]:
     """Returns the arguments for ``experiments.train``: those that are not options of this command alone."""
     own = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Options)}
-    kept, words = [], iter(argv)
-    for word in words:
-        if word.partition("=")[0].replace("_", "-") not in own:
-            kept.append(word)
-        elif "=" not in word:
-            next(words, None)  # its value
-    return tuple(kept)
+    return without(argv, own)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import json
 import shutil
 import statistics
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -78,9 +78,21 @@ class Soak:
         return self.options.reference or self.out / "reference"
 
     def command(self, run: Path, data: Path, *more: str) -> tuple[str, ...]:
-        """Returns the training command, as a user would type it."""
-        places = ("--run-dir", str(run), "--data-dir", str(data))
-        return (sys.executable, "-m", "experiments.train", *self.arguments, *places, *more)
+        """Returns the training command, as a user would type it; ``more`` replaces options of the user's."""
+        more = ("--run-dir", str(run), "--data-dir", str(data), *more)
+        own = without(self.arguments, {word.partition("=")[0] for word in more if word.startswith("--")})
+        return (sys.executable, "-m", "experiments.train", *own, *more)
+
+
+def without(argv: Sequence[str], flags: Collection[str]) -> tuple[str, ...]:
+    """Returns arguments without these options, each with one value, whose names have dashes."""
+    kept, words = [], iter(argv)
+    for word in words:
+        if word.partition("=")[0].replace("_", "-") not in flags:
+            kept.append(word)
+        elif "=" not in word:
+            next(words, None)  # its value
+    return tuple(kept)
 
 
 def make_reference(soak: Soak, show: Callable[[str], None]) -> None:

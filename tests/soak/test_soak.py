@@ -13,7 +13,7 @@ from tests.soak.__main__ import training_arguments
 from tests.soak.conftest import Dummies
 from tests.soak.faults import FULL_DISK, SHARES
 from tests.soak.rounds import SoakError
-from tests.soak.runs import Options, Soak
+from tests.soak.runs import Options, Soak, without
 from tests.soak.soak import run_soak
 from tests.soak.table import HEADER, conclusion, markdown, passed, rows
 
@@ -130,3 +130,8 @@ def test_training_gets_the_arguments_that_are_not_the_soaks_own() -> None:
     )
     kept = "tiny --train.steps 9 --train.curriculum simple:2 difficult:3"
     assert " ".join(training_arguments(argv.split())) == kept
+
+
+def test_options_of_the_soak_replace_those_of_the_user() -> None:
+    argv = ("tiny", "--train.steps=9", "--train.log_every", "5", "--train.seed", "1")
+    assert without(argv, {"--train.steps", "--train.log-every"}) == ("tiny", "--train.seed", "1")
