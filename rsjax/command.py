@@ -46,7 +46,7 @@ def main_errors() -> Iterator[None]:
     with stop_signals() as received:
         try:
             yield
-        except (Exception, KeyboardInterrupt, Preempted) as error:
+        except (Exception, KeyboardInterrupt) as error:
             line, status = _answer(error, received)
             if line is None:
                 raise
@@ -56,10 +56,10 @@ def main_errors() -> Iterator[None]:
 def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]:
     """Returns the line that reports an error, None for a bug, and the exit status."""
     # A signal may come out as another error, such as an ImportError where it hit an import.
-    if isinstance(error, KeyboardInterrupt) or signal.SIGINT in received:
-        return INTERRUPTED, 130
     if isinstance(error, Preempted):
         return str(error), os.EX_TEMPFAIL
+    if isinstance(error, KeyboardInterrupt) or signal.SIGINT in received:
+        return INTERRUPTED, 130
     if signal.SIGTERM in received:
         return TERMINATED, os.EX_TEMPFAIL
     if isinstance(error, UserError):

@@ -36,9 +36,9 @@ def first_line(error: object) -> str:
     return str(error).strip().partition("\n")[0][:200] or type(error).__name__
 
 
-class Preempted(BaseException):
+class Preempted(KeyboardInterrupt):
     """The process was stopped by SIGTERM, with its work saved. The message says how to resume.
 
-    Like :class:`KeyboardInterrupt` not an :class:`Exception`: it may be raised anywhere, and error handlers there must
-    not catch it.
+    A :class:`KeyboardInterrupt`, as it may be raised anywhere, and error handlers there must not catch it: asyncio, in
+    which orbax saves and restores, logs and drops every other exception and would then wait for ever.
     """

@@ -47,6 +47,14 @@ try:
 except BaseException as error:
     raise ImportError("numpy failed to import") from error
 """
+IN_ASYNCIO = """
+import asyncio
+runtime.STOP_SECONDS = 600
+async def main():
+    asyncio.get_running_loop().call_soon(said, lambda: time.sleep(600))
+    await asyncio.sleep(600)
+asyncio.run(main())
+"""
 CLEANING_UP = """
 try:
     said(lambda: time.sleep(600))
@@ -84,7 +92,7 @@ def stopped(lines: str, number: int, again: bool = False) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    "lines", ["said(lambda: time.sleep(600))", IN_C, IN_AN_IMPORT, CLEANING_UP, IN_A_GARBAGE_COLLECTION]
+    "lines", ["said(lambda: time.sleep(600))", IN_C, IN_AN_IMPORT, CLEANING_UP, IN_A_GARBAGE_COLLECTION, IN_ASYNCIO]
 )
 def test_sigterm_ends_a_command_whatever_it_does(lines: str) -> None:
     assert stopped(lines, signal.SIGTERM) == (75, TERMINATED)
@@ -95,6 +103,6 @@ def test_a_second_interrupt_ends_a_command_at_once_in_one_line(lines: str) -> No
     assert stopped(lines, signal.SIGINT, again=True) == (130, INTERRUPTED)
 
 
-@pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION, COMPILING])
+@pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION, IN_ASYNCIO, COMPILING])
 def test_one_interrupt_is_one_line(lines: str) -> None:
     assert stopped(lines, signal.SIGINT) == (130, INTERRUPTED)

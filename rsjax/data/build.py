@@ -18,7 +18,7 @@ from rsjax.data.codec import Record, encode
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
 from rsjax.errors import did_you_mean
-from rsjax.files import disk_guard
+from rsjax.files import disk_guard, making
 
 TRACKS = 256  # of clips without tracks
 _LABELS = ("difficulty", "scene", "segment", "skill")
@@ -66,7 +66,9 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
             writer.close()
         if not count:
             raise StoreError(f"{path}: there are no clips to write")
-        _write(path, Source(Path(folder), "clips", [(spool.name, count)]), episodes, test_share, digest, scored)
+        spooled = Source(Path(folder), "clips", [(spool.name, count)])
+        with making(path, wait=True):
+            _write(path, spooled, episodes, test_share, digest, scored)
     return open_store(path)
 
 

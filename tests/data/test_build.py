@@ -80,7 +80,7 @@ def test_all_clips_of_an_episode_are_in_one_split(
     ]
     assert not episodes[0] & episodes[1] and episodes[1] == choose_test(set(names), share)
     assert sum(store.counts().values()) == len(names) and episodes[0]
-    assert not [file for file in path.parent.iterdir() if file != path]
+    assert {file.name for file in path.parent.iterdir()} == {"mine", ".mine.lock"}, "the lock stays"
 
 
 WRONG = [
