@@ -50,7 +50,10 @@ def main() -> None:
     grid = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
     number = options.cell
     if number is None and not options.list and (task := os.environ.get(TASK)):
-        require(task.isdigit(), f"{TASK} is {task!r}, not a cell's number; unset it, or choose with --cell")
+        require(
+            task.isascii() and task.isdecimal(),
+            f"{TASK} is {task!r}, not a cell's number; unset it, or choose with --cell",
+        )
         number = int(task)
     choice = Choice(number, options.only, options.skip)
     # Loads JAX, so only after the arguments have been checked.

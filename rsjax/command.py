@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Collection, Iterator, Sequence
 
-from rsjax.errors import Preempted, UserError
+from rsjax.errors import Preempted, UserError, storage_limit
 from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
 
 
@@ -43,6 +43,7 @@ def main_errors() -> Iterator[None]:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
+    os.environ["MPLBACKEND"] = "agg"  # figures only go to files; the import fails with a backend that it does not know
     with stop_signals() as received:
         try:
             yield
@@ -62,6 +63,8 @@ def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]
         return INTERRUPTED, 130
     if signal.SIGTERM in received:
         return TERMINATED, os.EX_TEMPFAIL
+    if missing := _no_device(error):  # also where it came out as another error, such as one of a checkpoint
+        return f"error: {missing}", 2
     if isinstance(error, UserError):
         return f"error: {error}", error.status
     cure = _cure(error)
@@ -70,12 +73,30 @@ def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]
 
 def _cure(error: BaseException) -> str | None:
     where = f" at {error.filename}" if isinstance(error, OSError) and error.filename else ""
-    # Orbax, TensorStore and ArrayRecord report a full disk in errors of their own.
-    if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or "No space left on device" in str(error):
-        return f"disk full{where}; free some space or choose another directory: the same command resumes"
+    if limit := storage_limit(error):
+        cause, _, cure = limit.partition("; ")
+        return f"{cause}{where}; {cure}: the same command resumes"
     if isinstance(error, PermissionError) or getattr(error, "errno", None) == errno.EROFS:
         return f"no permission to write or read{where}; choose another directory or change its owner"
+    if where:  # a directory in place of a file, a file in place of a directory, a place where none can be made
+        return f"{error.strerror}{where}; choose another path"  # type: ignore[union-attr,attr-defined]
     return None
+
+
+def _no_device(error: BaseException | None) -> str:
+    """Says that JAX has no device of the kind that JAX_PLATFORMS asks for, if this is why an error was raised."""
+    platforms, jax = os.environ.get("JAX_PLATFORMS"), sys.modules.get("jax")
+    while platforms and jax is not None and error is not None:
+        # For a kind that it knows, jax raises an empty AssertionError.
+        if isinstance(error, AssertionError) or "Unable to initialize backend" in str(error):
+            try:
+                jax.devices()
+            except Exception:
+                return (
+                    f"JAX has no device for JAX_PLATFORMS={platforms}; unset it to use what there is, or set it to cpu"
+                )
+        error = error.__cause__ or error.__context__
+    return ""
 
 
 def _exit(line: str, status: int) -> None:

@@ -1,6 +1,8 @@
 """Errors that a user can fix. Commands print each as one line without a traceback."""
 
 import difflib
+import errno
+import os
 from collections.abc import Iterable
 
 
@@ -34,6 +36,25 @@ def did_you_mean(word: str, choices: Iterable[str], prefix: str = "") -> str:
 def first_line(error: object) -> str:
     """Returns the first line of an error's message, at most 200 characters, or its type's name where it has none."""
     return str(error).strip().partition("\n")[0][:200] or type(error).__name__
+
+
+def storage_limit(error: object) -> str:
+    """Says which limit of a disk an error reports, and the cure; "" for none.
+
+    Libraries report these in errors of their own, which have the operating system's text somewhere.
+    """
+    number, text = getattr(error, "errno", None), str(error)
+    for limit, cure in _LIMITS.items():
+        if number == limit or os.strerror(limit) in text:
+            return cure
+    return ""
+
+
+_LIMITS = {
+    errno.ENOSPC: "the disk is full; free some space there and run again",
+    errno.EDQUOT: "your quota of the disk is used up; free some space there and run again",
+    errno.EFBIG: "the file is larger than this process may write; raise the limit (ulimit -f) and run again",
+}
 
 
 class Preempted(KeyboardInterrupt):

@@ -16,7 +16,7 @@ from typing import Any
 
 from filelock import lock_descriptor
 
-from rsjax.errors import UserError
+from rsjax.errors import UserError, storage_limit
 from rsjax.progress import note
 
 _HEAD = 512  # bytes in which a file shows that it is something else
@@ -72,6 +72,37 @@ def regular(path: Path) -> Path:
     if stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
         raise OSError(errno.EINVAL, "a pipe or device, not a file", str(path))
     return path
+
+
+def read_json_lines(path: Path, field: str, kind: type, cure: str = "delete the line") -> list[dict[str, Any]]:
+    """Reads a file of JSON objects, one a line. Returns [] if there is none.
+
+    A last line that is torn, as by a process that was killed while it wrote, is left out.
+
+    Args:
+        field: one that every object has, of type ``kind``.
+        cure: what to do about a line that is damaged.
+
+    Raises:
+        FileError: the file cannot be read, or a line is not such an object.
+    """
+    try:
+        lines = regular(path).read_bytes().split(b"\n") if path.exists() else []
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read ({error.strerror}); mend the link or permission") from error
+    rows: list[dict[str, Any]] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            row = parse_json(line)
+            if type(row.get(field)) is not kind:
+                raise ValueError(f"{field} is {row.get(field)!r:.80}")
+            rows.append(row)
+        except ValueError as error:
+            if number < len(lines):
+                raise FileError(f"{path}: line {number} is damaged ({error}); {cure}") from error
+    return rows
 
 
 def placeholder(content: Path | bytes) -> str:
@@ -145,8 +176,8 @@ def disk_guard(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, ValueError) as error:  # ArrayRecord reports a full disk by the latter two
-        if getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error):
-            raise FileError(f"{path}: the disk is full; free some space there and run again") from error
+        if limit := storage_limit(error):
+            raise FileError(f"{path}: {limit}") from error
         if isinstance(error, OSError):
             raise FileError(f"{path}: cannot write ({error}); check the place and its permissions") from error
         raise

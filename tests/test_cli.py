@@ -166,8 +166,9 @@ def test_help_lists_presets_then_first_fields_then_all_fields(capsys: pytest.Cap
     [
         (ConfigError("sim.frames is 1;\n a clip needs 2"), 2, "error: sim.frames is 1; a clip needs 2"),
         (UserError("no OpenGL"), 2, "error: no OpenGL"),
-        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "clips.tmp"), 2, "error: disk full at clips.tmp; free"),
-        (ValueError("RESOURCE_EXHAUSTED: write failed: No space left on device"), 2, "error: disk full; free"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "clips.tmp"), 2, "error: the disk is full at clips.tmp;"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "x"), 2, "error: Is a directory at x; choose another path"),
+        (ValueError("RESOURCE_EXHAUSTED: write failed: No space left on device"), 2, "error: the disk is full; free"),
         (PermissionError(errno.EACCES, "Permission denied", "/root/x"), 2, "error: no permission to write or read at"),
         (KeyboardInterrupt(), 130, "interrupted; the same command resumes"),
     ],

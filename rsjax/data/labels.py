@@ -71,6 +71,8 @@ class Labels:
         if zlib.crc32(payload) != entry["crc32"]:
             raise ValueError("its checksum is wrong")
         codes = np.load(io.BytesIO(payload), allow_pickle=False)
+        if any(len(words) <= max(column) for words, column in zip(entry["words"].values(), codes, strict=True)):
+            raise ValueError("the manifest lacks words of it")
         return cls(entry["words"], dict(zip(entry["words"], codes, strict=True)))
 
     def of(self, number: int) -> Words:

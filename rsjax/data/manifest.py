@@ -5,14 +5,24 @@ from typing import Any
 
 FORMAT = 1
 MOST = 2**50  # bytes or records
-OPTIONAL: dict[str, type] = {
-    "episodes": dict,
-    "counts": dict,
-    "filtered": dict,
-    "quarantine": dict,
-    "action_mean": list,
-    "action_std": list,
-    "action_dimensions": list,
+NUMBER = (int, float)
+# Fields that may be missing or null, and of lists and objects the types of the values in them.
+OPTIONAL: dict[str, tuple[tuple[type, ...], tuple[type, ...]]] = {
+    "kind": ((str,), ()),
+    "key": ((str,), ()),
+    "tokenizer": ((str,), ()),
+    "source": ((str,), ()),
+    "depth_unit": ((str,), ()),
+    "success_share": (NUMBER, ()),
+    "action_count": ((int,), ()),
+    "config": ((dict,), ()),
+    "episodes": ((dict,), (list,)),
+    "counts": ((dict,), (int, dict)),
+    "filtered": ((dict,), ()),
+    "quarantine": ((dict,), ()),
+    "depth_range": ((list,), NUMBER),
+    "action_dimensions": ((list,), ()),
+    **{f"action_{name}": ((list,), NUMBER) for name in ("mean", "std", "min", "max")},
 }
 
 
@@ -30,8 +40,14 @@ def check_manifest(manifest: dict[str, Any]) -> None:
     if manifest["format"] != FORMAT:
         raise ManifestError(f"format {manifest['format']!r:.80}, this code reads format {FORMAT}")
     _require("splits", isinstance(manifest.get("splits"), dict))
-    for name, kind in OPTIONAL.items():
-        _require(name, isinstance(manifest.get(name) or kind(), kind))
+    for name, (kinds, inner) in OPTIONAL.items():
+        if (value := manifest.get(name)) is not None:
+            _require(name, type(value) in kinds)
+            items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+            _require(name, not inner or all(type(item) in inner for item in items))
+    windows = (manifest.get("counts") or {}).get("windows", {})
+    _require("counts.windows", isinstance(windows, dict) and all(type(count) is int for count in windows.values()))
+    _require("config.control_steps", type((manifest.get("config") or {}).get("control_steps", 1)) is int)
     for split, entry in manifest["splits"].items():
         name = f"splits.{split}"
         if not _is_plain(split):
@@ -44,7 +60,9 @@ def check_manifest(manifest: dict[str, Any]) -> None:
                 raise ManifestError(f"{name}.files.{number}.count is {counts}")
         if "labels" in entry:
             _check_file(f"{name}.labels", entry["labels"], ("bytes",))
-            _require(f"{name}.labels.words", isinstance(entry["labels"].get("words"), dict))
+            words = entry["labels"].get("words")
+            sound = isinstance(words, dict) and all(isinstance(column, list) for column in words.values())
+            _require(f"{name}.labels.words", sound and all(isinstance(w, str) for c in words.values() for w in c))
             _require(f"{name}.labels.crc32", type(entry["labels"].get("crc32")) is int)
 
 

@@ -175,7 +175,7 @@ def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
     """Returns the reasons of all stores by episode; an episode that two stores have is named with the later store."""
     reasons: dict[str, str] = {}
     for store in stores:
-        for episode, why in store.manifest.get(name, {}).items():
+        for episode, why in (store.manifest.get(name) or {}).items():
             reasons[f"{episode} ({store.path})" if episode in reasons else episode] = why
     return reasons
 

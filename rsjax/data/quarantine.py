@@ -10,7 +10,7 @@ from typing import Any
 from filelock import lock_descriptor
 
 from rsjax.data.store import StoreError
-from rsjax.files import disk_guard
+from rsjax.files import disk_guard, parse_json, regular
 
 NAME = "quarantine.jsonl"
 MAX_DAMAGED = 0.01  # share of the records that training goes on without
@@ -87,8 +87,13 @@ class Quarantine:
 
 
 def read_quarantine(path: Path) -> list[dict[str, Any]]:
-    """Returns the rows of a list, each record once and torn lines left out; none if there is no list."""
-    return list(_rows(path.read_bytes()).values()) if path.is_file() else []
+    """Returns the rows of a list, each record once and torn lines left out; none if there is no list.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    with disk_guard(path):
+        return list(_rows(regular(path).read_bytes()).values()) if path.exists() else []
 
 
 def _key(row: dict[str, Any]) -> Key:
@@ -98,6 +103,8 @@ def _key(row: dict[str, Any]) -> Key:
 def _rows(payload: bytes) -> dict[Key, dict[str, Any]]:
     rows = []
     for line in payload.splitlines():
-        with contextlib.suppress(ValueError):
-            rows.append(json.loads(line))
+        with contextlib.suppress(ValueError):  # torn
+            row = parse_json(line)
+            if type(row.get("record")) is int and {type(row.get(name, "")) for name in ("store", "split")} == {str}:
+                rows.append(row)
     return {_key(row): row for row in rows}

@@ -178,6 +178,6 @@ def source_options(words: Sequence[str]) -> dict[str, Any]:
         require(name not in settings, f"--option {name} is given twice, the second time as {value}; give it once")
         try:
             settings[name] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             settings[name] = value
     return settings

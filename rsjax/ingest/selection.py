@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsjax.files import disk_guard, regular, write_atomically
+from rsjax.files import disk_guard, parse_json, regular, write_atomically
 from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError, fingerprint
 
 FORMAT = 1
@@ -75,7 +75,7 @@ def select(source: EpisodeSource, path: Path) -> Selected:
         SourceError: the list cannot be read, or is about other episodes or about these with other options.
     """
     try:
-        content = json.loads(regular(path).read_text())
+        content = parse_json(regular(path).read_bytes())
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']}, this code reads format {FORMAT}")
         reasons = {_key(entry): "; ".join(map(str, entry["reasons"])) for entry in content["left_out"]}

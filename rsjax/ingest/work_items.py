@@ -22,7 +22,7 @@ from rsjax.config import content_key
 from rsjax.data.codec import Record, encode
 from rsjax.data.store import WRITER_OPTIONS, Source
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, safe_id, write_atomically
+from rsjax.files import disk_guard, parse_json, safe_id, write_atomically
 from rsjax.ingest.episode import Episode, EpisodeRef, EpisodeSource
 
 Summary = dict[str, Any]  # what a step says about its output, JSON-ready
@@ -114,11 +114,17 @@ class EpisodeWork:
         """Reads a work item's mark; None where it was not run, or its output is missing or truncated."""
         output = self.output(step)
         try:
-            mark = json.loads(mark_path(output).read_text())
-            whole = mark["status"] == "failed" or output.stat().st_size == mark["bytes"]
-        except (OSError, ValueError, KeyError, TypeError):
+            mark = parse_json(mark_path(output).read_bytes())
+            numbers = [mark["seconds"], mark["cpu_seconds"]]
+            if mark["status"] == "failed":
+                whole = True
+            else:
+                numbers.append(mark["records"])
+                whole = isinstance(mark["summary"], dict) and output.stat().st_size == mark["bytes"]
+        except (OSError, ValueError, KeyError):
             return None
-        return mark if whole else None
+        sound = mark["status"] in ("done", "failed") and all(type(number) in (int, float) for number in numbers)
+        return mark if sound and whole else None
 
     def done(self, step: str) -> Mark | None:
         """Reads the mark of a work item that succeeded; None where it did not, or was not run."""

@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 import socket
@@ -17,7 +16,7 @@ import jax
 import rsjax
 from rsjax.config import to_dict
 from rsjax.data.store import MANIFEST
-from rsjax.files import read_json, write_json
+from rsjax.files import FileError, parse_json, read_json, write_json
 from rsjax.pipeline.run import Run
 
 NAME = "run.json"
@@ -35,7 +34,11 @@ def read_starts(directory: Path) -> list[dict[str, Any]]:
         FileError: the file is damaged.
     """
     path = directory / NAME
-    return read_json(path, list) if path.exists() else []
+    starts = read_json(path, list) if path.exists() else []
+    for number, start in enumerate(starts):
+        if not isinstance(start, dict) or not all(isinstance(start.get(name, {}), dict) for name in DECIDE):
+            raise FileError(f"{path}: entry {number} is not a start of this run; restore the file, or delete it")
+    return starts
 
 
 def record_start(run: Run, command: str) -> list[str]:
@@ -94,10 +97,12 @@ def data_fingerprints(run: Run) -> dict[str, Any]:
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
-    raw = (path / MANIFEST).read_bytes()
-    known: dict[str, Any] = {"path": str(path.absolute()), "manifest_sha256": hashlib.sha256(raw).hexdigest()}
-    with suppress(ValueError, KeyError, TypeError):  # damage is reported by the stage that reads it
-        manifest = json.loads(raw)
+    known: dict[str, Any] = {"path": str(path.absolute())}
+    # Damage is reported by the stage that reads it.
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        raw = (path / MANIFEST).read_bytes()
+        known["manifest_sha256"] = hashlib.sha256(raw).hexdigest()
+        manifest = parse_json(raw)
         files = {name: split["files"] for name, split in manifest["splits"].items()}
         splits = {name: {of: sum(file[of] for file in files[name]) for of in ("count", "bytes")} for name in files}
         known |= {"key": manifest.get("key"), "splits": splits}

@@ -4,7 +4,7 @@ The content key of a stage covers everything that its output depends on. A stage
 has this key and says "finished"; a mark with another key was made by another configuration.
 """
 
-import json
+import math
 import os
 import shutil
 import time
@@ -156,10 +156,10 @@ class Run:
     def _differences(self, stage: str) -> str:
         """Describes the fields that differ from the saved stage's, except those without effect on results."""
         try:
-            saved = from_dict(Config, json.loads((self.directory / "config.json").read_text()))
+            saved = from_dict(Config, read_json(self.directory / "config.json"))
         except ConfigError as error:
             return f"of another version: {error}"
-        except (OSError, ValueError, TypeError):
+        except (FileError, TypeError):
             return "its config.json is missing or damaged"
         there, here = (
             {name: value for part in DECIDED_BY[stage] for name, value in _deciding(getattr(config, part), part)}
@@ -180,15 +180,19 @@ class Run:
         if not done or stage != "tokens":
             return done
         try:
-            manifest = json.loads((self.output("tokens") / MANIFEST).read_text())
-        except (OSError, ValueError):
+            manifest = read_json(self.output("tokens") / MANIFEST)
+        except FileError:
             return True  # the stage that reads them reports the damage
         return self._made_of_these_clips(manifest)
 
     def mark(self, stage: str) -> dict[str, Any]:
-        """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started."""
+        """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started or the mark is damaged."""
         with suppress(FileError):
-            return read_json(self.directory / stage / MARK)
+            mark = read_json(self.directory / stage / MARK)
+            seconds = mark.get("seconds")
+            sound = type(mark.get("key")) is str and type(mark.get("finished")) is bool
+            if sound and type(seconds) in (int, float) and math.isfinite(seconds):
+                return mark
         return {}
 
     @contextmanager

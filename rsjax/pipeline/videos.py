@@ -24,6 +24,9 @@ from rsjax.pipeline.trained import load
 from rsjax.report.figures import ClipFigure, animation
 from rsjax.report.video import write_gif, write_mp4
 
+FPS = (0.1, 240.0)  # a GIF cannot show a frame for more than eleven minutes
+MOST_SCALE = 64
+
 
 @dataclass(frozen=True)
 class Request:
@@ -81,8 +84,9 @@ def write_videos(
             if not 0 <= number < len(source):
                 last = len(source) - 1
                 raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
-    if not fps > 0 or scale < 1:
-        raise UserError(f"--fps is {fps} and --scale is {scale}; both must be positive")
+    if not FPS[0] <= fps <= FPS[1] or not 1 <= scale <= MOST_SCALE:
+        limits = f"{FPS[0]} to {FPS[1]} and 1 to {MOST_SCALE}"
+        raise UserError(f"--fps is {fps} and --scale is {scale}; they can be {limits}")
     trained = resampled(trained, request.sample)
     foreign = _foreign_actions(request, source, config)
     for number in clips:
@@ -106,9 +110,11 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
         return None
     try:
         actions = np.load(regular(request.actions), allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         instead = placeholder(request.actions) or f"not a readable .npy file of numbers ({error})"
         raise UserError(f"{request.actions}: {instead}") from error
+    if not isinstance(actions, np.ndarray):
+        raise UserError(f"{request.actions}: an .npz archive of {len(actions.files)} arrays; save one of them as .npy")
     width, shortest = config.clips.action_dim, config.prompt_frames + 1
     if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
         fits = f"(T, {width}) with T at least {shortest}"

@@ -39,7 +39,7 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         actions.append(record["actions"][1:])
         deep += record.get("depth") is not None
     manifest = store.manifest
-    episodes = {split: len(ids) for split, ids in manifest.get("episodes", {}).items()}
+    episodes = {split: len(ids) for split, ids in (manifest.get("episodes") or {}).items()}
     named = _dimensions(manifest)
     lines = [("splits", _counted(store.counts()))]
     lines += [("tokens", f"{key}: {_counted(tokens.counts())}") for key, tokens in token_sets(store).items()]
@@ -65,10 +65,10 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
 
 def left_out(manifest: Mapping[str, Any]) -> dict[str, int]:
     """Returns how much is not in a store, by reason; of a merged store, which has no counts, only its episodes."""
-    counts = manifest.get("counts", {})
+    counts = manifest.get("counts") or {}
     reasons = {
-        "episodes without a clip": counts.get("without", len(manifest.get("filtered", {}))),
-        "episodes quarantined": counts.get("quarantined", len(manifest.get("quarantine", {}))),
+        "episodes without a clip": counts.get("without", len(manifest.get("filtered") or {})),
+        "episodes quarantined": counts.get("quarantined", len(manifest.get("quarantine") or {})),
         **{f"windows {reason}": count for reason, count in counts.get("windows", {}).items() if reason != "kept"},
         "depths": counts.get("depth_left_out", 0),
     }
@@ -140,7 +140,7 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
 
 def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Returns a line for each dimension of the actions where their names are known, otherwise one for all."""
-    figures = zip(manifest.get("action_mean", []), manifest.get("action_std", []), strict=False)
+    figures = zip((manifest.get("action_mean") or []), (manifest.get("action_std") or []), strict=False)
     units = [f"{mean:.3g}±{std:.2g}" for mean, std in figures]
     names = manifest.get("action_dimensions") or []
     if len(names) != len(units):

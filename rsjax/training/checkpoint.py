@@ -4,6 +4,7 @@ import errno
 import logging
 import math
 import os
+import resource
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +27,7 @@ from rsjax.training.retention import retention
 # and the error is raised as well.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
+MOST_FILE = 2**31  # bytes; orbax begins another file then
 UNFINISHED = ".orbax-checkpoint-tmp"  # what orbax adds to the name of a checkpoint while it writes it
 
 Tree = TypeVar("Tree")  # a tree of arrays, or of their shapes
@@ -237,8 +239,12 @@ def load_weights(path: Path, like: Tree) -> Tree:
 
 def _need_space(folder: Path, tree: PyTree) -> None:
     # Checked before: on a full disk TensorStore prints tracebacks from callbacks that outlive orbax.
-    if shutil.disk_usage(folder).free < sum(x.nbytes for x in jax.tree.leaves(tree)):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    size = sum(x.nbytes for x in jax.tree.leaves(tree))
+    if shutil.disk_usage(folder).free < size:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    most, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if most != resource.RLIM_INFINITY and most < min(size, MOST_FILE):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:

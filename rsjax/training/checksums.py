@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.data.codec import decode
+from rsjax.files import parse_json
 
 NAME = "checksums.json"
 OLD_NAME = "manifest.msgpack"  # in checkpoints of earlier versions
@@ -72,7 +73,7 @@ def _read(checkpoint: Path) -> dict[str, Any]:
     path, old = checkpoint / NAME, checkpoint / OLD_NAME
     if old.exists() and not path.exists():
         return decode(old.read_bytes())
-    content = json.loads(path.read_text())
-    if not isinstance(content, dict) or content.pop("crc32", None) != _checksum(content):
+    content = parse_json(path.read_bytes())
+    if content.pop("crc32", None) != _checksum(content):
         raise ValueError(f"{path}: its checksum is wrong")
     return content

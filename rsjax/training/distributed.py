@@ -49,13 +49,23 @@ def has_peers(environ: Mapping[str, str]) -> bool:
 
     Args:
         environ: environment variables; nothing else is looked at, no server is asked.
+
+    Raises:
+        HostsError: a variable with a number of processes is no number.
     """
-    if any(mark in environ and int(environ.get(size, 1)) > 1 for mark, size in _LAUNCHERS.items()):
+    if any(mark in environ and _count(environ, size) > 1 for mark, size in _LAUNCHERS.items()):
         return True
     tpu_hosts = environ.get("TPU_PROCESS_ADDRESSES") or environ.get("TPU_WORKER_HOSTNAMES", "")
     if tpu_hosts:
-        return "," in tpu_hosts or int(environ.get("MEGASCALE_NUM_SLICES") or 1) > 1
+        return "," in tpu_hosts or _count(environ, "MEGASCALE_NUM_SLICES") > 1
     return "JOB_COMPLETION_INDEX" in environ and importlib.util.find_spec("kubernetes") is not None
+
+
+def _count(environ: Mapping[str, str], name: str) -> int:
+    value = environ.get(name) or "1"
+    if not (value.isascii() and value.isdecimal()):
+        raise HostsError(f"{name} is {value!r}, not a number of processes; unset it, or name the processes by options")
+    return int(value)
 
 
 def _on_tpu(environ: Mapping[str, str]) -> bool:
@@ -76,8 +86,8 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
     Raises:
         HostsError: an option is missing or out of range, or the processes cannot join each other.
     """
-    peers = has_peers(os.environ)
     alone = not coordinator and processes is None and process_id is None
+    peers = alone and has_peers(os.environ)
     if alone and not peers and not _on_tpu(os.environ):
         return
     arguments = {} if alone else _address(coordinator, processes, process_id)
@@ -90,7 +100,7 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
         jax.distributed.initialize(
             **arguments, initialization_timeout=JOIN_SECONDS, shutdown_timeout_seconds=SHUTDOWN_SECONDS
         )
-    except (RuntimeError, ValueError) as error:
+    except Exception as error:  # jax reads a cluster's variables without checks
         if alone and not peers and isinstance(error, ValueError):
             return  # a TPU machine that is not part of a pod
         raise LostHostError(
@@ -109,7 +119,7 @@ def _address(coordinator: str, processes: int | None, process_id: int | None) ->
     if not 0 <= process_id < processes:
         raise HostsError(f"--process-id is {process_id}; with --processes {processes} it is 0 … {processes - 1}")
     host, _, port = coordinator.rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
         raise HostsError(f"--coordinator is {coordinator!r}; it is HOST:PORT of process 0")
     # With Slurm's detection active, a process would get only one of its devices.
     return {

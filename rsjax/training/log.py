@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from rsjax.files import disk_guard, write_file
+from rsjax.files import disk_guard, read_json_lines, write_file
 from rsjax.training.tensorboard import TensorBoardWriter
 from rsjax.training.wandb_run import WandbRun
 
@@ -27,14 +27,12 @@ MEASURED = frozenset(
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Reads a file of JSON lines. Returns [] if there is none; a torn last line is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.is_file() else ():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break  # killed while writing
-    return rows
+    """Reads a file of JSON lines, each with its ``step``. Returns [] if there is none; a torn last line is left out.
+
+    Raises:
+        FileError: it cannot be read, or another line is damaged.
+    """
+    return read_json_lines(path, "step", int)
 
 
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:

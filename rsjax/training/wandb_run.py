@@ -1,7 +1,6 @@
 """Weights & Biases, an optional mirror of a training run's log."""
 
 import importlib
-import json
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
@@ -64,7 +63,7 @@ class WandbRun:
                 name=f"{run_directory.name}/{directory.name}",
                 group=run_directory.name,
                 job_type=directory.name,
-                config=json.loads(config.read_text()) if config.exists() else {},
+                config=read_json(config) if config.exists() else {},
                 dir=str(directory),
                 settings=self._wandb.Settings(console="off", quiet=True),
             )

@@ -77,10 +77,10 @@ def test_bytes_that_are_no_text_are_reported(path: Path) -> None:
 
 
 def test_a_missing_permission_is_reported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*arguments: object) -> str:
+    def refuse(*arguments: object) -> bytes:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(Path, "read_text", refuse)  # root, who may run the tests, may read everything
+    monkeypatch.setattr(Path, "read_bytes", refuse)  # root, who may run the tests, may read everything
     with pytest.raises(StoreError, match=r"manifest.json: cannot be read \(Permission denied\)"):
         open_store(path)
 

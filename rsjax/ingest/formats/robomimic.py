@@ -267,7 +267,7 @@ def _settings(group: Any, path: Path) -> dict[str, Any]:
         text = attribute(group, name)
         try:
             values = json.loads(text) if text else {}
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             raise EpisodeError.at(path, f"data.{name} is not JSON ({error})", "mend the attribute") from error
         settings |= values if isinstance(values, dict) else {}
     return settings
@@ -294,7 +294,7 @@ def _task(group: Any, settings: dict[str, Any], path: Path, how: Convention) -> 
     text = attribute(group, "ep_meta")
     try:
         instruction = json.loads(text).get("lang") if text else None
-    except (AttributeError, TypeError, ValueError):
+    except (AttributeError, TypeError, ValueError, RecursionError):
         instruction = None
     instruction = instruction or settings.get("language_instruction")
     if isinstance(instruction, list):

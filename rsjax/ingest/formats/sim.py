@@ -93,7 +93,7 @@ class StoreSource:
     def _episode(self, ref: EpisodeRef, record: Record, place: dict[str, Any]) -> Episode:
         provenance = record.get("provenance", {})
         camera = str(provenance.get("camera", "camera"))
-        steps = int(self.store.manifest.get("config", {}).get("control_steps", 1))
+        steps = int((self.store.manifest.get("config") or {}).get("control_steps", 1))
         fps, timestamps = _times(provenance, len(record["rgb"]), steps)
         width = record["actions"].shape[1]
         ours, grippers = "control_hz" in provenance, tuple[int, ...]()
