@@ -35,7 +35,7 @@ FIRST_FIELDS = {
     "train.curriculum": "A curriculum, one word per stage: simple:2 difficult:3 (docs/training.md); no word: none.",
     "train.batch-size": "Clips of a batch, over all devices.",
     "train.optimizer.learning-rate": "Peak learning rate of the world model.",
-    "train.seed": "Seed of the world model's training.",
+    "train.seed": "Seed of the world model's training, 0 to 4294967295.",
     "train.checkpoint-every": "Steps between checkpoints.",
     "train.eval-every": "Steps between evaluations on validation clips; 0: none.",
     "train.start-from": "A run directory or converted checkpoint to start from.",

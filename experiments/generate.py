@@ -37,9 +37,9 @@ class Options:
     format: Literal["mp4", "gif"] = "mp4"
     """File format."""
     fps: float = 4.0
-    """Frames per second."""
+    """Frames per second, 0.1 to 240."""
     scale: int = 4
-    """Enlargement of videos that show only the prediction."""
+    """Enlargement of videos that show only the prediction, 1 to 64."""
     steps: int | None = None
     """Decoding steps per frame. This and the following options default to the run's settings."""
     temperature: float | None = None
@@ -55,7 +55,7 @@ class Options:
     cache_dtype: Literal["float32", "bfloat16"] | None = None
     """Data type of the cache of keys and values."""
     seed: int | None = None
-    """Seed of the random draws."""
+    """Seed of the random draws, 0 to 4294967295."""
 
 
 @main_errors()
