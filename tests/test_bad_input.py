@@ -240,6 +240,7 @@ OUTPUTS = (
     "store split STORE --parts 2 --into OUT",
     "store merge OUT STORE PLACE/second",
     "bench debug --only matmul --json OUT/bench.json",
+    "ingest sim STORE --out OUT --windows.frames 2 --option kind=delta",
 )
 
 

@@ -4,7 +4,7 @@ A clip's actions, depth (if it is in metres) and task are taken as they are; its
 store, and ``meta["clip"]`` says where. Any other store of clips is read in the same way for checks.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from jaxtyping import Float
 from rsjax.clip import UNKNOWN
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
-from rsjax.ingest.actions import Layout
+from rsjax.ingest.actions import Kind, Layout
+from rsjax.ingest.dimensions import layout_of
 from rsjax.ingest.episode import (
     LEAVE_OUT,
     Episode,
@@ -32,12 +33,17 @@ FPS = 5.0  # of a clip that does not say how it was made
 _CURE = f"make the store again or {LEAVE_OUT}"
 
 
-def open_source(path: Path, split: str = "") -> "StoreSource":
+def open_source(
+    path: Path, split: str = "", kind: Kind | None = None, held: Sequence[int] | None = None
+) -> "StoreSource":
     """Opens a store of clips.
 
     Args:
         path: its directory.
         split: the only one to read; "": all.
+        kind: of the actions in clips that no simulator of this project made; see
+            :class:`rsjax.ingest.actions.Layout`.
+        held: their dimensions that stay in force, such as a gripper's; None: nobody says.
 
     Raises:
         SourceError: it is no whole store of clips, or has no such split.
@@ -50,7 +56,7 @@ def open_source(path: Path, split: str = "") -> "StoreSource":
         raise SourceError(f"{path}: a store of {store.manifest.get('kind')}; give one of clips")
     if split and split not in store.splits:
         raise SourceError(f"{path}: no split {split!r}{did_you_mean(split, store.splits)}; it has {list(store.splits)}")
-    return StoreSource(store, (split,) if split else store.splits)
+    return StoreSource(store, (split,) if split else store.splits, kind, None if held is None else tuple(held))
 
 
 @dataclass(frozen=True)
@@ -60,15 +66,25 @@ class StoreSource:
     Attributes:
         store: of clips.
         splits: those that are read.
+        kind: of undeclared actions; see :func:`open_source`.
+        held: likewise.
     """
 
     name = "sim"
     store: Store
     splits: tuple[str, ...]
+    kind: Kind | None = None
+    held: tuple[int, ...] | None = None
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every clip of every split, in the store's order."""
-        key = fingerprint((), self.store.manifest.get("key"), self.store.manifest["splits"])
+        declared = (self.kind, self.held)
+        key = fingerprint(
+            (),
+            self.store.manifest.get("key"),
+            self.store.manifest["splits"],
+            *([declared] if declared != (None, None) else []),
+        )
         for split in self.splits:
             for number in range(len(self.store.source(split))):
                 location = {"split": split, "record": number}
@@ -96,9 +112,10 @@ class StoreSource:
         steps = int((self.store.manifest.get("config") or {}).get("control_steps", 1))
         fps, timestamps = _times(provenance, len(record["rgb"]), steps)
         width = record["actions"].shape[1]
-        ours, grippers = "control_hz" in provenance, tuple[int, ...]()
-        if ours and width % steps == 0:  # the last dimension of each control step of a simulator
-            grippers = tuple(range(width // steps - 1, width, width // steps))
+        layout = layout_of(record["actions"], self.kind, self.held, (), (), None)
+        if "control_hz" in provenance:  # a simulator's own: the last dimension of each control step is the gripper
+            last = width // steps - 1 if width % steps == 0 else width
+            layout = Layout("delta", held=tuple(range(last, width, width // steps or 1)))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
         return Episode(
             id=ref.id,
@@ -114,7 +131,7 @@ class StoreSource:
                 "source": self.store.manifest.get("source", "sim"),
                 "clip": place,
                 "provenance": provenance,
-                "actions": Layout("delta" if ours else "undeclared", held=grippers).to_json(),
+                "actions": layout.to_json(),
                 "success": np.asarray(record.get("success", []), bool).tolist(),
             },
         )

@@ -48,6 +48,8 @@ def test_a_clip_cut_from_a_recording_keeps_its_times(tmp_path: Path) -> None:
     assert episode.fps == pytest.approx(2.0) and episode.depth == {}
     np.testing.assert_allclose(episode.timestamps, [0, 0.5, 1, 1.5])
     assert episode.meta["actions"]["kind"] == "undeclared"  # only a simulator's own are known
+    declared = read_first("sim", tmp_path / "store", kind="delta", held=[6]).meta["actions"]
+    assert (declared["kind"], declared["held"]) == ("delta", [6])
     uneven = cut | {"frames": [30, 45, 60, 65], "times": [1.0, 1.5, 2.0, 2.5]}
     episode = read_first("sim", write(tmp_path / "uneven", clip(provenance=uneven)))
     np.testing.assert_allclose(episode.timestamps, [0, 0.5, 1, 1.5])
