@@ -55,7 +55,7 @@ def main() -> None:
     else:
         print(*lines(summary), sep="\n")
         if missing := unfiltered(options.windows):
-            print(f"filters   off: {missing}; --recipe paper turns them on (§2.2)")
+            print(f"filters   off: {missing}{'' if options.recipe else '; --recipe paper turns them on (§2.2)'}")
         if tables := summary.tables():
             print(f"what was left out, and why: {tables} in {plan.folder}")
     print(f"store: {plan.out}")

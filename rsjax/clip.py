@@ -13,6 +13,11 @@ Array = Any  # JAX or numpy
 UNKNOWN = "unknown"  # the task or label of a clip whose data set does not name it
 
 
+def words_of(value: object) -> str:
+    """Returns a text of a data set without blanks around it; "" for null, which some write as NaN."""
+    return "" if value is None or value != value else str(value).strip()
+
+
 @dataclass(frozen=True)
 class Clip:
     """One clip of one episode, as numpy arrays.

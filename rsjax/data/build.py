@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordWriter
 
-from rsjax.clip import UNKNOWN, Clip
+from rsjax.clip import UNKNOWN, Clip, words_of
 from rsjax.data.codec import Record, encode
 from rsjax.data.normalization import Statistics
 from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError, encode_clip, open_store, write_store
@@ -52,6 +52,8 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
         writer, count = ArrayRecordWriter(str(spool), WRITER_OPTIONS), 0
         for clip in clips:
             given = encode_clip(clip) if isinstance(clip, Clip) else clip
+            if not isinstance(given, Mapping):
+                raise StoreError(f"clip {count}: is a {type(given).__name__}, should be a dict with rgb and actions")
             record = _record(given, f"clip {count}", count)
             shapes = {name: array.shape for name, array in record.items() if isinstance(array, np.ndarray)}
             _check_alike({name: shape for name, shape in shapes.items() if name != "depth"}, first, f"clip {count}")
@@ -152,7 +154,7 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
     if success.shape not in ((), (count,)):
         raise StoreError(f"{where}: success has the shape {success.shape}, should be one value or ({count},)")
     origin = {"source": "write_store", "episode": number} | dict(clip.get("provenance") or {})
-    words = {name: str(clip.get(name) or origin.get(name) or UNKNOWN) for name in _LABELS}
+    words = {name: words_of(clip.get(name)) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
     timing = {"fps": float(clip["fps"]), "frames": list(range(count))} if clip.get("fps") else {}
     unit = {"depth_unit": "metres" if depth is not None else ""}
     return {
@@ -162,7 +164,7 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         "tracks": tracks,
         "visible": visible,
         "success": np.broadcast_to(success, (count,)).copy(),
-        "task": str(clip.get("task") or UNKNOWN),
+        "task": words_of(clip.get("task")) or UNKNOWN,
         "provenance": origin | words | timing | unit | {"episode": str(clip.get("episode", origin["episode"]))},
     }
 

@@ -83,11 +83,6 @@ class Segment:
     skill: str = ""
 
 
-def words_of(value: object) -> str:
-    """Returns a text of a data set without blanks around it; "" for null, which some write as NaN."""
-    return "" if value is None or value != value else str(value).strip()
-
-
 def runs(texts: Sequence[str]) -> list[Segment]:
     """Returns a segment for each run of frames with the same text."""
     starts = [row for row, text in enumerate(texts) if row == 0 or text != texts[row - 1]]

@@ -66,6 +66,20 @@ def test_clips_of_the_dataclass_go_in_too(tmp_path: Path) -> None:
     np.testing.assert_array_equal(record["tracks"], toy.clip(int(original)).tracks)
 
 
+@pytest.mark.parametrize("task", [None, float("nan"), "", " \n"])
+def test_no_task_is_unknown(tmp_path: Path, task: Any) -> None:
+    store = rsjax.write_store(tmp_path / "mine", [clip(0, task=task, scene=task), clip(1, task=" push ")])
+    tasks = {store.source(split)[0]["task"] for split in ("train", "test")}
+    scenes = {store.source(split)[0]["provenance"]["scene"] for split in ("train", "test")}
+    assert tasks == {"unknown", "push"} and scenes == {"unknown"}
+
+
+def test_what_is_no_clip_is_named(tmp_path: Path) -> None:
+    wrong: list[Any] = [clip(), [clip()]]
+    with pytest.raises(StoreError, match="^clip 1: is a list, should be a dict with rgb and actions$"):
+        rsjax.write_store(tmp_path / "mine", wrong)
+
+
 @settings(max_examples=8)
 @given(names=st.lists(st.sampled_from("abcdef"), min_size=1, max_size=12), share=st.floats(0.01, 0.99))
 def test_all_clips_of_an_episode_are_in_one_split(

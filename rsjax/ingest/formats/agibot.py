@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from rsjax.clip import words_of
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Layout, align_actions
-from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, reason, words_of
+from rsjax.ingest.episode import Episode, EpisodeRef, Segment, SourceError, checked, fingerprint, reason
 from rsjax.ingest.formats.agibot_proprio import Proprio
 from rsjax.ingest.formats.files import broken, exists, inside, location_of, media, read_json, subfolders
 from rsjax.ingest.formats.hdf5 import open_file

@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, Float32
 
+from rsjax.clip import words_of
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Kind, align_actions, check_layout
 from rsjax.ingest.dimensions import layout_of
@@ -50,7 +51,7 @@ class FolderConfig:
     """What ``dataset.json`` and the options say of all episodes.
 
     Attributes:
-        task: of episodes that name none.
+        task: of episodes that name none; None, as null in JSON, names none either.
         fps: frames per second; 0: as the videos or the timestamps say.
         after: whether each frame was recorded after the action of its row.
         action: the columns that are the action, in order; none: by their names.
@@ -59,7 +60,7 @@ class FolderConfig:
         quaternions: likewise.
     """
 
-    task: str = ""
+    task: str | None = ""
     fps: float = 0.0
     after: bool = False
     action: tuple[str, ...] = ()
@@ -155,7 +156,7 @@ class Folder:
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=task or config.task.strip(),
+            task=task or words_of(config.task),
             fps=fps or _rate(times),
             timestamps=times - times[0],
             actions=actions,

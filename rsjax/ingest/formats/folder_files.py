@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from jaxtyping import Float32
 
+from rsjax.clip import words_of
 from rsjax.errors import did_you_mean
 from rsjax.ingest.episode import (
     LEAVE_OUT,
@@ -21,7 +22,6 @@ from rsjax.ingest.episode import (
     SourceError,
     data_file,
     reason,
-    words_of,
 )
 from rsjax.ingest.formats.files import exists, load_npy, matrix, media, parquet_columns, read_json
 from rsjax.ingest.pictures import PictureFiles

@@ -45,9 +45,10 @@ class KeyMap:
     names: tuple[str, ...] = field(default=(), compare=False)
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the fields that differ from their defaults, as a file of a key map has them."""
+        """Returns the map as a file has it, without the fields that a file may leave out."""
         blank = asdict(KeyMap({}, (), 0.0)) | {"names": self.names}
-        return {name: value for name, value in asdict(self).items() if value != blank[name]}
+        said = ("kind", "held")  # always, so that they are seen; in a file, none means that nobody says
+        return {name: value for name, value in asdict(self).items() if name in said or value != blank[name]}
 
 
 def _cameras(*names: str) -> dict[str, str]:

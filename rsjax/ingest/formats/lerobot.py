@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float
 
+from rsjax.clip import words_of
 from rsjax.files import safe_id
 from rsjax.ingest.actions import Kind, align_actions, check_layout
 from rsjax.ingest.dimensions import Declared, flat_names, layout_of
@@ -25,7 +26,6 @@ from rsjax.ingest.episode import (
     checked,
     fingerprint,
     runs,
-    words_of,
 )
 from rsjax.ingest.formats.files import (
     broken,

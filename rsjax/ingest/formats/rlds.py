@@ -72,8 +72,6 @@ def open_source(
     features = step_features(described, _read_object(described))
     if keys == "auto":
         keymap = propose(described, features, fps)
-        cure = "mend what is wrong in it as a file of your own (--option keys=FILE.json)"
-        note(f"{folder}: key map {json.dumps(keymap.to_json())}; {cure}")
     else:
         keymap = key_map(keys, info.get("name") or _split_name(shards[0])[0], folder)
     keymap = replace(
@@ -82,6 +80,9 @@ def open_source(
         kind=kind or keymap.kind,
         held=keymap.held if held is None else tuple(held),
     )
+    if keys == "auto":
+        cure = "mend what is wrong in it as a file of your own (--option keys=FILE.json)"
+        note(f"{folder}: key map {json.dumps(keymap.to_json())}; {cure}")
     check_keys(keymap, described, features)
     shapes = {key: features[key].shape for key in keymap.depth.values() if key in features}
     sides = {key: shape[:2] for key, shape in shapes.items() if shape and len(shape) > 1}
@@ -143,9 +144,10 @@ class RldsSource:
             raise EpisodeError.at(example.where, f"{', '.join(blank)} hold placeholders of one colour", LEAVE_OUT)
         count = len(next(iter(cameras.values())))
         keys = self.keys
-        actions = align_actions(_joined(example, keys.action, count), keys.after)
-        states = _joined(example, keys.state, count) if keys.state else None
-        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, (), states)
+        rows, names = _joined(example, keys.action, count)
+        actions = align_actions(rows, keys.after)
+        states = _joined(example, keys.state, count)[0] if keys.state else None
+        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, names, states)
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
         segments = [segment for segment in runs(texts) if segment.text]
@@ -164,6 +166,7 @@ class RldsSource:
                 "source": "rlds",
                 "file": ref.location["file"],
                 "actions": layout.to_json(),
+                "action_names": names,
                 "blank": blank,
                 "episode": _metadata(example),
             },
@@ -202,8 +205,12 @@ def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], 
     return {name: pictures for name, pictures in frames.items() if name not in blank}, blank
 
 
-def _joined(example: Example, keys: Sequence[str], count: int) -> Float32[np.ndarray, "N n"]:
-    return np.concatenate([example.numbers(f"steps/{key}", count) for key in keys], axis=1)
+def _joined(example: Example, keys: Sequence[str], count: int) -> tuple[Float32[np.ndarray, "N n"], list[str]]:
+    """Returns these features one after the other, and a name for each dimension."""
+    parts = [example.numbers(f"steps/{key}", count) for key in keys]
+    widths = [part.shape[1] for part in parts]
+    names = [f"{key}[{n}]" if width > 1 else key for key, width in zip(keys, widths, strict=True) for n in range(width)]
+    return np.concatenate(parts, axis=1), names
 
 
 def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:

@@ -6,7 +6,6 @@ robosuite has the models (:mod:`rsjax.ingest.formats.rendered`). LIBERO's files 
 conventions (:mod:`rsjax.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
 """
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,20 +15,20 @@ import h5py
 import numpy as np
 from jaxtyping import Float32
 
+from rsjax.clip import words_of
 from rsjax.errors import did_you_mean
 from rsjax.files import safe_id
-from rsjax.ingest.actions import Kind, Layout, align_actions, continuous_signs
+from rsjax.ingest.actions import Layout, align_actions, continuous_signs
 from rsjax.ingest.episode import (
     LEAVE_OUT,
-    MAX_FPS,
     Episode,
     EpisodeError,
     EpisodeRef,
     SourceError,
     checked,
     fingerprint,
-    words_of,
 )
+from rsjax.ingest.formats.demo_settings import fps_of, instruction_of, kind_of, settings_of
 from rsjax.ingest.formats.files import broken, inside, location_of
 from rsjax.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
 from rsjax.ingest.formats.rendered import CURE, Pictures, rendered
@@ -157,7 +156,7 @@ class DemoSource:
             group = member(file, f"data/{demo}", path)
             if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group | None):
                 raise EpisodeError.at(path, f"has no group data/{demo}", LEAVE_OUT)
-            return checked(self._episode(ref, path, group, _settings(file["data"], path)), f"{path}: data/{demo}")
+            return checked(self._episode(ref, path, group, settings_of(file["data"], path)), f"{path}: data/{demo}")
 
     def _episode(self, ref: EpisodeRef, path: Path, group: Any, settings: dict[str, Any]) -> Episode:
         how = self.convention
@@ -167,14 +166,15 @@ class DemoSource:
             problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
             raise EpisodeError.at(path, problem)
         cameras, depth = self.pictures(group, path)
-        fps = _fps(settings, path) or how.fps
+        fps = fps_of(settings, path) or how.fps
         states, flipped = _states(group.get("obs", {}), how, path)
+        named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
         width = commands.shape[1]  # a gripper is the last dimension of each arm's seven, of other robots the last alone
         grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
-            task=_task(group, settings, path, how),
+            task=instruction_of(group, settings) or (named if how.after else words_of(settings.get("env_name"))),
             fps=fps,
             timestamps=np.arange(len(commands)) / fps,
             actions=align_actions(commands, how.after),
@@ -187,7 +187,7 @@ class DemoSource:
                 "demo": ref.location["demo"],
                 "environment": words_of(settings.get("env_name")),
                 "notes": {"flipped": flipped} if flipped else {},
-                "actions": Layout(_kind(settings), held=grippers).to_json(),
+                "actions": Layout(kind_of(settings), held=grippers).to_json(),
             },
         )
 
@@ -258,50 +258,6 @@ def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndar
             problem = f"states below {observed.name} have {len(parts[0])} and {len(part)} rows"
             raise EpisodeError.at(path, problem, "leave it out", "length")
     return np.concatenate(parts, axis=1) if parts else None, flipped
-
-
-def _settings(group: Any, path: Path) -> dict[str, Any]:
-    """Returns ``env_args``, ``env_info`` (robosuite's own) and ``problem_info`` of a file, which are JSON."""
-    settings: dict[str, Any] = {}
-    for name in ("env_info", "env_args", "problem_info"):
-        text = attribute(group, name)
-        try:
-            values = json.loads(text) if text else {}
-        except (TypeError, ValueError, RecursionError) as error:
-            raise EpisodeError.at(path, f"data.{name} is not JSON ({error})", "mend the attribute") from error
-        settings |= values if isinstance(values, dict) else {}
-    return settings
-
-
-def _fps(settings: dict[str, Any], path: Path) -> float:
-    """Returns the rate of the simulator; 0 if the file does not say."""
-    arguments = settings.get("env_kwargs")
-    fps = arguments.get("control_freq", 0) if isinstance(arguments, dict) else 0
-    if not isinstance(fps, int | float) or not 0 <= fps <= MAX_FPS:
-        raise EpisodeError.at(path, f"control_freq in data.env_args is {fps!r}, should be steps per second", "mend it")
-    return float(fps)
-
-
-def _kind(settings: dict[str, Any]) -> Kind:
-    """Returns what the arms' commands are: targets if robosuite's controller says so, by its older or newer name."""
-    arguments = settings.get("env_kwargs")
-    text = json.dumps(arguments.get("controller_configs") if isinstance(arguments, dict) else None)
-    return "absolute" if '"control_delta": false' in text or '"input_type": "absolute"' in text else "delta"
-
-
-def _task(group: Any, settings: dict[str, Any], path: Path, how: Convention) -> str:
-    """Returns the instruction if there is one, otherwise the environment's name; LIBERO names files after tasks."""
-    text = attribute(group, "ep_meta")
-    try:
-        instruction = json.loads(text).get("lang") if text else None
-    except (AttributeError, TypeError, ValueError, RecursionError):
-        instruction = None
-    instruction = instruction or settings.get("language_instruction")
-    if isinstance(instruction, list):
-        instruction = instruction[0] if instruction else ""
-    if text := words_of(instruction).strip('" '):
-        return text
-    return path.stem.removesuffix("_demo").replace("_", " ") if how.after else words_of(settings.get("env_name"))
 
 
 def _number(demo: str) -> tuple[int, str]:

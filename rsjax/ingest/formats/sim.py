@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rsjax.clip import UNKNOWN
+from rsjax.clip import UNKNOWN, words_of
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
 from rsjax.ingest.actions import Kind, Layout
@@ -25,7 +25,6 @@ from rsjax.ingest.episode import (
     SourceError,
     checked,
     fingerprint,
-    words_of,
 )
 from rsjax.ingest.pictures import ArrayFrames
 

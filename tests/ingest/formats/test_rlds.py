@@ -322,8 +322,8 @@ def test_a_proposed_key_map_reads_pictures_depth_and_texts(
     printed = capsys.readouterr().out
     assert "--option keys=FILE.json" in printed
     proposed = json.loads(printed[printed.index("{") : printed.rindex("}") + 1])
-    assert proposed["kind"] is None and proposed["held"] is None
-    (tmp_path / "map.json").write_text(json.dumps(proposed | {"kind": "delta", "held": [6]}))
+    assert (proposed["kind"], proposed["held"], proposed["fps"]) == ("delta", [6], 4)
+    (tmp_path / "map.json").write_text(json.dumps(proposed))
     again = read_first("rlds", tmp_path / "set", keys=str(tmp_path / "map.json"))
     assert list(again.depth) == ["front_rgb"] and again.meta["actions"] == episode.meta["actions"]
 
@@ -333,7 +333,10 @@ def test_parts_of_an_action_are_joined_in_the_proposal(tmp_path: Path) -> None:
     values = {name: value for name, value in VALUES.items() if name != "steps/action"}
     values |= {"steps/action/world_vector": np.ones(9), "steps/action/gripper": np.zeros(3)}
     write_kitchen(tmp_path, {"front_rgb": image(8, 8, 3)}, {"action": features(parts)}, values)
-    assert read_first("rlds", tmp_path, keys="auto", fps=3).actions.shape == (3, 4)
+    episode = read_first("rlds", tmp_path, keys="auto", fps=3, kind="delta")
+    assert episode.actions.shape == (3, 4)
+    vector = [f"action/world_vector[{place}]" for place in range(3)]
+    assert episode.meta["action_names"] == [*vector, "action/gripper"]
 
 
 def test_what_cannot_be_proposed_is_refused(tmp_path: Path) -> None:

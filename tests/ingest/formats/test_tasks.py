@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rsjax.clip import words_of
 from rsjax.ingest.annotate import Annotated
 from rsjax.ingest.clips import ClipConfig, clip_labels, cut
-from rsjax.ingest.episode import words_of
 from rsjax.ingest.windows import WindowConfig
 from tests.ingest.formats.reading import read_all
 from tests.ingest.formats.test_folder import write_episode
@@ -24,6 +24,7 @@ from tests.ingest.formats.toy_demos import demo, write_demos
 def folder(root: Path, task: Any) -> None:
     segments = [{"start": 0, "end": 4, "text": task}]
     (write_episode(root) / "episode.json").write_text(json.dumps({"task": task, "segments": segments}))
+    (root / "dataset.json").write_text(json.dumps({"task": task}))
 
 
 def lerobot_v2(root: Path, task: Any) -> None:
