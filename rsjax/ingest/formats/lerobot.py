@@ -63,7 +63,7 @@ def open_source(
         action: the column of actions.
         state: the column of states; if it is missing, episodes have none.
         kind: what the actions are, which the format does not say; see :class:`rsjax.ingest.actions.Layout`. None:
-            absolute, unless the names of the dimensions speak of deltas; then it must be said.
+            absolute, unless the names of the dimensions contain ``delta``; then it has to be given.
         held: likewise.
         quaternions: likewise.
 
