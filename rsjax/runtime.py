@@ -19,6 +19,7 @@ STOP_SECONDS = 20.0  # for which SIGTERM may go unanswered; Kubernetes and Slurm
 REPEAT_SECONDS = 0.5  # within which two Ctrl-C are one: wrappers such as make pass on what the terminal sent already
 INTERRUPTED = "interrupted; the same command resumes"
 TERMINATED = "stopped by SIGTERM; the same command resumes"
+ANSWERS = {signal.SIGINT: (INTERRUPTED, 130), signal.SIGTERM: (TERMINATED, os.EX_TEMPFAIL)}
 
 patient = threading.Event()  # set while SIGTERM may take longer, because steps are to be saved
 
@@ -36,6 +37,19 @@ def tune_process() -> None:
     sys.stdout.flush()
     tuned = os.environ | {"GLIBC_TUNABLES": f"{tunables}:{HUGE_PAGES}".lstrip(":")}
     os.execve(sys.executable, sys.orig_argv, tuned)
+
+
+def answer_while_importing() -> None:
+    """Lets Ctrl-C and SIGTERM end ``python -m`` with one line while a command's modules are imported.
+
+    A package of commands calls this before it imports anything else; :func:`stop_signals` takes over. Does nothing
+    where another program imports the package.
+    """
+    if sys.argv[:1] != ["-m"]:  # which Python sets while it looks for the module to run
+        return
+    for number, answer in ANSWERS.items():
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda *_, answer=answer: _end(*answer))
 
 
 @contextmanager
@@ -101,7 +115,7 @@ def _watch(pipe: int) -> None:
         wait = None if deadline == float("inf") else max(0.0, deadline - now)
         if not select.select([pipe], [], [], wait)[0]:
             if not patient.is_set():
-                _end(TERMINATED, os.EX_TEMPFAIL)
+                _end(*ANSWERS[signal.SIGTERM])
             os.kill(os.getpid(), signal.SIGTERM)  # the exception may have been swallowed before training began
             deadline = time.monotonic() + STOP_SECONDS
             continue
@@ -111,7 +125,7 @@ def _watch(pipe: int) -> None:
         if signal.SIGINT in numbers:
             interrupted = min(interrupted, now)
             if now - interrupted > REPEAT_SECONDS:
-                _end(INTERRUPTED, 130)
+                _end(*ANSWERS[signal.SIGINT])
         if signal.SIGTERM in numbers:
             deadline = min(deadline, now + STOP_SECONDS)
 

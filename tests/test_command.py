@@ -1,5 +1,6 @@
 """Commands that are stopped: one line and an exit status, whatever the main thread is doing."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.runtime import INTERRUPTED, TERMINATED
+from rsjax.runtime import ANSWERS, INTERRUPTED, TERMINATED
 
 ROOT = Path(__file__).parents[1]
 # Prints "ready" and then runs the lines of its argument, within a command.
@@ -106,3 +107,22 @@ def test_a_second_interrupt_ends_a_command_at_once_in_one_line(lines: str) -> No
 @pytest.mark.parametrize("lines", [ASLEEP, IN_AN_IMPORT, IN_A_GARBAGE_COLLECTION, IN_ASYNCIO, COMPILING])
 def test_one_interrupt_is_one_line(lines: str) -> None:
     assert stopped(lines, signal.SIGINT) == (130, INTERRUPTED)
+
+
+@pytest.mark.parametrize("number", ANSWERS)
+@pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("rsjax.convert", "argparse")])
+def test_a_signal_while_a_command_is_imported_is_one_line(
+    number: int, command: str, imported: str, tmp_path: Path
+) -> None:
+    (tmp_path / f"{imported}.py").write_text(f"import signal\nsignal.raise_signal({int(number)})")
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    line = [sys.executable, "-m", command]
+    done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
+    answer, status = ANSWERS[number]
+    assert (done.returncode, done.stderr) == (status, f"{answer}\n")
+
+
+def test_a_program_that_imports_commands_keeps_its_handlers() -> None:
+    program = "import signal, experiments.train, rsjax.convert; print(signal.getsignal(signal.SIGINT).__name__)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "default_int_handler\n"

@@ -63,7 +63,8 @@ def read_tensors(path: Path) -> TensorFile:
             type is unknown to numpy; or PyTorch is not installed.
     """
     if not path.is_file():
-        raise ConvertError(f"{path}: {'is a directory; name a file in it' if path.is_dir() else 'no such file'}")
+        what = "is a directory; name a file in it" if path.is_dir() else "is a pipe or device; name a file"
+        raise ConvertError(f"{path}: {what if path.exists() else 'no such file'}")
     if instead := placeholder(path):
         raise ConvertError(f"{path}: {instead}")
     if path.suffix == SAFE:

@@ -85,7 +85,7 @@ def check_answers(address: str) -> None:
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS", address)
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not port.isdigit():  # Ray says what is wrong with it, or looks for a cluster itself
+    if not (port.isascii() and port.isdecimal()):  # Ray says what is wrong with it, or looks for a cluster itself
         return
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_SECONDS).close()

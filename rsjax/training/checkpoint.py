@@ -148,7 +148,7 @@ class Checkpoints:
 
     def _open(self) -> ocp.CheckpointManager:
         keep_last, keep_every, keep_best = self._keep
-        steps = [path for path in self.directory.iterdir() if path.name.isdigit()]
+        steps = [path for path in self.directory.iterdir() if path.name.isascii() and path.name.isdigit()]
         self._metrics = {int(path.name): metric for path in steps if (metric := read_metric(path)) is not None}
         options = ocp.CheckpointManagerOptions(
             preservation_policy=retention(keep_last, keep_every, self._metrics if keep_best else None),

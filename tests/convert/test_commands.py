@@ -150,6 +150,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     (tmp_path / "x" / "config.json").mkdir(parents=True)
     assert "config.json: cannot be read" in refused(capsys, "genie", tmp_path / "own", tmp_path / "x" / "x.safetensors")
     assert "is a directory" in refused(capsys, "lpips", tmp_path / "own", tmp_path / "x.safetensors")
+    assert "is a pipe or device" in refused(capsys, "lpips", "/dev/zero", tmp_path / "x.safetensors")
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text(json.dumps({"name": "tiny", "model": {}}))

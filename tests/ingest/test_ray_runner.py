@@ -103,7 +103,7 @@ def test_an_address_that_nobody_answers_is_named_at_once(address: str) -> None:
 def test_an_address_that_answers_or_is_none_is_left_to_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{server.getsockname()[1]}")
-        for address in ("auto", "local", "nonsense"):
+        for address in ("auto", "local", "nonsense", "host:²"):
             check_answers(address)
 
 
