@@ -102,11 +102,11 @@ def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
     doubts = "; ".join(layout.unclear)
     if layout.kind == "delta":
         problem = f"declared as steps, which add up, but {doubts}"
-        cure = "list what are commands that stay in force, such as --option 'held=[6]' ('held=[]' if they are steps)"
+        cure = "say --option 'held=[…]' with the numbers of those that stay in force ('held=[]' if none does)"
         raise EpisodeError(f"actions: {problem}; {cure}", option="--option held")
     problem = f"{skipped} recorded rows become one, and nobody says whether they are steps, which add up, or targets"
     cure = "say --option kind=delta or --option kind=absolute, and 'held=[…]' for grippers"
-    doubts = f"; no steps: {doubts}" if doubts else ""
+    doubts = f"; these cannot be steps: {doubts}" if doubts else ""
     raise EpisodeError(f"actions: {problem}; {cure}{doubts}", option="--option kind")
 
 

@@ -170,7 +170,8 @@ def lines(summary: IngestSummary) -> list[str]:
     if summary.cut:
         text.append(f"cuts      in {summary.cut} episodes, which no window crosses; --shots none if they are none")
     if summary.test_clips == 0:
-        text.append("testing   no clip is left for it, and training needs two: raise --test-share or add episodes")
+        cure = "add episodes" if summary.done < 2 else "raise --test-share"  # one episode is always for training
+        text.append(f"testing   no clip is left for it, and training needs two: {cure}")
     text += [f"pictures  of {number} episodes, {how}" for how, number in summary.fits.items()]
     if summary.depth_left_out:
         text.append(f"depth     left out of {summary.depth_left_out} clips: metres and relative depth do not mix")

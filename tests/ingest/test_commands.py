@@ -109,7 +109,7 @@ def test_the_papers_recipe_filters_windows_and_the_default_says_what_it_leaves_o
     line = ["folder", source, "--out", tmp_path / "store", "--workers", 0, *SMALL, "--shots", "none"]
     text = command(ingest, *line)
     assert "filters   off: windows of one action, a key frame in each, clear motion; --recipe paper turns them" in text
-    assert "testing   no clip is left for it" in text
+    assert "testing   no clip is left for it, and training needs two: add episodes\n" in text  # there is but one
     assert "pictures  of 1 episodes, 32 × 24 cropped to the middle square" in text
     assert "9 still" in command.refused(ingest, *line, "--recipe", "paper")
     text = command(ingest, *line, "--recipe=paper", "--windows.least-motion", 0, "--windows.no-key-frame")

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.ingest.actions import ActionConfig, Layout
+from rsjax.ingest.actions import ActionConfig, Kind, Layout, check_declared
 from rsjax.ingest.dimensions import describe_dimensions, flat_names, layout_of
+from rsjax.ingest.episode import EpisodeError
 
 COUNT = 60
 STEPS = np.random.default_rng(0).normal(0, 0.01, (COUNT, 2)).astype(np.float32)
@@ -68,3 +69,15 @@ def test_each_dimension_is_described() -> None:
     assert describe_dimensions(layout, (), ActionConfig(kind="delta"), 5)[3:] == ["(delta, of a quaternion)", "(held)"]
     stacked = describe_dimensions(Layout("undeclared"), ["x"], ActionConfig(compose="stack"), 2)
     assert stacked == ["x (undeclared, row 0)", "x (undeclared, row 1)"]
+
+
+def test_a_refusal_names_the_dimension_and_no_number_that_could_be_mistaken_for_it() -> None:
+    rows = np.zeros((8, 2), np.float32)
+    rows[4:, 1] = 1
+    cases: list[tuple[Kind | None, str]] = [
+        ("delta", r"dimension 1 is never anything but 0 or 1; say --option 'held=\[…\]' with the numbers"),
+        (None, r"say --option kind=delta .*these cannot be steps: dimension 1 is never anything but 0 or 1"),
+    ]
+    for kind, message in cases:
+        with pytest.raises(EpisodeError, match=message):
+            check_declared(layout_of(rows, kind, None), 5, ActionConfig())
