@@ -63,8 +63,8 @@ def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]
         return INTERRUPTED, 130
     if signal.SIGTERM in received:
         return TERMINATED, os.EX_TEMPFAIL
-    if missing := _no_device(error):  # also where it came out as another error, such as one of a checkpoint
-        return f"error: {missing}", 2
+    if bad := _bad_variable(error):  # also where it came out as another error, such as one of a checkpoint
+        return f"error: {bad}", 2
     if isinstance(error, UserError):
         return f"error: {error}", error.status
     cure = _cure(error)
@@ -83,12 +83,15 @@ def _cure(error: BaseException) -> str | None:
     return None
 
 
-def _no_device(error: BaseException | None) -> str:
-    """Says that JAX has no device of the kind that JAX_PLATFORMS asks for, if this is why an error was raised."""
+def _bad_variable(error: BaseException | None) -> str:
+    """Says which of jax's variables asks for what there is not, if this is why an error was raised."""
     platforms, jax = os.environ.get("JAX_PLATFORMS"), sys.modules.get("jax")
-    while platforms and jax is not None and error is not None:
-        # For a kind that it knows, jax raises an empty AssertionError.
-        if isinstance(error, AssertionError) or "Unable to initialize backend" in str(error):
+    while error is not None:
+        if (refused := _JAX_REFUSES.search(str(error))) and (value := os.environ.get(name := refused[1].upper())):
+            return f"{name} is {value!r:.80}, which jax does not know; unset it"
+        # For a kind of device that it knows, jax raises an empty AssertionError.
+        unknown = isinstance(error, AssertionError) or "Unable to initialize backend" in str(error)
+        if platforms and jax is not None and unknown:
             try:
                 jax.devices()
             except Exception:
@@ -97,6 +100,11 @@ def _no_device(error: BaseException | None) -> str:
                 )
         error = error.__cause__ or error.__context__
     return ""
+
+
+_JAX_REFUSES = re.compile(
+    r"^(?:invalid truth value .* for environment '|Invalid value .* for JAX flag )(jax_\w+)", re.I
+)
 
 
 def _exit(line: str, status: int) -> None:

@@ -274,20 +274,30 @@ def test_variables_of_a_cluster_that_are_no_numbers_are_named(
     assert_clear(command(filled(LINES["train"], place)), message)
 
 
-@pytest.mark.parametrize(
-    ("name", "variables"),
-    [("generate", {"JAX_PLATFORMS": "cuda"}), ("train", {"JAX_PLATFORMS": "foo"}), ("inspect", {"MPLBACKEND": "foo"})],
-)
-def test_devices_and_figures_that_the_environment_asks_for_in_vain(
-    name: str, variables: dict[str, str], place: Path
-) -> None:
-    line = [sys.executable, "-m", *f"experiments.{filled(LINES[name], place)}".split()]
-    done = subprocess.run(line, cwd=ROOT, env=os.environ | variables, capture_output=True, text=True)
-    if name == "inspect":
-        assert done.returncode == 0, done.stderr
-    else:
-        named = f"JAX has no device for JAX_PLATFORMS={variables['JAX_PLATFORMS']}; unset it"
-        assert_clear((done.returncode, done.stdout, done.stderr), named)
+REFUSED = {
+    "cuda": ("generate", "JAX_PLATFORMS", "JAX has no device for JAX_PLATFORMS=cuda; unset it"),
+    "foo": ("train", "JAX_PLATFORMS", "JAX has no device for JAX_PLATFORMS=foo; unset it"),
+    "maybe": ("train", "JAX_ENABLE_X64", "JAX_ENABLE_X64 is 'maybe', which jax does not know"),
+    "many": ("generate", "JAX_NUM_CPU_DEVICES", "JAX_NUM_CPU_DEVICES is 'many', which jax does not know"),
+}
+
+
+def with_variable(line: str, name: str, value: str) -> Answer:
+    """Runs a command in a process of its own, with a variable of the environment."""
+    command = [sys.executable, "-m", *f"experiments.{line}".split()]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {name: value}, capture_output=True, text=True)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("value", REFUSED)
+def test_a_variable_that_jax_refuses_is_named(value: str, place: Path) -> None:
+    command, name, message = REFUSED[value]
+    assert_clear(with_variable(filled(LINES[command], place), name, value), message)
+
+
+def test_figures_are_drawn_whatever_backend_the_environment_names(place: Path) -> None:
+    answer = with_variable(filled(LINES["inspect"], place), "MPLBACKEND", "foo")
+    assert answer[0] == 0, answer
 
 
 def test_a_cell_number_of_slurm_that_is_none_is_named(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
