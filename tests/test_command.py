@@ -112,7 +112,7 @@ def test_one_interrupt_is_one_line(lines: str) -> None:
 @pytest.mark.parametrize("number", ANSWERS)
 @pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("rsjax.convert", "argparse")])
 def test_a_signal_while_a_command_is_imported_is_one_line(
-    number: int, command: str, imported: str, tmp_path: Path
+    number: signal.Signals, command: str, imported: str, tmp_path: Path
 ) -> None:
     (tmp_path / f"{imported}.py").write_text(f"import signal\nsignal.raise_signal({int(number)})")
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
