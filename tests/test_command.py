@@ -23,13 +23,16 @@ def blocked():
     lock(mutex)
     print("ready", flush=True)
     lock(mutex)  # for ever, in C code
+def wait():  # in short sleeps: a signal that comes just before a sleep would not end it
+    while True:
+        time.sleep(0.05)
 def said(work):
     print("ready", flush=True)
     work()
 with main_errors():
     exec(sys.argv[1])
 """
-ASLEEP = "said(lambda: time.sleep(600))"
+ASLEEP = "said(wait)"
 IN_C = "blocked()"
 IN_A_GARBAGE_COLLECTION = """
 import gc
@@ -37,14 +40,14 @@ runtime.STOP_SECONDS = 600
 def callback(phase, info):  # as jax has one
     if phase == "start":
         gc.callbacks.remove(callback)
-        said(lambda: time.sleep(600))
+        said(wait)
 gc.callbacks.append(callback)
 gc.collect()
 time.sleep(600)
 """
 IN_AN_IMPORT = """
 try:
-    said(lambda: time.sleep(600))
+    said(wait)
 except BaseException as error:
     raise ImportError("numpy failed to import") from error
 """
@@ -58,7 +61,7 @@ asyncio.run(main())
 """
 CLEANING_UP = """
 try:
-    said(lambda: time.sleep(600))
+    said(wait)
 finally:
     time.sleep(600)
 """
@@ -73,7 +76,7 @@ def traced(x):
     return x
 threading.Thread(target=jax.jit(traced), args=(jnp.ones((300, 300)),), daemon=True).start()
 begun.wait()
-said(lambda: time.sleep(600))
+said(wait)
 """
 
 
@@ -92,9 +95,7 @@ def stopped(lines: str, number: int, again: bool = False) -> tuple[int, str]:
     return process.returncode, errors.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    "lines", ["said(lambda: time.sleep(600))", IN_C, IN_AN_IMPORT, CLEANING_UP, IN_A_GARBAGE_COLLECTION, IN_ASYNCIO]
-)
+@pytest.mark.parametrize("lines", ["said(wait)", IN_C, IN_AN_IMPORT, CLEANING_UP, IN_A_GARBAGE_COLLECTION, IN_ASYNCIO])
 def test_sigterm_ends_a_command_whatever_it_does(lines: str) -> None:
     assert stopped(lines, signal.SIGTERM) == (75, TERMINATED)
 
