@@ -1,14 +1,17 @@
 """Settings of the process that come before JAX is imported, and the signals that stop it."""
 
 import faulthandler
+import hashlib
 import os
+import platform
 import select
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -24,13 +27,22 @@ ANSWERS = {signal.SIGINT: (INTERRUPTED, 130), signal.SIGTERM: (TERMINATED, os.EX
 patient = threading.Event()  # set while SIGTERM may take longer, because steps are to be saved
 
 
-def tune_process() -> None:
-    """Restarts the program once, with the same process id and arguments, so that glibc allocates huge pages.
+CACHE_DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
+CACHE_SIZE = 4 * 2**30  # bytes of compiled programs that are kept
 
-    XLA's CPU backend allocates fresh memory for every step, and touching it 4 KiB at a time takes a quarter of a small
-    model's step. glibc reads its tunables only when a process starts, hence the restart. Does nothing if the user has
-    set this tunable, or off Linux.
+
+def tune_process() -> None:
+    """Keeps compiled programs from one start to the next, and restarts the program once for huge pages.
+
+    Compiled programs are kept in ``~/.cache/rsjax``, or where the user's ``JAX_COMPILATION_CACHE_DIR`` says; if that is
+    empty, nowhere.
+
+    The restart has the same process id and arguments. XLA's CPU backend allocates fresh memory for every step, and
+    touching it 4 KiB at a time takes a quarter of a small model's step. glibc reads its tunables only when a process
+    starts, hence the restart. Does not restart if the user has set this tunable, or off Linux.
     """
+    if CACHE_DIRECTORY not in os.environ and (cache := _cache_directory()):
+        os.environ |= {CACHE_DIRECTORY: str(cache), "JAX_COMPILATION_CACHE_MAX_SIZE": str(CACHE_SIZE)}
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if not sys.platform.startswith("linux") or "glibc.malloc.hugetlb" in tunables:
         return
@@ -50,6 +62,23 @@ def answer_while_importing() -> None:
     for number, answer in ANSWERS.items():
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, lambda *_, answer=answer: _end(*answer))
+
+
+def _cache_directory() -> Path | None:
+    """Returns the directory of compiled programs; None without a home.
+
+    Machines that share a home may have different processors, whose programs must not be mixed: hence one directory for
+    each set of instructions.
+    """
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
+    processor = platform.machine()
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next((line for line in lines if line.startswith(("flags", "Features"))), processor)
+    return home / "rsjax" / f"xla-{hashlib.sha256(processor.encode()).hexdigest()[:8]}"
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.runtime import HUGE_PAGES
+from rsjax.runtime import HUGE_PAGES, tune_process
 
 ROOT = Path(__file__).parents[1]
 # Prints its tunables and arguments, and appends its process id to a file at each start.
@@ -47,3 +47,18 @@ def test_a_tunable_that_the_user_set_stays(tmp_path: Path) -> None:
     lines, starts = run(tmp_path / "starts", "glibc.malloc.hugetlb=0", "a")
     assert lines == ["glibc.malloc.hugetlb=0", "a"]
     assert len(starts) == 1
+
+
+@pytest.mark.parametrize("set_by_user", [None, "", "/elsewhere"])
+def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, set_by_user: str | None
+) -> None:
+    monkeypatch.setattr(os, "execve", lambda *_: None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_MAX_SIZE", "-1")  # restored after the test
+    if set_by_user is not None:
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", set_by_user)
+    tune_process()
+    chosen = os.environ["JAX_COMPILATION_CACHE_DIR"]
+    assert chosen == set_by_user if set_by_user is not None else chosen.startswith(str(tmp_path / "rsjax" / "xla-"))
