@@ -103,6 +103,7 @@ class MaskConfig:
     corruption_probability: float = 0.5  # step 2 applies to this share of the batches
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
     corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+    visible_prefix: float = 0.0  # step 3: share of the clips in which all frames before a random one stay visible
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 1. Every sub-token of every frame, the first too, becomes a random code with probability rate·u, u ~ U(0, 1).
 2. With ``corruption_probability``: f ~ U{P, …, T-1} and r ~ U(keep, 1); in each frame ≥ f, r shrinks by U(decay, 1) and
    sub-tokens become random with probability 1 - r. Otherwise f = 1. (P: prompt frames.)
-3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame.
+3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame. In a share
+   ``visible_prefix`` of the clips (not in the reference) this begins at a frame drawn per clip, {1, …, T-1}: before it
+   all is visible, as past frames are in sampling.
 
 u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that it does
 not depend on the clip's device.
@@ -57,7 +59,8 @@ def corrupt(
             branch: _replace_sub_tokens(k, grid, replace, code_bits, vocabularies)
             for k, (branch, grid) in zip(branch_keys, clip.items(), strict=True)
         }
-        return Masked(noisy, _mask(mask_key, next(iter(clip.values())).shape, first_masked))
+        first = _after_prefix(config.visible_prefix, mask_key, frames, first_masked)
+        return Masked(noisy, _mask(mask_key, next(iter(clip.values())).shape, first))
 
     return jax.vmap(one_clip)(index, tokens)
 
@@ -85,6 +88,15 @@ def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int)
     survive = keep * jnp.cumprod(jnp.where(late, decay, 1.0))
     extra = jnp.where(happens & late, 1 - survive, 0.0)
     return 1 - (1 - everywhere) * (1 - extra), jnp.where(happens, drawn, 1)
+
+
+def _after_prefix(rate: float, key: Array, frames: int, first_masked: Array) -> Array:
+    """Returns a clip's first masked frame: later than the batch's in a share ``rate`` of the clips."""
+    if not rate:
+        return first_masked
+    happens_key, cut_key = jax.random.split(jax.random.fold_in(key, 0))
+    cut = jnp.where(jax.random.bernoulli(happens_key, rate), jax.random.randint(cut_key, (), 1, frames), 1)
+    return jnp.maximum(first_masked, cut)
 
 
 def _replace_sub_tokens(key: Array, tokens: Array, rate: Array, code_bits: int, vocabularies: int) -> Array:

@@ -15,7 +15,8 @@ T, GRID, BITS, VOCABULARIES = 10, 8, 18, 2
 BATCHES, CLIPS = 64, 16
 STEP_1 = MaskConfig(corruption_probability=0.0)
 STEP_2 = MaskConfig(random_token_rate=0.0)
-PROMPT = {STEP_1: 1, STEP_2: 4}  # frames given at generation
+PREFIX = MaskConfig(corruption_probability=0.0, visible_prefix=0.5)
+PROMPT = {STEP_1: 1, STEP_2: 4, PREFIX: 1}  # frames given at generation
 
 
 @partial(jax.jit, static_argnums=0)
@@ -139,3 +140,12 @@ def test_dropped_actions_follow_a_clips_place_too(seed: int) -> None:
 def test_the_given_share_of_actions_is_dropped() -> None:
     drop = dropped(0.2, jax.random.key(0), jnp.arange(4000))
     assert np.mean(drop) == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_visible_prefix_ends_at_a_frame_drawn_per_clip_and_changes_nothing_else() -> None:
+    before, after = (run(config)[0].mask for config in (STEP_1, PREFIX))
+    masked = after.any((-1, -2))  # batches, clips, T
+    first = np.where(masked.any(-1), masked.argmax(-1), T)
+    np.testing.assert_array_equal(after, before & (np.arange(T) >= first[..., None])[..., None, None])
+    assert np.mean(first > 1) == pytest.approx(0.5 * (T - 2) / (T - 1), abs=0.06)
+    assert set(range(1, T)) <= set(np.unique(first))
