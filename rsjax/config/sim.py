@@ -17,7 +17,7 @@ class SimConfig:
     frames: int = 16
     control_steps: int = 4  # 20 Hz control steps between frames; a frame's action is their concatenation
     image_size: int = 64
-    camera: str = "agentview"
+    camera: str = "agentview"  # near: our own, in which cube and gripper are larger
     tracks: int = 256  # N₀: dense keypoint tracks per clip
     # Where tracks start. grid: evenly over the image, as in the paper, which avoids segmentation on purpose.
     # objects: up to half on a grid, the others on the cube and the arm's moving links, found by segmentation.

@@ -31,8 +31,12 @@ class Camera:
     fovy: float
 
     @property
+    def extent(self) -> float:
+        """Returns the metres that the image spans at a depth of 1 m."""
+        return 2 * self._half
+
+    @property
     def _half(self) -> float:
-        """Returns half the image's extent at a depth of 1 m."""
         return float(np.tan(np.radians(self.fovy) / 2))
 
     def project(self, points: Float[np.ndarray, "*N 3"]) -> tuple[Float[np.ndarray, "*N 2"], Float[np.ndarray, "*N"]]:

@@ -1,6 +1,6 @@
 """Measures how exact Lucas–Kanade tracks and depth colours are on a simulator's clips, as docs/annotate.md reports.
 
-python -m tests.ingest.annotators.track_accuracy data/lift-2bf9a2b8adc30d79 --split test
+python -m tests.ingest.annotators.track_accuracy data/lift-c117ee71e3e53484 --split test
 """
 
 import argparse
