@@ -37,7 +37,7 @@ def debug() -> Config:
         tokenizer_train=TokenizerTrainConfig(steps=6, batch_size=2, log_every=2, checkpoint_every=3),
         model=RoboScapeConfig(width=32, blocks=2, heads=2, loss=LossConfig(num_keypoints=8)),
         train=LoopConfig(steps=4, batch_size=2, log_every=2, checkpoint_every=2),
-        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2),
+        eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2, localiser_steps=10),
     )
 
 

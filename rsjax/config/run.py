@@ -21,13 +21,16 @@ class EvalConfig:
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
     report_clips: int = 4  # clips shown in the report
+    localiser_steps: int = 800  # of the network that reads from frames where cube and gripper are
     # Without these files, which are not part of this project, the metrics are null.
     lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips
     lpips_vgg_weights: str = ""
     depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth
 
     def __post_init__(self) -> None:
-        require_range(self, "eval", 1, math.inf, "loss_clips", "batch_size", "action_draws", "report_clips")
+        require_range(
+            self, "eval", 1, math.inf, "loss_clips", "batch_size", "action_draws", "report_clips", "localiser_steps"
+        )
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,12 @@ from jaxtyping import Float
 from rsjax.clip import Video
 from rsjax.config import EvalConfig
 from rsjax.data.clips import Clips, readable, spread
-from rsjax.data.codec import decode, encode
+from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import Store, StoreError
 from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
+from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.metrics import delta_psnr
-from rsjax.evaluation.registry import Metric, Scene, Unavailable, metrics
+from rsjax.evaluation.registry import Located, Metric, Places, Scene, Unavailable, metrics
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
 from rsjax.ingest.annotators.protocols import DepthEstimator
@@ -26,6 +28,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tokenizers.lpips import load_lpips
 
+LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 
 
@@ -71,8 +74,10 @@ def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
     check_files(config.eval)
     estimator = choose_estimator(config.eval, load=True)
     numbers = spread(source, config.eval.clips)
-    clips = Clips.stacked([source[number] for number in numbers], numbers)
-    scenes = _scenes(trained, clips, _generate_all(trained, clips, store), estimator)
+    records = [source[number] for number in numbers]
+    clips = Clips.stacked(records, numbers)
+    videos = _generate_all(trained, clips, store)
+    scenes = _scenes(trained, clips, videos, estimator, _locate(trained, store, records))
 
     scores: dict[str, float] = {}
     reasons: dict[str, str] = {}
@@ -129,8 +134,28 @@ def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: b
     return Video(rgb, np.concatenate(unknown)[: len(actions)])
 
 
+def _locate(trained: TrainedModel, store: Store, records: Sequence[Record]) -> Callable[[Video, bool], Located] | None:
+    """Trains a localiser and returns a function that compares its reading of a video's last frames with the truth.
+
+    None if the clips do not record where things are.
+    """
+    recorded, train = recorded_places(records), store.source("train")
+    if recorded is None:
+        return None
+    places, width = recorded
+    last = Places(places.xy[:, -1], places.lifted[:, -1])
+    clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))]
+    localiser = train_localiser(clips, trained.config.eval.localiser_steps)
+    on_truth = localiser(np.stack([record["rgb"][-1] for record in records]))
+    return lambda video, own: Located(last, width, on_truth if own else None, localiser(video.rgb[:, -1]))
+
+
 def _scenes(
-    trained: TrainedModel, clips: Clips, videos: dict[str, list[Video]], estimator: DepthEstimator | None
+    trained: TrainedModel,
+    clips: Clips,
+    videos: dict[str, list[Video]],
+    estimator: DepthEstimator | None,
+    locate: Callable[[Video, bool], Located] | None,
 ) -> dict[str, Scene]:
     """Returns the prediction's scene as "", and those of both baselines by their suffix of names."""
     settings, prompt, truth = trained.config.eval, trained.config.prompt_frames, clips.metric_video
@@ -141,7 +166,15 @@ def _scenes(
     rgb = {suffix: video.rgb for suffix, video in shown.items()}
     estimated = estimate_depth(estimator, truth.rgb, rgb) if estimator else {}
     return {
-        suffix: Scene(truth, video, prompt, {} if suffix else alternatives, estimated.get(suffix), settings)
+        suffix: Scene(
+            truth,
+            video,
+            prompt,
+            {} if suffix else alternatives,
+            estimated.get(suffix),
+            locate(video, not suffix) if locate else None,
+            settings,
+        )
         for suffix, video in shown.items()
     }
 
@@ -166,8 +199,8 @@ def _flat(metric: Metric, scene: Scene, suffix: str) -> dict[str, float]:
     scored = metric.function(scene)
     flat: dict[str, float] = {}
     for part, per_clip in (scored if isinstance(scored, dict) else {"": scored}).items():
-        name = f"{metric.name}{part}{suffix}"
-        flat |= bootstrap(per_clip).flat(name) if metric.interval else {name: float(np.mean(per_clip))}
+        name, estimate = f"{metric.name}{suffix}{part}", bootstrap(per_clip, statistic=metric.statistic)
+        flat |= estimate.flat(name) if metric.interval else {name: estimate.value}
     return flat
 
 

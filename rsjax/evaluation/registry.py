@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rsjax.clip import Video
 from rsjax.config import ConfigError, EvalConfig
+from rsjax.evaluation.statistics import Statistic
 
 PerClip: TypeAlias = Float[np.ndarray, " B"]
 Scores: TypeAlias = PerClip | dict[str, PerClip]  # a dict has several scores by suffix; "" is the metric itself
@@ -37,6 +38,40 @@ class EstimatedDepth:
     prediction: Float[np.ndarray, "B T H W"]
 
 
+@dataclass(frozen=True)
+class Places:
+    """Where things are in the last frames of B clips, or in any frames.
+
+    Attributes:
+        xy: x (right) and y (down) of cube and gripper; 0 and 1 are the image's edges, to which points outside move.
+        lifted: whether the cube is lifted.
+    """
+
+    xy: Float[np.ndarray, "*B 2 2"]
+    lifted: Bool[np.ndarray, "*B"]
+
+
+@dataclass(frozen=True)
+class Located:
+    """Places in the last frames of B clips: true ones, and as a network reads them from the pictures.
+
+    Attributes:
+        truth: as the simulator recorded them.
+        width: the cube's width in the unit of ``xy``.
+        on_truth: read from the recorded frames; None where that is reported elsewhere.
+        prediction: read from the generated frames.
+    """
+
+    truth: Places
+    width: Float[np.ndarray, " B"]
+    on_truth: Places | None
+    prediction: Places
+
+    def read(self) -> dict[str, Places]:
+        """Returns what the network read, by suffix of the metrics' names."""
+        return {"": self.prediction} | ({"_truth": self.on_truth} if self.on_truth else {})
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Inputs of a metric: B clips, of which the first ``prompt_frames`` frames are the prompt.
@@ -46,6 +81,7 @@ class Scene:
         prediction: videos generated under their own actions.
         alternatives: videos generated under other actions, by kind; one for each draw of actions.
         estimated: depth estimated from the frames; None without an estimator.
+        located: where things are in the last frame; None if the clips do not record it.
         settings: with the paths of weights.
     """
 
@@ -54,6 +90,7 @@ class Scene:
     prompt_frames: int = 1
     alternatives: Mapping[str, Sequence[Video]] = field(default_factory=dict)
     estimated: EstimatedDepth | None = None
+    located: Located | None = None
     settings: EvalConfig = field(default_factory=EvalConfig)
     _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
@@ -79,6 +116,7 @@ class Metric:
         needs: videos that it needs beside the prediction.
         watch: whether it is also computed during training.
         interval: whether its bootstrap interval is reported.
+        statistic: what summarises the clips.
         column: whether tables have a column for it.
         function: scores a scene, one number per clip, or raises :class:`Unavailable`; None for a number that is not
             computed from videos.
@@ -92,6 +130,7 @@ class Metric:
     needs: tuple[Need, ...] = ()
     watch: bool = False
     interval: bool = True
+    statistic: Statistic = "mean"
     column: bool = True
     function: Callable[[Scene], Scores] | None = None
 
@@ -141,6 +180,7 @@ def metric(
     needs: tuple[Need, ...] = (),
     watch: bool = False,
     interval: bool = True,
+    statistic: Statistic = "mean",
     column: bool = True,
 ) -> Callable[[Callable[[Scene], Scores]], Callable[[Scene], Scores]]:
     """Registers a function as a metric; the arguments are the fields of :class:`Metric`.
@@ -152,7 +192,8 @@ def metric(
     def register(function: Callable[[Scene], Scores]) -> Callable[[Scene], Scores]:
         if name in _METRICS:
             raise ConfigError(f"two metrics are named {name!r}; rename one of them")
-        _METRICS[name] = Metric(name, title, unit, better, decimals, needs, watch, interval, column, function)
+        settings = (name, title, unit, better, decimals, needs, watch, interval, statistic, column)
+        _METRICS[name] = Metric(*settings, function)
         return function
 
     return register

@@ -1,22 +1,25 @@
 """Means over clips and their confidence intervals."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+Statistic = Literal["mean", "median"]
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over clips with its bootstrap interval; ``low`` and ``high`` are None for a single clip."""
+    """A mean or median over clips with its bootstrap interval; ``low`` and ``high`` are None for a single clip."""
 
-    mean: float
+    value: float
     low: float | None
     high: float | None
 
     def flat(self, name: str) -> dict[str, float]:
-        """Returns the mean as ``name``, and the interval, if any, as ``name_low`` and ``name_high``."""
-        values = {name: self.mean, f"{name}_low": self.low, f"{name}_high": self.high}
+        """Returns the value as ``name``, and the interval, if any, as ``name_low`` and ``name_high``."""
+        values = {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
         return {key: value for key, value in values.items() if value is not None}
 
 
@@ -33,9 +36,13 @@ def over_predicted_frames(per_frame: Float[np.ndarray, "*B T"], prompt_frames: i
 
 
 def bootstrap(
-    per_clip: Float[np.ndarray, " B"], seed: int = 0, level: float = 0.95, resamples: int = 10_000
+    per_clip: Float[np.ndarray, " B"],
+    seed: int = 0,
+    level: float = 0.95,
+    resamples: int = 10_000,
+    statistic: Statistic = "mean",
 ) -> Estimate:
-    """Returns the mean over clips and its percentile-bootstrap interval; clips are resampled, not frames.
+    """Returns the mean or median over clips and its percentile-bootstrap interval; clips are resampled, not frames.
 
     For a paired comparison of two models, pass the clips' differences.
 
@@ -44,6 +51,7 @@ def bootstrap(
         seed: of the resampling.
         level: the interval's coverage, between 0 and 1.
         resamples: the number of times that B clips are drawn with replacement.
+        statistic: what summarises the clips.
 
     Raises:
         ValueError: no clips, or a value that is not finite.
@@ -55,5 +63,6 @@ def bootstrap(
         return Estimate(float(values[0]), None, None)
     drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
     tail = (1 - level) / 2
-    low, high = np.quantile(values[drawn].mean(1), [tail, 1 - tail])
-    return Estimate(float(values.mean()), float(low), float(high))
+    summarise = np.mean if statistic == "mean" else np.median
+    low, high = np.quantile(summarise(values[drawn], axis=1), [tail, 1 - tail])
+    return Estimate(float(summarise(values)), float(low), float(high))

@@ -34,6 +34,7 @@ def held_out() -> list[dict[str, np.ndarray]]:
     return [vars(toy.clip(toy.TRAIN + i, toy.SUCCESS[i])) for i in range(toy.TEST)]
 
 
+PLACES = {"cube_error_widths", "gripper_error_widths", "lifted_accuracy"}
 TRUTH = {name: np.stack([clip[name] for clip in held_out()]) for name in ("rgb", "depth", "actions")}
 
 
@@ -57,6 +58,11 @@ def test_the_baselines_are_plain_numpys(clips: Store, result: Evaluation) -> Non
     first = np.broadcast_to(TRUTH["rgb"][:, :1], TRUTH["rgb"].shape)
     reconstruction = codec.decode_rgb(codec.encode_rgb(TRUTH["rgb"]))
     assert result.metrics["psnr_repeat_first"] == pytest.approx(psnr(TRUTH["rgb"], first), rel=1e-4)
+    frames = TRUTH["rgb"].shape[1]
+    late = [0, *range(1 + (frames - 1) // 2, frames)]  # a prompt frame, then the second half of the predicted ones
+    assert result.metrics["psnr_tokenizer_second_half"] == pytest.approx(
+        psnr(TRUTH["rgb"][:, late], reconstruction[:, late]), rel=1e-4
+    )
     assert result.metrics["psnr_tokenizer"] == pytest.approx(psnr(TRUTH["rgb"], reconstruction), rel=1e-4)
     first_depth = np.broadcast_to(TRUTH["depth"][:, :1], TRUTH["depth"].shape)
     depth = codec.decode_depth(codec.encode_depth(TRUTH["depth"]))
@@ -92,7 +98,7 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
 
 def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> None:
     assert {name for name in metrics() if name in result.metrics} == metrics().keys() - result.reasons.keys()
-    assert {name for name in result.reasons if "estimator" not in name} == {"lpips_alex", "lpips_vgg"}
+    assert {name for name in result.reasons if "estimator" not in name} == {"lpips_alex", "lpips_vgg"} | PLACES
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
 
 

@@ -17,7 +17,7 @@ def test_bootstrap_agrees_with_a_loop_and_with_normal_theory():
     got = bootstrap(values)
     rng = np.random.default_rng(99)
     means = [rng.choice(values, len(values)).mean() for _ in range(10_000)]
-    assert got.mean == pytest.approx(values.mean())
+    assert got.value == pytest.approx(values.mean())
     np.testing.assert_allclose([got.low, got.high], np.quantile(means, [0.025, 0.975]), atol=0.05)
     np.testing.assert_allclose(got.high - got.low, 2 * 1.96 * values.std() / np.sqrt(40), rtol=0.05)
 

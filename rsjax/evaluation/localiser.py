@@ -1,0 +1,108 @@
+"""Reads from a frame where cube and gripper are and whether the cube is lifted: a small network trained on true frames.
+
+It measures what a picture shows: blurred frames can have everything in its place, and sharp ones nothing.
+
+Axes: B frames, H×W pixels; 2 objects: cube, gripper.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from jaxtyping import Array, Float, Int, UInt8
+
+from rsjax.data.codec import Record
+from rsjax.evaluation.registry import Places
+from rsjax.progress import Progress
+
+OBJECTS = ("cube", "gripper")
+BATCH = 64  # frames of a step
+
+
+def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, " B"]] | None:
+    """Returns what the simulator wrote into clips' provenance, for all frames (B, T, …), and the cubes' widths.
+
+    None if one of the clips has nothing of this.
+    """
+    objects = [clip["provenance"].get("objects") for clip in clips]
+    if not all(objects):
+        return None
+    xy = np.stack([np.stack([each[name] for name in OBJECTS], axis=1) for each in objects])
+    lifted = np.stack([clip["success"] for clip in clips])
+    return Places(np.clip(xy, 0, 1), lifted), np.array([each["cube_width"] for each in objects])
+
+
+class Network(nn.Module):
+    """Convolutions, and for each object the mean place under a softmax over the cells, with a linear correction."""
+
+    @nn.compact
+    def __call__(self, rgb: Array) -> tuple[Float[Array, "B 2 2"], Float[Array, " B"]]:
+        """Returns places, and the logit of "lifted"."""
+        x = rgb.astype(jnp.float32) / 127.5 - 1
+        for width, stride in ((24, 2), (32, 2), (32, 1), (32, 1), (32, 1)):
+            x = nn.relu(nn.GroupNorm(8)(nn.Conv(width, (3, 3), (stride, stride))(x)))
+        b, h, w, _ = x.shape
+        heat = jax.nn.softmax(nn.Conv(len(OBJECTS), (1, 1))(x).reshape(b, h * w, -1), axis=1)
+        rows, columns = jnp.divmod(jnp.arange(h * w), w)
+        cells = jnp.stack([(columns + 0.5) / w, (rows + 0.5) / h], -1)
+        around = jnp.einsum("bno,bnc->boc", heat, x.reshape(b, h * w, -1)).reshape(b, -1)  # features at the objects
+        xy = jnp.einsum("bno,nc->boc", heat, cells) + 0.1 * nn.Dense(4)(around).reshape(b, 2, 2)
+        seen = jnp.concatenate([around, xy.reshape(b, -1)], -1)
+        return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(seen)))[:, 0]
+
+
+@dataclass(frozen=True)
+class Localiser:
+    """A trained network."""
+
+    params: Any
+
+    def __call__(self, rgb: UInt8[np.ndarray, "B H W 3"], batch: int = 256) -> Places:
+        """Returns the places in frames."""
+        rows = [np.minimum(np.arange(i, i + batch), len(rgb) - 1) for i in range(0, len(rgb), batch)]
+        parts = [_apply(self.params, rgb[each]) for each in rows]
+        xy, logit = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(rgb)] for i in (0, 1))
+        return Places(np.clip(xy, 0, 1), logit > 0)
+
+
+def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
+    """Trains a network on the true frames of clips that record places. The result depends on the arguments alone."""
+    recorded = recorded_places(clips)
+    assert recorded is not None
+    frames = np.concatenate([clip["rgb"] for clip in clips])
+    xy, lifted = recorded[0].xy.reshape(-1, 2, 2), recorded[0].lifted.reshape(-1)
+
+    params = Network().init(jax.random.key(0), frames[:1])
+    optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
+    state, rng = optimizer.init(params), np.random.default_rng(0)
+    step = _make_step(optimizer)
+    with Progress("localiser", steps, "steps") as progress:
+        for number in range(steps):
+            rows: Int[np.ndarray, " B"] = rng.integers(0, len(frames), BATCH)
+            params, state = step(params, state, frames[rows], xy[rows], lifted[rows])
+            progress.update(number + 1)
+    return Localiser(params)
+
+
+def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
+    def loss(params: Any, frames: Array, xy: Array, lifted: Array) -> Array:
+        places, logit = _apply(params, frames)
+        # Absolute errors: a hidden cube has a large one, which must not rule the others.
+        return 10 * jnp.abs(places - xy).mean() + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()
+
+    @jax.jit
+    def step(params: Any, state: Any, frames: Array, xy: Array, lifted: Array) -> tuple[Any, Any]:
+        updates, state = optimizer.update(jax.grad(loss)(params, frames, xy, lifted), state)
+        return optax.apply_updates(params, updates), state
+
+    return step
+
+
+@jax.jit
+def _apply(params: Any, frames: Array) -> tuple[Array, Array]:
+    return cast(tuple[Array, Array], Network().apply(params, frames))
