@@ -37,12 +37,18 @@ def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
     for stage in soak.all_stages[: soak.all_stages.index("world_model")]:
         copy_tree(soak.reference / stage, place / "whole" / stage)
     record = damage_record(place / "whole" / "tokens" / "store", rng)
-    copy_tree(place / "whole", place / "killed")
+    copy_tree(place / "whole", place / "untouched")
     show(f"record {record} of the training split is damaged: two short runs without it")
     whole = _target(soak, place / "whole", 0.0)
     run_without_faults(whole)
-    killed = _target(soak, place / "killed", 3 * step_seconds(whole.trained[0]))
-    done = run_round(killed, [KILL_TRAINING], rng, show=show)
+    # A run of some milliseconds a step can end before the kill: then again, with the kill nearer to the first step.
+    for steps in (3, 1, 0, 0, 0):
+        shutil.rmtree(place / "killed", ignore_errors=True)
+        copy_tree(place / "untouched", place / "killed")
+        killed = _target(soak, place / "killed", steps * step_seconds(whole.trained[0]))
+        done = run_round(killed, [KILL_TRAINING], rng, show=show)
+        if done.events or done.problem:
+            break
     problem = done.problem or ("" if done.events else "the run ended before it could be killed")
     differences = compare_stages(killed.trained[0], whole.trained[0])
     quarantined = sorted(json.loads(line)["record"] for line in json_lines(killed.trained[0], QUARANTINE))
