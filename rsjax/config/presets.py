@@ -68,7 +68,7 @@ def tiny() -> Config:
             l1_weight=0.2,
             l2_weight=4.0,
             entropy_weight=0.01,
-            entropy_offset=0.0,
+            entropy_offset=0.0,  # the true entropy, as these weights were chosen with
             commitment_weight=0.1,
             sharding="jit",
             checkpoint_every=500,
