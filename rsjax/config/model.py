@@ -161,8 +161,8 @@ class LossConfig:
     use_keypoints: bool = True  # False: without the keypoint and attention terms
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
     # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
-    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which gains
-    # 0.07 dB of ΔPSNR under uniform actions and changes nothing else (docs/results/keypoints.md).
+    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which has
+    # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (docs/results/keypoints.md).
     keypoint_target: Literal["observed", "predicted"] = "observed"
     # Whether Eq. 5 compares masked cells only: from a third to half of ŝ_t lie on visible cells, where nobody samples.
     # Measured there without effect.
