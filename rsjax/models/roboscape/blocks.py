@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import Attention, Dense, KeyValues, layer_norm
+from rsjax.models.roboscape.gelu import gelu
 
 Features = Float[Array, "B T S C"]
 
@@ -33,7 +34,7 @@ class STBlock(nn.Module):
         out, cache = Attention(cfg, name="temporal_attn").temporal(before_time, start, cache)
         x = x + out
         h = Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed("norm2", x))
-        return x + Dense(cfg.width, bf16, name="fc2")(nn.gelu(h, approximate=False)), cache
+        return x + Dense(cfg.width, bf16, name="fc2")(gelu(h)), cache
 
 
 class DualBlock(nn.Module):

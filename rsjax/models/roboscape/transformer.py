@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
 from rsjax.models.roboscape.blocks import DualBlock
+from rsjax.models.roboscape.gelu import gelu
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
@@ -118,7 +119,7 @@ class Transformer(nn.Module):
         if actions is None:
             raise ValueError(f"the model reads actions ({cfg.action_inputs} numbers a frame), and got none")
         if cfg.action_encoder == "mlp":
-            hidden = nn.gelu(Dense(cfg.width, name="action_encoder_fc1")(actions), approximate=False)
+            hidden = gelu(Dense(cfg.width, name="action_encoder_fc1")(actions))
             encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name="action_encoder_fc2")(hidden)
         else:
             encoded = Dense(cfg.width, name="action_encoder")(actions)
