@@ -20,7 +20,7 @@ class EvalConfig:
     loss_clips: int = 1000  # clips of the validation loss during training, likewise
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
-    report_clips: int = 4  # clips shown in the report
+    report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 800  # of the network that reads from frames where cube and gripper are
     # Without these files, which are not part of this project, the metrics are null.
     lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips

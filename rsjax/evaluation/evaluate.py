@@ -5,9 +5,8 @@ Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random act
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,9 +17,11 @@ from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import Store, StoreError
 from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
+from rsjax.evaluation.frame_curves import Curves, frame_curves
 from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.metrics import delta_psnr
-from rsjax.evaluation.registry import Located, Metric, Places, Scene, Unavailable, metrics
+from rsjax.evaluation.registry import Located, Metric, PerClip, Places, Scene, Unavailable, metrics
+from rsjax.evaluation.shown import shown_arrays
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
 from rsjax.ingest.annotators.protocols import DepthEstimator
@@ -40,11 +41,15 @@ class Evaluation:
         metrics: scores by name.
         reasons: why a registered metric has no score, by name.
         shown: arrays of the clips in the report, with a leading axis over clips.
+        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the test split.
+        curves: means over the clips at each predicted frame, as in curves.json.
     """
 
     metrics: dict[str, float]
     reasons: dict[str, str]
     shown: dict[str, np.ndarray]
+    per_clip: dict[str, list[float]] = field(default_factory=dict)
+    curves: Curves = field(default_factory=dict)
 
 
 def check_files(settings: EvalConfig) -> None:
@@ -81,15 +86,21 @@ def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
 
     scores: dict[str, float] = {}
     reasons: dict[str, str] = {}
+    per_clip: dict[str, PerClip] = {}
     for metric in metrics().values():
         try:
-            scores |= _score(metric, scenes)
+            scored = _score(metric, scenes)
         except Unavailable as reason:
             reasons[metric.name] = str(reason)
+        else:
+            scores |= _summarised(metric, scored)
+            per_clip |= scored
     scores["clips"] = float(len(clips.rgb))
     if (share := store.manifest.get("success_share")) is not None:
         scores["success_share"] = float(share)
-    return Evaluation(scores, reasons, _shown(clips, scenes, config.eval.report_clips))
+    shown = shown_arrays(clips, scenes, per_clip["psnr"], config.eval.report_clips)
+    rows = {name: values.tolist() for name, values in per_clip.items()}
+    return Evaluation(scores, reasons, shown, rows, frame_curves(scenes))
 
 
 def _generate_all(trained: TrainedModel, clips: Clips, store: Store) -> dict[str, list[Video]]:
@@ -179,29 +190,33 @@ def _scenes(
     }
 
 
-def _score(metric: Metric, scenes: dict[str, Scene]) -> dict[str, float]:
-    """Scores the prediction and both baselines with a metric.
+def _score(metric: Metric, scenes: dict[str, Scene]) -> dict[str, PerClip]:
+    """Scores the clips of the prediction and of both baselines with a metric, by name.
 
     Raises:
         Unavailable: the prediction cannot be scored. A baseline that cannot is left out.
     """
-    scores = _flat(metric, scenes[""], "")
-    if metric.needs:
-        return scores | {f"{metric.name}_repeat_first": 0.0}  # this baseline ignores actions
-    for suffix in filter(None, scenes):
+    scores = _named(metric, scenes[""], "")
+    for suffix in filter(None, scenes if not metric.needs else ()):
         with suppress(Unavailable):
-            scores |= _flat(metric, scenes[suffix], suffix)
+            scores |= _named(metric, scenes[suffix], suffix)
     return scores
 
 
-def _flat(metric: Metric, scene: Scene, suffix: str) -> dict[str, float]:
+def _named(metric: Metric, scene: Scene, suffix: str) -> dict[str, PerClip]:
     assert metric.function is not None
     scored = metric.function(scene)
+    parts = scored if isinstance(scored, dict) else {"": scored}
+    return {f"{metric.name}{suffix}{part}": np.asarray(per_clip) for part, per_clip in parts.items()}
+
+
+def _summarised(metric: Metric, per_clip: dict[str, PerClip]) -> dict[str, float]:
+    """Returns the mean or median over clips of each score, and its interval."""
     flat: dict[str, float] = {}
-    for part, per_clip in (scored if isinstance(scored, dict) else {"": scored}).items():
-        name, estimate = f"{metric.name}{suffix}{part}", bootstrap(per_clip, statistic=metric.statistic)
+    for name, values in per_clip.items():
+        estimate = bootstrap(values, statistic=metric.statistic)
         flat |= estimate.flat(name) if metric.interval else {name: estimate.value}
-    return flat
+    return flat | ({f"{metric.name}_repeat_first": 0.0} if metric.needs else {})  # this baseline ignores actions
 
 
 def _repeat_first(video: Video, prompt_frames: int) -> Video:
@@ -210,33 +225,10 @@ def _repeat_first(video: Video, prompt_frames: int) -> Video:
     return Video(np.repeat(last.rgb, frames, 1), None if last.depth is None else np.repeat(last.depth, frames, 1))
 
 
-def _shown(clips: Clips, scenes: dict[str, Scene], count: int) -> dict[str, np.ndarray]:
-    """Returns arrays of the clips in the report: successes and failures alternate, in the split's order."""
-    ends, own, other = clips.success[:, -1], scenes[""].prediction, scenes[""].alternatives["other"][0]
-    good, bad = (list(np.flatnonzero(ends == outcome)) for outcome in (True, False))
-    turns = [queue.pop(0) for _ in ends for queue in (good, bad) if queue]
-    rows = np.array(turns[:count])
-    arrays: dict[str, Any] = {
-        "clip": clips.index[rows],
-        "task": np.array(clips.task)[rows],
-        "truth": clips.rgb[rows],
-        "prediction": own.rgb[rows],
-        "other_actions": other.rgb[rows],
-        "has_depth": clips.has_depth[rows],
-        "metric": clips.metric[rows],
-        "true_depth": clips.depth[rows],
-        "tracks": clips.tracks[rows],
-        "visible": clips.visible[rows],
-        "success": ends[rows],
-    }
-    if "_tokenizer" in scenes:
-        arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
-    return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
-
-
 def save(path: Path, result: Evaluation) -> None:
     """Writes a result atomically."""
-    write_atomically(path, encode({"metrics": result.metrics, "reasons": result.reasons} | result.shown))
+    values = {name: getattr(result, name) for name in ("metrics", "reasons", "per_clip", "curves")}
+    write_atomically(path, encode(values | result.shown))
 
 
 def load(path: Path) -> Evaluation:
@@ -249,4 +241,7 @@ def load(path: Path) -> Evaluation:
         record = decode(path.read_bytes())
     except ValueError as error:
         raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
-    return Evaluation(record.pop("metrics"), record.pop("reasons"), record)
+    metrics, reasons = record.pop("metrics"), record.pop("reasons")
+    # Files of earlier versions have neither of these two.
+    per_clip, curves = record.pop("per_clip", {}), record.pop("curves", {})
+    return Evaluation(metrics, reasons, record, per_clip, curves)

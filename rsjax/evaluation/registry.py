@@ -15,6 +15,7 @@ from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation.statistics import Statistic
 
 PerClip: TypeAlias = Float[np.ndarray, " B"]
+PerFrame: TypeAlias = Float[np.ndarray, "B P"]  # P predicted frames; NaN where a frame has no score
 Scores: TypeAlias = PerClip | dict[str, PerClip]  # a dict has several scores by suffix; "" is the metric itself
 # Videos generated under another clip's actions, or under uniform random actions.
 Need = Literal["other", "uniform"]
@@ -120,6 +121,8 @@ class Metric:
         column: whether tables have a column for it.
         function: scores a scene, one number per clip, or raises :class:`Unavailable`; None for a number that is not
             computed from videos.
+        per_frame: scores every predicted frame of a scene, or raises :class:`Unavailable`; None for a metric without a
+            curve over frames.
     """
 
     name: str
@@ -133,6 +136,7 @@ class Metric:
     statistic: Statistic = "mean"
     column: bool = True
     function: Callable[[Scene], Scores] | None = None
+    per_frame: Callable[[Scene], PerFrame] | None = None
 
     @property
     def heading(self) -> str:
@@ -182,6 +186,7 @@ def metric(
     interval: bool = True,
     statistic: Statistic = "mean",
     column: bool = True,
+    per_frame: Callable[[Scene], PerFrame] | None = None,
 ) -> Callable[[Callable[[Scene], Scores]], Callable[[Scene], Scores]]:
     """Registers a function as a metric; the arguments are the fields of :class:`Metric`.
 
@@ -193,7 +198,7 @@ def metric(
         if name in _METRICS:
             raise ConfigError(f"two metrics are named {name!r}; rename one of them")
         settings = (name, title, unit, better, decimals, needs, watch, interval, statistic, column)
-        _METRICS[name] = Metric(*settings, function)
+        _METRICS[name] = Metric(*settings, function, per_frame)
         return function
 
     return register

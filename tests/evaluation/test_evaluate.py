@@ -6,11 +6,13 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import EvalConfig, SampleConfig
+from rsjax.data.codec import encode
 from rsjax.data.store import Store, StoreError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, evaluate
 from rsjax.evaluation.metrics.delta_psnr import other_clips
 from rsjax.evaluation.registry import metrics
+from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
 from tests.pipeline import toy
 
@@ -102,21 +104,49 @@ def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> 
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0
 
 
-def test_shown_clips_are_successes_and_failures_by_turns(result: Evaluation) -> None:
-    assert result.shown["clip"].tolist() == [2, 0, 4]
-    assert result.shown["success"].tolist() == [True, False, True]
-    np.testing.assert_array_equal(result.shown["truth"], TRUTH["rgb"][[2, 0, 4]])
-    np.testing.assert_array_equal(result.shown["true_depth"], TRUTH["depth"][[2, 0, 4]])
+def test_shown_clips_are_typical_ones_and_the_worst_by_their_own_psnr(
+    trained: TrainedModel, result: Evaluation
+) -> None:
+    own = generated(trained, TRUTH["actions"]).rgb
+    scores = [psnr(TRUTH["rgb"][[i]], own[[i]]) for i in range(toy.TEST)]
+    rows, ranks = choose_clips(np.array(scores), np.array(toy.SUCCESS), 3)
+    assert result.shown["clip"].tolist() == rows.tolist()
+    assert rows[1] == np.argmin(scores)
+    assert result.shown["rank"].tolist() == ranks.tolist() == [0, 1, 0]
+    np.testing.assert_allclose(result.shown["psnr"], np.array(scores)[rows], rtol=1e-4)
+    np.testing.assert_array_equal(result.shown["truth"], TRUTH["rgb"][rows])
+    np.testing.assert_array_equal(result.shown["true_depth"], TRUTH["depth"][rows])
     assert len({array.shape[0] for array in result.shown.values()}) == 1
+
+
+def test_scores_of_single_clips_and_frames_have_the_scores_as_their_means(result: Evaluation) -> None:
+    frames = TRUTH["rgb"].shape[1]
+    assert result.curves["frame"] == list(range(2, frames + 1))
+    for name in ("psnr", "ssim_repeat_first", "psnr_tokenizer", "depth_absrel", "depth_absrel_repeat_first"):
+        assert len(result.per_clip[name]) == toy.TEST
+        assert np.mean(result.per_clip[name]) == pytest.approx(result.metrics[name], rel=1e-5)
+        assert len(result.curves[name]) == frames - 1
+        assert np.mean(np.array(result.curves[name], float)) == pytest.approx(result.metrics[name], rel=1e-5)
+    assert np.mean(np.array(result.curves["delta_psnr"], float)) == pytest.approx(result.metrics["delta_psnr"])
+    assert "delta_psnr_repeat_first" not in result.curves
 
 
 def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, tmp_path: Path) -> None:
     path = tmp_path / "result.msgpack"
     evaluation.save(path, result)
     again = evaluation.load(path)
-    assert (again.metrics, again.reasons) == (result.metrics, result.reasons)
+    for name in ("metrics", "reasons", "per_clip", "curves"):
+        assert getattr(again, name) == getattr(result, name)
     for name, array in result.shown.items():
         np.testing.assert_array_equal(again.shown[name], array)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(StoreError, match=r"result.msgpack: damaged \(its checksum is wrong\); delete it"):
         evaluation.load(path)
+
+
+def test_a_result_without_curves_is_read(tmp_path: Path) -> None:
+    """Earlier versions wrote neither curves nor the scores of single clips."""
+    (tmp_path / "old").write_bytes(encode({"metrics": {"psnr": 20.0}, "reasons": {}, "clip": np.arange(2)}))
+    old = evaluation.load(tmp_path / "old")
+    assert (old.metrics, old.per_clip, old.curves) == ({"psnr": 20.0}, {}, {})
+    assert old.shown.keys() == {"clip"}

@@ -9,29 +9,27 @@ from jaxtyping import Float, Int, Num
 
 from rsjax.clip import Array
 from rsjax.evaluation.metrics.psnr import psnr
-from rsjax.evaluation.registry import Scene, Scores, metric
+from rsjax.evaluation.registry import Need, PerFrame, Scene, Scores, metric
 from rsjax.evaluation.statistics import over_predicted_frames
 
 GENIE_T = 4  # the predicted frame that Genie reports
 
 
-@metric("delta_psnr", "ΔPSNR, another clip's actions", unit="dB", better="higher", decimals=2, needs=("other",))
-def under_other_actions(scene: Scene) -> Scores:
-    """Scores ΔPSNR under another clip's actions: the mean over frames, and Δ₄ as ``_t4``."""
-    return _scores(scene, "other")
+def _register(name: str, title: str, kind: Need) -> None:
+    """Registers ΔPSNR under one kind of actions: the mean over frames, and Δ₄ as ``_t4``."""
+
+    def per_frame(scene: Scene) -> PerFrame:
+        return scene.shared(_draws, kind).mean(0)[:, scene.prompt_frames :]
+
+    @metric(name, title, unit="dB", better="higher", decimals=2, needs=(kind,), per_frame=per_frame)
+    def score(scene: Scene) -> Scores:
+        means = clip_means(scene.shared(_draws, kind), scene.prompt_frames)
+        return {"" if part == "mean" else f"_{part}": per_clip for part, per_clip in means.items()}
 
 
-@metric("delta_psnr_uniform", "ΔPSNR, uniform actions", unit="dB", better="higher", decimals=2, needs=("uniform",))
-def under_uniform_actions(scene: Scene) -> Scores:
-    """Scores ΔPSNR under uniform random actions: the mean over frames, and Δ₄ as ``_t4``."""
-    return _scores(scene, "uniform")
-
-
-def _scores(scene: Scene, kind: str) -> Scores:
+def _draws(scene: Scene, kind: Need) -> Float[np.ndarray, "R B T"]:
     draws = scene.alternatives[kind]
-    delta = np.stack([delta_psnr(scene.truth.rgb, scene.prediction.rgb, drawn.rgb) for drawn in draws])
-    means = clip_means(delta, scene.prompt_frames)
-    return {"" if name == "mean" else f"_{name}": per_clip for name, per_clip in means.items()}
+    return np.stack([delta_psnr(scene.truth.rgb, scene.prediction.rgb, drawn.rgb) for drawn in draws])
 
 
 def delta_psnr(
@@ -101,3 +99,7 @@ def _derangement(n: int, rng: np.random.Generator) -> Int[np.ndarray, " n"]:
         permutation = rng.permutation(n)
         if (permutation != np.arange(n)).all():
             return permutation
+
+
+_register("delta_psnr", "ΔPSNR, another clip's actions", "other")
+_register("delta_psnr_uniform", "ΔPSNR, uniform actions", "uniform")

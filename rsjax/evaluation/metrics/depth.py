@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rsjax.evaluation.registry import PerClip, Scene, Unavailable, metric
+from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
 
 Alignment = Literal["none", "median", "affine_disparity", "l1_scale"]
 DepthSource = Literal["branch", "estimator"]
@@ -62,23 +62,32 @@ class DepthScores:
         delta1: each video's share of pixels with max(d̂/d, d/d̂) < 1.25, 0–1.
         delta2: the same with 1.25².
         weight: each video's weight in the data set's mean: 1, or its number of pixels for averaging "pixel".
+        frames: abs_rel, delta1 and delta2 of each frame's valid pixels; NaN for a frame without any.
     """
 
     abs_rel: Float[np.ndarray, " B"]
     delta1: Float[np.ndarray, " B"]
     delta2: Float[np.ndarray, " B"]
     weight: Float[np.ndarray, " B"]
+    frames: Float[np.ndarray, "3 B T"]
 
     def per_clip(self, measure: Measure) -> Float[np.ndarray, " B"]:
         """Returns each video's score, such that their plain mean is the data set's score."""
         scores = {"absrel": self.abs_rel, "delta1": self.delta1, "delta2": self.delta2}[measure]
         return scores * (self.weight / self.weight.mean())
 
+    def per_frame(self, measure: Measure) -> PerFrame:
+        """Returns each frame's score."""
+        return self.frames[get_args(Measure).index(measure)]
+
 
 def _register(measure: Measure, alignment: Alignment, source: DepthSource) -> None:
     """Registers one score under one protocol; tables have a column for metres, and for WorldArena's protocol."""
     title, better, decimals = _MEASURES[measure]
     plain = result_key(measure, alignment, source) == f"depth_{measure}"
+
+    def per_frame(scene: Scene) -> PerFrame:
+        return scene.shared(_scores, alignment, source).per_frame(measure)
 
     @metric(
         result_key(measure, alignment, source),
@@ -88,6 +97,7 @@ def _register(measure: Measure, alignment: Alignment, source: DepthSource) -> No
         watch=plain and measure == "absrel",
         interval=measure == "absrel",
         column=plain or (alignment, source) == ("median", "estimator"),
+        per_frame=per_frame,
     )
     def score(scene: Scene) -> PerClip:
         return scene.shared(_scores, alignment, source).per_clip(measure)
@@ -203,10 +213,10 @@ def depth_scores(
         _video_scores(d, np.clip(align(d, p, m, alignment), _MIN_PREDICTION, upper), m, protocol)
         for d, p, m in zip(truth, prediction, mask, strict=True)
     ]
-    absolute, first, second = np.array(rows).T
+    absolute, first, second = np.array([scores for scores, _ in rows]).T
     pooled = protocol.averaging == "pixel"
     weight = mask.sum((1, 2, 3)).astype(np.float64) if pooled else np.ones(len(truth))
-    return DepthScores(absolute, first, second, weight)
+    return DepthScores(absolute, first, second, weight, np.stack([frames for _, frames in rows], axis=1))
 
 
 def _video_scores(
@@ -214,11 +224,15 @@ def _video_scores(
     prediction: Float[np.ndarray, "T H W"],
     mask: Bool[np.ndarray, "T H W"],
     protocol: Protocol,
-) -> list[float]:
+) -> tuple[list[float], Float[np.ndarray, "3 T"]]:
+    """Returns the video's three scores, and those of each frame."""
     truth = np.where(mask, truth, 1.0)
     per_pixel = [abs_rel(truth, prediction), within(truth, prediction, 1), within(truth, prediction, 2)]
     axes = (1, 2) if protocol.averaging == "frame" else None
-    return [float(np.mean(np.mean(pixels, axis=axes, where=mask))) for pixels in per_pixel]
+    scores = [float(np.mean(np.mean(pixels, axis=axes, where=mask))) for pixels in per_pixel]
+    valid = mask.sum((1, 2))
+    sums = np.stack([np.sum(pixels, axis=(1, 2), where=mask) for pixels in per_pixel])
+    return scores, np.where(valid, sums / np.maximum(valid, 1), np.nan)
 
 
 def result_key(metric: str, alignment: Alignment = "none", source: DepthSource = "branch") -> str:

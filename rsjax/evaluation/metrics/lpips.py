@@ -10,33 +10,42 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rsjax.clip import Array
-from rsjax.evaluation.registry import PerClip, Scene, Unavailable, metric
-from rsjax.evaluation.statistics import over_predicted_frames
+from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
 from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
 
 _PAIRS = 8  # frames at a time, for memory: VGG's first layers hold 64 channels of full size
 
 
-@metric("lpips_alex", "LPIPS, AlexNet", better="lower", decimals=4)
+def alex_frames(scene: Scene) -> PerFrame:
+    """Scores every predicted frame with AlexNet."""
+    return _frames(scene, "alexnet", scene.settings.lpips_alex_weights, "--eval.lpips-alex-weights")
+
+
+def vgg_frames(scene: Scene) -> PerFrame:
+    """Scores every predicted frame with VGG16."""
+    return _frames(scene, "vgg16", scene.settings.lpips_vgg_weights, "--eval.lpips-vgg-weights")
+
+
+@metric("lpips_alex", "LPIPS, AlexNet", better="lower", decimals=4, per_frame=alex_frames)
 def alex_score(scene: Scene) -> PerClip:
     """Scores the mean over each clip's predicted frames."""
-    return _score(scene, "alexnet", scene.settings.lpips_alex_weights, "--eval.lpips-alex-weights")
+    return scene.shared(alex_frames).mean(-1)
 
 
-@metric("lpips_vgg", "LPIPS, VGG", better="lower", decimals=4)
+@metric("lpips_vgg", "LPIPS, VGG", better="lower", decimals=4, per_frame=vgg_frames)
 def vgg_score(scene: Scene) -> PerClip:
     """Scores the mean over each clip's predicted frames."""
-    return _score(scene, "vgg16", scene.settings.lpips_vgg_weights, "--eval.lpips-vgg-weights")
+    return scene.shared(vgg_frames).mean(-1)
 
 
-def _score(scene: Scene, net: str, path: str, option: str) -> PerClip:
+def _frames(scene: Scene, net: str, path: str, option: str) -> PerFrame:
     if not path:
         raise Unavailable(f"no weights: {option} FILE (python -m rsjax.convert lpips makes it)")
     params, side = load_lpips(path, net), min(scene.truth.rgb.shape[2:4])
     if side < min_size(params):
         raise Unavailable(f"frames of {side} pixels; LPIPS with {net} needs {min_size(params)}")
     pairs = zip(scene.truth.rgb, scene.prediction.rgb, strict=True)
-    return over_predicted_frames(np.stack([distances(params, *pair) for pair in pairs]), scene.prompt_frames)
+    return np.stack([distances(params, *pair) for pair in pairs])[:, scene.prompt_frames :]
 
 
 @jax.jit

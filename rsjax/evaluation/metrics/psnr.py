@@ -6,19 +6,22 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from rsjax.clip import Array
-from rsjax.evaluation.registry import Scene, Scores, metric
-from rsjax.evaluation.statistics import over_predicted_frames
+from rsjax.evaluation.registry import PerFrame, Scene, Scores, metric
 
 PEAK = 255.0
 PSNR_CAP = 100.0  # dB; the score of identical frames
 
 
-@metric("psnr", "PSNR", unit="dB", better="higher", decimals=2, watch=True)
+def per_frame(scene: Scene) -> PerFrame:
+    """Scores every predicted frame."""
+    return np.asarray(psnr(scene.truth.rgb, scene.prediction.rgb))[:, scene.prompt_frames :]
+
+
+@metric("psnr", "PSNR", unit="dB", better="higher", decimals=2, watch=True, per_frame=per_frame)
 def score(scene: Scene) -> Scores:
     """Scores the mean over each clip's predicted frames, and over the second half of them as ``_second_half``."""
-    per_frame, prompt = np.asarray(psnr(scene.truth.rgb, scene.prediction.rgb)), scene.prompt_frames
-    half = prompt + (per_frame.shape[-1] - prompt) // 2
-    return {"": over_predicted_frames(per_frame, prompt), "_second_half": over_predicted_frames(per_frame, half)}
+    frames = scene.shared(per_frame)
+    return {"": frames.mean(-1), "_second_half": frames[:, frames.shape[-1] // 2 :].mean(-1)}
 
 
 def same_frames(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"]) -> tuple[Array, Array]:

@@ -7,8 +7,7 @@ from jaxtyping import Float, Num
 
 from rsjax.clip import Array
 from rsjax.evaluation.metrics.psnr import PEAK, same_frames
-from rsjax.evaluation.registry import Scene, metric
-from rsjax.evaluation.statistics import over_predicted_frames
+from rsjax.evaluation.registry import PerClip, PerFrame, Scene, metric
 
 _WINDOW = 11
 _SIGMA = 1.5
@@ -16,10 +15,15 @@ _K1 = 0.01
 _K2 = 0.03
 
 
-@metric("ssim", "SSIM", better="higher", decimals=3)
-def score(scene: Scene) -> Float[np.ndarray, " B"]:
+def per_frame(scene: Scene) -> PerFrame:
+    """Scores every predicted frame."""
+    return np.asarray(ssim(scene.truth.rgb, scene.prediction.rgb))[:, scene.prompt_frames :]
+
+
+@metric("ssim", "SSIM", better="higher", decimals=3, per_frame=per_frame)
+def score(scene: Scene) -> PerClip:
     """Scores the mean over each clip's predicted frames."""
-    return over_predicted_frames(np.asarray(ssim(scene.truth.rgb, scene.prediction.rgb)), scene.prompt_frames)
+    return scene.shared(per_frame).mean(-1)
 
 
 @jax.jit

@@ -188,12 +188,30 @@ def test_the_branch_is_scored_where_recorded_depth_is_in_metres():
     np.testing.assert_array_equal(estimated(part), estimated(scene))
 
 
+def test_a_frames_score_is_the_mean_over_its_own_valid_pixels():
+    scene = _scene()
+    truth = scene.truth.depth.copy()
+    truth[1, 2] = 0  # a frame without depth
+    truth[2, 3, :, :5] = 0
+    scene = dataclasses.replace(scene, truth=Video(scene.truth.rgb, truth))
+    got = metrics()["depth_absrel"].per_frame(scene)
+    assert got.shape == (4, 3)
+    for b, t in np.ndindex(4, 3):
+        d, p = truth[b, t + 1], scene.prediction.depth[b, t + 1]
+        expected = np.mean([abs(y - x) / x for x, y in zip(d.ravel(), p.ravel(), strict=True) if x > 0] or np.nan)
+        np.testing.assert_allclose(got[b, t], expected, rtol=1e-5)
+    assert np.argwhere(np.isnan(got)).tolist() == [[1, 1]]
+    fitted = metrics()["depth_delta1_median_branch"]
+    np.testing.assert_allclose(fitted.per_frame(_scene()).mean(-1), fitted.function(_scene()), rtol=1e-6)
+
+
 def test_scores_share_one_fit(monkeypatch):
     fits = []
     monkeypatch.setattr(depth, "align", lambda *args: fits.append(args) or align(*args))
     scene = _scene()
     for measure in ("absrel", "delta1", "delta2"):
         metrics()[f"depth_{measure}_median_branch"].function(scene)
+        metrics()[f"depth_{measure}_median_branch"].per_frame(scene)
     assert len(fits) == 4, "one for each video"
 
 
