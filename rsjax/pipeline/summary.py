@@ -1,4 +1,4 @@
-"""The last stage: writes ``report.html`` and ``metrics.json``."""
+"""The last stage: writes ``report.html``, ``metrics.json`` and ``curves.json``."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ LIBRARIES = ("rsjax", "jax", "flax", "optax", "orbax-checkpoint", "grain", "nump
 
 
 def write_summary(run: Run, command: str) -> None:
-    """Writes both files from the outputs of the previous stages.
+    """Writes the three files from the outputs of the previous stages.
 
     Args:
         command: the command that repeats the run.
@@ -31,7 +31,9 @@ def write_summary(run: Run, command: str) -> None:
         preset=cfg.name,
         metrics=metrics,
         reasons=result.reasons,
-        clips=[_figure(result.shown, i, cfg) for i in range(len(result.shown["clip"]))],
+        clips=[_figure(result, i, cfg) for i in range(len(result.shown["clip"]))],
+        curves=result.curves,
+        per_clip=result.per_clip,
         logs={stage.replace("_", " "): read_log(run.directory / stage) for stage in TRAINED},
         config=to_dict(cfg),
         versions=_versions(run),
@@ -41,9 +43,11 @@ def write_summary(run: Run, command: str) -> None:
     )
     write_report(run.output("report"), report)
     write_json(run.directory / "metrics.json", metrics | dict.fromkeys(result.reasons) | {"reasons": result.reasons})
+    write_json(run.directory / "curves.json", result.curves)
 
 
-def _figure(shown: dict[str, np.ndarray], row: int, config: Config) -> ClipFigure:
+def _figure(result: evaluation.Evaluation, row: int, config: Config) -> ClipFigure:
+    shown = result.shown
     names = ["truth", "prediction", "reconstruction", "other_actions"]
     names += ["true_depth", "predicted_depth"] if shown["has_depth"][row] else []
     arrays: dict[str, Any] = {name: shown[name][row] for name in names if name in shown}
@@ -54,8 +58,18 @@ def _figure(shown: dict[str, np.ndarray], row: int, config: Config) -> ClipFigur
     title = f"test clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
     if shown["success"].any():  # otherwise success may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
+    if "rank" in shown:  # not in files of earlier versions
+        title += f", {_rank(int(shown['rank'][row]), int(result.metrics['clips']))}: {shown['psnr'][row]:.1f} dB"
     unit = "metres" if shown.get("metric", shown["has_depth"])[row] else "relative"
     return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, **arrays)
+
+
+def _rank(rank: int, clips: int) -> str:
+    """Returns a clip's rank from below in words; 0 is a typical clip."""
+    if not rank:
+        return "typical"
+    ending = {2: "nd ", 3: "rd "}.get(rank % 10 * (rank // 10 % 10 != 1), "th ")
+    return f"{'' if rank == 1 else f'{rank}{ending}'}worst of {clips}"
 
 
 def _versions(run: Run) -> dict[str, str]:

@@ -1,24 +1,26 @@
-"""Draws training curves as inline SVG."""
+"""Draws small charts as inline SVG, among them training curves."""
 
 import html
 import io
 import math
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+Chart: TypeAlias = Callable[[Axes], None]
+
 _COLUMNS = 4
-_INK = "#010203"  # placeholder for the page's text colour
-_LINE = "#3b7dd8"
+INK = "#010203"  # placeholder for the page's text colour
+LINE = "#3b7dd8"
 
 
 def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
-    """Draws a small chart per scalar of a log, as one <svg> element that inherits the page's font and text colour.
+    """Draws a small chart per scalar of a log, as :func:`charts_svg` does.
 
     Args:
         log: one dict per logged step, with "step"; its other numbers are drawn, other values are ignored. A scalar may
@@ -32,7 +34,19 @@ def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
     names.sort(key=lambda key: (key != "loss", "loss" not in key))
     if not names:
         raise ValueError(f"the log of {name} has no scalar to draw")
-    rows = math.ceil(len(names) / _COLUMNS)
+    return charts_svg([_scalar_chart(log, key) for key in names], f"{name} curves")
+
+
+def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height: float = 1.9) -> str:
+    """Draws charts, four in a row, as one <svg> element that inherits the page's font and text colour.
+
+    Args:
+        charts: each draws into the axes that it gets; ``INK`` becomes the text colour.
+        name: says what is drawn, and makes the element ids of several drawings on a page distinct.
+        legend: draw one legend, of the first chart's labels, above all.
+        height: of a row, where the width of four charts is 11.6.
+    """
+    rows = math.ceil(len(charts) / _COLUMNS)
     settings: dict[Any, Any] = {
         "svg.fonttype": "none",
         "svg.hashsalt": name,
@@ -42,31 +56,39 @@ def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
         "axes.spines.right": False,
         "axes.linewidth": 0.6,
     }
-    settings |= dict.fromkeys(["text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"], _INK)
+    settings |= dict.fromkeys(["text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"], INK)
     with matplotlib.rc_context(settings):
-        figure = Figure(figsize=(11.6, 1.9 * rows), layout=ConstrainedLayoutEngine(h_pad=0.09))
-        for place, key in enumerate(names, start=1):
-            points = [(line["step"], float(line[key])) for line in log if _is_scalar(key, line.get(key))]
-            _chart(figure.add_subplot(rows, _COLUMNS, place), key, points)
+        figure = Figure(figsize=(11.6, height * rows + 0.3 * legend), layout=ConstrainedLayoutEngine(h_pad=0.09))
+        for place, draw in enumerate(charts, start=1):
+            axes = figure.add_subplot(rows, _COLUMNS, place)
+            axes.grid(alpha=0.18, linewidth=0.6, color=INK)
+            draw(axes)
+        if legend:
+            handles, labels = figure.axes[0].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
-    head = rf'<svg \1 role="img" aria-label="{html.escape(name)} curves">'
+    head = rf'<svg \1 role="img" aria-label="{html.escape(name)}">'
     svg = re.sub(r'<svg [^>]*?(viewBox="[^"]*")[^>]*>', head, svg, count=1)
-    return svg.replace(_INK, "currentColor")
+    return svg.replace(INK, "currentColor")
 
 
-def _chart(axes: Axes, key: str, points: list[tuple[float, float]]) -> None:
+def _scalar_chart(log: Sequence[dict[str, Any]], key: str) -> Chart:
+    points = [(line["step"], float(line[key])) for line in log if _is_scalar(key, line.get(key))]
     steps, values = zip(*points, strict=True)
-    axes.plot(steps, values, color=_LINE, linewidth=1.3, marker="o" if len(points) == 1 else None)
-    finite = [value for value in values if math.isfinite(value)]
-    if finite and min(finite) > 0 and max(finite) / min(finite) > 30:
-        axes.set_yscale("log")
-    else:
-        axes.ticklabel_format(axis="y", scilimits=(-3, 4))
-    axes.set_title(f"{key}: {values[-1]:.4g}", fontsize=9, loc="left")
-    axes.grid(alpha=0.18, linewidth=0.6, color=_INK)
+
+    def draw(axes: Axes) -> None:
+        axes.plot(steps, values, color=LINE, linewidth=1.3, marker="o" if len(points) == 1 else None)
+        finite = [value for value in values if math.isfinite(value)]
+        if finite and min(finite) > 0 and max(finite) / min(finite) > 30:
+            axes.set_yscale("log")
+        else:
+            axes.ticklabel_format(axis="y", scilimits=(-3, 4))
+        axes.set_title(f"{key}: {values[-1]:.4g}", fontsize=9, loc="left")
+
+    return draw
 
 
 def _is_scalar(key: str, value: Any) -> bool:

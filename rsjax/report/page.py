@@ -1,6 +1,6 @@
 """Writes a run's HTML report: one self-contained page without scripts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,11 +8,13 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from rsjax.evaluation.registry import ABSENT, Footnotes, metrics
+from rsjax.evaluation.frame_curves import Curves
+from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.report.curves import curves_svg
 from rsjax.report.figures import ClipFigure, animation, filmstrip, keypoints
+from rsjax.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg
 from rsjax.report.targets import judge
 from rsjax.report.video import animation_uri, webp_uri
 
@@ -23,11 +25,10 @@ Row = tuple[str, str]
 Column = tuple[str, str, int]
 
 # Rows are (suffix, label), columns are (metric, header, decimals); a column's {} stands for the row's suffix.
-_SCORE_ROWS = (
-    ("", "prediction"),
-    ("_repeat_first", "first frame repeated"),
-    ("_tokenizer", "tokenizer's reconstruction"),
-)
+_SCORE_ROWS = tuple(SCENES.items())
+_PLACE_ROWS = tuple(PLACE_SCENES.items())
+_PLACE_ERRORS = ("cube_error_widths", "gripper_error_widths")
+_PLACES = (*_PLACE_ERRORS, "lifted_accuracy")  # metrics in a table of their own
 _DEPTH_ROWS = (
     ("", "depth branch, in metres"),
     ("_median_branch", "depth branch, median scale"),
@@ -52,6 +53,8 @@ class Report:
             lists all of them, and tabulates those of its columns.
         reasons: why a metric is absent, by name; footnotes of its cells.
         clips: test clips; the first ones head the page.
+        curves: scores at each predicted frame, as in curves.json.
+        per_clip: the scores of single clips by name, of which the errors of places are drawn.
         logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
         config: nested settings, JSON-ready.
         versions: library → version.
@@ -64,6 +67,8 @@ class Report:
     metrics: Mapping[str, float]
     reasons: Mapping[str, str] = field(default_factory=dict)
     clips: Sequence[ClipFigure] = ()
+    curves: Curves = field(default_factory=dict)
+    per_clip: Mapping[str, Sequence[float]] = field(default_factory=dict)
     logs: Mapping[str, Sequence[dict[str, Any]]] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -87,21 +92,29 @@ def write_report(path: Path, report: Report) -> None:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["duration"] = duration
-    columns = [(f"{m.name}{{}}", m.heading, m.decimals) for m in metrics().values() if m.column]
+    shown = [metric for metric in metrics().values() if metric.column]
+    places = [metrics()[name] for name in _PLACES]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
         headline=_HEADLINE_CLIPS,
         clips=[_clip_pictures(clip) for clip in report.clips],
-        scores=_table(report, notes, _SCORE_ROWS, columns),
+        scores=_table(report, notes, _SCORE_ROWS, _columns(metric for metric in shown if metric not in places)),
         depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
         control=_table(report, notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
+        places=_table(report, Footnotes(), _PLACE_ROWS, _columns(places)),
+        place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
+        frame_curves=Markup(frame_curves_svg(report.curves, shown)),
         notes=notes.texts,
         verdicts=judge(report.metrics) if report.show_targets else [],
-        curves={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
+        training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
     )
     write_file(path, html.encode())
+
+
+def _columns(shown: Iterable[Metric]) -> list[Column]:
+    return [(f"{metric.name}{{}}", metric.heading, metric.decimals) for metric in shown]
 
 
 def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:

@@ -25,12 +25,15 @@ from tests.pipeline import toy
 
 @pytest.fixture
 def drift() -> Iterator[None]:
-    """A metric of this test alone: how far the last frame's brightness is off."""
+    """A metric of this test alone: how far the last frame's brightness is off, and that of every predicted frame."""
 
-    @metric("drift", "brightness drift", unit="levels", better="lower", decimals=1)
-    def score(scene: Scene) -> np.ndarray:
-        truth, predicted = (video.rgb[:, -1].mean((1, 2, 3)) for video in (scene.truth, scene.prediction))
+    def per_frame(scene: Scene) -> np.ndarray:
+        truth, predicted = (video.rgb[:, 1:].mean((2, 3, 4)) for video in (scene.truth, scene.prediction))
         return np.abs(truth - predicted)
+
+    @metric("drift", "brightness drift", unit="levels", better="lower", decimals=1, per_frame=per_frame)
+    def score(scene: Scene) -> np.ndarray:
+        return per_frame(scene)[:, -1]
 
     yield
     del registry._METRICS["drift"]
@@ -59,7 +62,13 @@ def test_a_toy_family_trains_generates_and_is_evaluated(config: Config, tmp_path
     assert not {name for name, value in metrics.items() if name.endswith("_tokenizer")}
     assert {value for name, value in metrics.items() if "depth" in name} == {None}
     assert metrics["reasons"]["depth_absrel"] == "the model generates no depth"
-    assert "brightness drift, levels ↓" in (run.directory / "report.html").read_text()
+    page = (run.directory / "report.html").read_text()
+    assert page.count("brightness drift, levels ↓") == 2  # a column, and a chart
+    assert ", typical: " in page and f", worst of {toy.TEST}: " in page
+    assert "Where cube and gripper are" not in page
+    curves = json.loads((run.directory / "curves.json").read_text())
+    assert len(curves["drift"]) == len(curves["drift_low"]) == len(curves["frame"]) == config.clips.frames - 1
+    assert curves["drift"][-1] == pytest.approx(metrics["drift"])
     rows = [json.loads(line) for line in (run.directory / "world_model" / "log.jsonl").read_text().splitlines()]
     assert any("validation/psnr" in row for row in rows)
 

@@ -14,14 +14,25 @@ _METRICS = {
     "psnr_repeat_first": 19.8,
     "psnr_tokenizer": 28.7,
     "ssim": 0.8714,
-    "delta_psnr": 2.75,
+    "delta_psnr": 6.75,
     "delta_psnr_uniform_t4": 4.125,
     "depth_absrel": 0.0213,
     "depth_absrel_repeat_first": 0.0555,
+    "cube_error_widths": 0.251,
+    "cube_error_widths_truth": 0.084,
+    "gripper_error_widths": 0.312,
+    "lifted_accuracy": 0.93,
     "seconds_total": 1633.0,
     "success_share": 0.4567,
 }
 _LOG = [{"step": s, "loss": 5.0 / (s + 1), "accuracy": s / 10, "note": "text"} for s in range(5)]
+_CURVES = {
+    "frame": [2, 3, 4],
+    "psnr": [27.0, 26.0, None],
+    "psnr_low": [26.0, 25.0, None],
+    "psnr_high": [28.0, 27.0, None],
+    "unknown": [1.0, 2.0, 3.0],
+}
 _VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
@@ -69,6 +80,8 @@ def full_page(tmp_path_factory, make_clip):
         preset="tiny",
         metrics=_METRICS,
         clips=[make_clip(title=f"episode <{i}>") for i in range(3)],
+        curves=_CURVES,
+        per_clip={"cube_error_widths": [0.3, 0.0, 2.0], "cube_error_widths_truth": [0.1, 0.1, 0.1]},
         logs={"tokenizer": _LOG, "world model": _LOG},
         config={"name": "tiny", "train": {"learning_rate": 0.0001}},
         versions={"jax": "0.10.2"},
@@ -95,11 +108,15 @@ def test_tables_show_each_number_in_its_row(full_page):
     page = _Page(full_page)
     header = ["test clips", "PSNR, dB ↑", "SSIM ↑", "depth AbsRel ↓", "ΔPSNR, another clip's actions, dB ↑"]
     assert header in page.cells
-    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "0.0213", "2.75"] in page.cells
+    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "0.0213", "6.75"] in page.cells
     assert ["first frame repeated", "19.80", "–", "0.0555", "–"] in page.cells
     assert ["tokenizer's reconstruction", "28.70", "–", "–", "–"] in page.cells
     assert ["uniform random actions", "4.12"] in page.cells
-    assert ["ΔPSNR, another clip's actions", "≥ 3 dB", "2.75 dB", "missed by 0.25"] in page.cells
+    assert ["last frame", "cube's place, widths ↓", "gripper's place, widths ↓", "lifted or not ↑"] in page.cells
+    assert ["prediction", "0.251", "0.312", "0.930"] in page.cells
+    assert ["true frames (the reading network's own error)", "0.084", "–", "–"] in page.cells
+    assert ["ΔPSNR, another clip's actions", "≥ 7 dB", "6.75 dB", "missed by 0.25"] in page.cells
+    assert ["cube's place in the last frame, median error", "≤ 0.3 widths", "0.25 widths", "met"] in page.cells
     assert ["train", "1 h 02 min"] in page.cells
     assert ["collect", "1 min 15 s"] in page.cells
     assert ["learning_rate", "0.0001"] in page.cells
@@ -113,7 +130,7 @@ def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
     report = Report("tiny", _METRICS | {"depth_absrel_median_branch": 0.0123}, weights | {"depth_delta1": "no depth"})
     write_report(tmp_path / "r.html", report)
     page = _Page(tmp_path / "r.html")
-    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "–¹", "0.0213", "–²", "–¹", "2.75"] in page.cells
+    assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "–¹", "0.0213", "–²", "–¹", "6.75"] in page.cells
     assert ["depth branch, median scale", "0.0123", "–²"] in page.cells
     assert ["estimator, median scale", "–¹", "–²"] in page.cells
     assert "¹ no <weights>." in page.text and "² no depth." in page.text
@@ -123,7 +140,7 @@ def test_missing_parts_are_left_out(tmp_path, make_clip):
     write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")
     assert ["test clips", "PSNR, dB ↑"] in page.cells
-    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "Command to reproduce"):
+    for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "Command", "Frame by", "Where cube"):
         assert absent not in page.text
     clip = make_clip(true_depth=None, predicted_depth=None, tracks=None, visible=None, selected=None)
     write_report(tmp_path / "rgb.html", Report(preset="debug", metrics={}, clips=[clip]))
@@ -143,12 +160,14 @@ def test_a_failed_page_leaves_the_old_one(tmp_path, make_clip):
 
 def test_only_measured_targets_are_judged():
     verdicts = {v.target.name: v for v in judge(_METRICS)}
-    assert len(verdicts) == 6
-    assert [v.margin >= 0 for v in verdicts.values()] == [True, True, False, False, True, True]
-    assert verdicts["prediction below the tokenizer's reconstruction"].margin == pytest.approx(2 - (28.7 - 26.314))
+    assert len(verdicts) == 8
+    assert [v.margin >= 0 for v in verdicts.values()] == [True, True, True, False, True, False, False, True]
+    assert verdicts["prediction below the tokenizer's reconstruction"].margin == pytest.approx(3 - (28.7 - 26.314))
+    late = judge({"psnr_tokenizer_second_half": 28.0, "psnr_second_half": 23.5})
+    assert [(v.target.name, v.margin) for v in late] == [("the same, second half of the predicted frames", -0.5)]
     assert verdicts["whole run"].measured == pytest.approx(1633 / 60)
-    assert [v.target.name for v in judge({"delta_psnr": 3.0})] == ["ΔPSNR, another clip's actions"]
-    assert judge({"delta_psnr": 3.0})[0].margin == 0
+    assert [v.target.name for v in judge({"delta_psnr": 7.0})] == ["ΔPSNR, another clip's actions"]
+    assert judge({"delta_psnr": 7.0})[0].margin == 0
 
 
 def test_curves_draw_each_scalar_once_in_the_pages_colour():
