@@ -77,6 +77,7 @@ class LiftSim:
                 hard_reset=False,
             )
         self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
+        _compute_once(self._env.sim)
         self._camera_id = _camera_id(self._model, camera)
         self._cube_id = self._model.body(CUBE_BODY).id
         self._renderer = Renderer(self._model, self._camera_id, image_size)
@@ -178,6 +179,32 @@ def _camera_id(model: Any, name: str) -> int:
     mujoco.mju_mat2Quat(model.cam_quat[0], (axes / np.linalg.norm(axes, axis=0)).ravel())
     model.cam_pos[0], model.cam_fovy[0] = position, fovy
     return 0
+
+
+def _compute_once(sim: Any) -> None:
+    """Makes robosuite's ``sim`` compute the kinematics of each state once: it asks before, in and after its controller.
+
+    MuJoCo's step is the two halves used here (for its integrators but Runge-Kutta), so the physics stay the same.
+    """
+    import mujoco
+
+    model, data, reset, known = sim.model._model, sim.data._data, sim.reset, [b""]
+
+    def forward() -> None:
+        state = np.concatenate([[data.time], data.qpos, data.qvel]).tobytes()
+        if state != known[0]:
+            mujoco.mj_step1(model, data)
+            known[0] = state
+
+    def step(with_udd: bool = True) -> None:
+        forward()
+        mujoco.mj_step2(model, data)
+
+    def reset_all() -> None:
+        known[0] = b""
+        reset()
+
+    sim.forward, sim.step, sim.reset = forward, step, reset_all
 
 
 @contextmanager
