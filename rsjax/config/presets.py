@@ -49,8 +49,8 @@ def tiny() -> Config:
         # Six vocabularies of 8 codes: many codes of a validation clip never occur in the training clips, but their
         # sub-tokens do (20.4 dB on validation clips after 600 steps, against 20.0 with two vocabularies of 512).
         tokenizer=TokenizerConfig(
-            # Patches of 4 pixels: a step takes two thirds of the time it takes with patches of 2, a third level and half
-            # of the channels. That costs 1 dB of reconstruction, and the time goes to the model, which is the limit.
+            # Patches of 4 pixels: a step takes two thirds of the time that it takes with patches of 2, half of the
+            # channels and a third level (docs/results/miniature.md). The model, which is the limit, gets that time.
             patch_size=4,
             channels=64,
             channel_multipliers=(1, 2),
