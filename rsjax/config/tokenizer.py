@@ -20,6 +20,10 @@ class TokenizerConfig:
     # Normalises each level of the decoder by the codes' statistics. The older public generation has 2 residual blocks
     # per level and False, the newer 4 and True.
     adaptive_norm: bool = False
+    # A cell's code depends on its own pixels alone: the encoder has convolutions of one cell, and norms of one cell
+    # instead of the whole image. Otherwise a moving arm changes codes far from it, which the world model has to predict
+    # too. Not in MAGVIT-2.
+    local_codes: bool = False
     code_bits: int = 18  # D: one token is D bits, a vocabulary of 2^D
     vocabularies: int = 2  # n: the vocabulary of 2^D is factorised into n of 2^(D/n)
     # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).

@@ -107,6 +107,7 @@ def infer_config(source: object, tensors: Tensors, weights: Weights, names: Name
             channel_multipliers=tuple(max(1, width // channels) for width in widths),
             res_blocks=blocks,
             adaptive_norm=has("decoder.adaptive.0.gamma.weight"),
+            local_codes=shape("encoder.conv_in.weight")[2] == 1,
             code_bits=bits,
             vocabularies=2 if bits % 2 == 0 else 1,
         )

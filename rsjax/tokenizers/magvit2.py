@@ -36,25 +36,41 @@ def _conv3(features: int, name: str, bias: bool = False, stride: int = 1) -> nn.
 
 
 class ResBlock(nn.Module):
-    """GroupNorm → swish → conv3, twice, plus the input (through a 1×1 convolution where the width changes)."""
+    """GroupNorm → swish → conv3, twice, plus the input (through a 1×1 convolution where the width changes).
+
+    ``local``: no cell sees another one, neither through convolutions nor through norms.
+    """
 
     features: int
     groups: int
+    local: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
-        h = _norm(self.groups, "norm1")(x)
-        h = _conv3(self.features, "conv1")(nn.swish(h))
-        h = _norm(self.groups, "norm2")(h)
-        h = _conv3(self.features, "conv2")(nn.swish(h))
+        h = x
+        for i in (1, 2):
+            h = nn.swish(_norm(self.groups, f"norm{i}", local=self.local)(h))
+            h = _inner_conv(self.features, f"conv{i}", self.local)(h)
         if x.shape[-1] != self.features:
             x = nn.Conv(self.features, (1, 1), use_bias=False, name="nin_shortcut")(x)
         return x + h
 
 
-def _norm(groups: int, name: str, affine: bool = True) -> nn.GroupNorm:
+def _inner_conv(features: int, name: str, local: bool) -> nn.Conv:
+    return nn.Conv(features, (1, 1), use_bias=False, name=name) if local else _conv3(features, name)
+
+
+def _norm(groups: int, name: str, affine: bool = True, local: bool = False) -> nn.GroupNorm:
     # The fast variance, E[x²] - E[x]², is too inexact for parity with the public weights.
-    return nn.GroupNorm(groups, epsilon=1e-6, use_bias=affine, use_scale=affine, use_fast_variance=False, name=name)
+    return nn.GroupNorm(
+        groups,
+        epsilon=1e-6,
+        use_bias=affine,
+        use_scale=affine,
+        reduction_axes=(-1,) if local else None,
+        use_fast_variance=False,
+        name=name,
+    )
 
 
 class AdaptiveGroupNorm(nn.Module):
@@ -80,16 +96,21 @@ class Encoder(nn.Module):
     def __call__(self, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w D"]:
         cfg = self.config
         x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
-        x = _conv3(cfg.channels, "conv_in")(x)
+        local = cfg.local_codes
+        x = _inner_conv(cfg.channels, "conv_in", local)(x)
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
             for i in range(cfg.res_blocks):
-                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, name=f"down_{level}_block_{i}")(x)
+                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, local, name=f"down_{level}_block_{i}")(x)
             if level < levels - 1:
-                x = _conv3(x.shape[-1], f"down_{level}_downsample", bias=True, stride=2)(x)
+                name = f"down_{level}_downsample"
+                if local:
+                    x = nn.Conv(x.shape[-1], (2, 2), (2, 2), name=name)(x)
+                else:
+                    x = _conv3(x.shape[-1], name, bias=True, stride=2)(x)
         for i in range(cfg.res_blocks):
-            x = ResBlock(x.shape[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
-        x = nn.swish(_norm(cfg.norm_groups, "norm_out")(x))
+            x = ResBlock(x.shape[-1], cfg.norm_groups, local, name=f"mid_block_{i}")(x)
+        x = nn.swish(_norm(cfg.norm_groups, "norm_out", local=local)(x))
         return nn.Conv(cfg.code_bits, (1, 1), name="conv_out")(x)
 
 

@@ -93,6 +93,15 @@ def test_a_training_checkpoint_yields_the_chosen_weights_and_counts_the_rest(gen
     assert ignored.total() == len(everything) - len(wanted)
 
 
+def test_a_tokenizer_with_local_codes_comes_back() -> None:
+    config = TokenizerConfig(4, 32, (1, 2), 1, local_codes=True)
+    params = jax.tree.map(np.asarray, Tokenizer(config).init_params(jax.random.key(0)))
+    written = to_tensors(params, table(config))
+    inferred, read, _ = from_public("file", written)
+    assert inferred == config
+    assert equal(to_tensors(read, table(config)), written)
+
+
 def test_half_precision_is_widened_exactly() -> None:
     half = {name: x.astype(np.float16) for name, x in tensors("older").items()}
     config, params, _ = from_public("file", half)

@@ -186,3 +186,15 @@ def test_pixels_survive_the_unit_range() -> None:
     unit = to_unit(pixels)
     assert (unit[0], unit[-1]) == (-1.0, 1.0)
     np.testing.assert_array_equal(np.round(to_pixels(unit)), pixels)
+
+
+@pytest.mark.parametrize("local", [True, False])
+def test_local_codes_depend_on_their_own_pixels_alone(local: bool, images: np.ndarray) -> None:
+    config = replace(SMALL, local_codes=local)
+    params = random_params(Tokenizer(config).init_params)
+    changed = images.copy()
+    changed[:, 4:8, 8:12] = 255 - changed[:, 4:8, 8:12]  # the pixels of the cell in row 1, column 2
+    latents = [Encoder(config).apply({"params": params["encoder"]}, to_unit(x)) for x in (images, changed)]
+    differ = np.argwhere(np.any(np.abs(latents[0] - latents[1]) > 1e-6, axis=(0, 3))).tolist()
+    assert [1, 2] in differ
+    assert (differ == [[1, 2]]) == local
