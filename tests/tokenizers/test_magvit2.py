@@ -194,7 +194,9 @@ def test_local_codes_depend_on_their_own_pixels_alone(local: bool, images: np.nd
     params = random_params(Tokenizer(config).init_params)
     changed = images.copy()
     changed[:, 4:8, 8:12] = 255 - changed[:, 4:8, 8:12]  # the pixels of the cell in row 1, column 2
-    latents = [Encoder(config).apply({"params": params["encoder"]}, to_unit(x)) for x in (images, changed)]
-    differ = np.argwhere(np.any(np.abs(latents[0] - latents[1]) > 1e-6, axis=(0, 3))).tolist()
+    before, after = (
+        np.asarray(Encoder(config).apply({"params": params["encoder"]}, to_unit(x))) for x in (images, changed)
+    )
+    differ = np.argwhere(np.any(np.abs(before - after) > 1e-6, axis=(0, 3))).tolist()
     assert [1, 2] in differ
     assert (differ == [[1, 2]]) == local
