@@ -1,12 +1,19 @@
-"""Means over clips and their confidence intervals."""
+"""Means over clips and seeds with their intervals, tests of differences, and what an interval says of a claim."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri, stdtr, stdtrit
 
 Statistic = Literal["mean", "median"]
+Direction = Literal["higher", "lower"]
+Verdict = Literal["holds", "does not hold", "cannot tell"]
+
+
+_SUMMARIES: dict[Statistic, Callable[..., Any]] = {"mean": np.mean, "median": np.median}
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,121 @@ def bootstrap(
     if len(values) == 1:
         return Estimate(float(values[0]), None, None)
     drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    tail = (1 - level) / 2
-    summarise = np.mean if statistic == "mean" else np.median
-    low, high = np.quantile(summarise(values[drawn], axis=1), [tail, 1 - tail])
-    return Estimate(float(summarise(values)), float(low), float(high))
+    summarise = _SUMMARIES[statistic]
+    return _estimate(summarise(values), summarise(values[drawn], axis=1), level)
+
+
+def paired_bootstrap(
+    a: Float[np.ndarray, "S B"],
+    b: Float[np.ndarray, "Z B"],
+    seed: int = 0,
+    level: float = 0.95,
+    resamples: int = 10_000,
+    statistic: Statistic = "mean",
+) -> Estimate:
+    """Returns the mean or median over clips of a - b, and its percentile-bootstrap interval over seeds and clips.
+
+    Each resample draws S seeds of ``a``, Z seeds of ``b`` and B clips, which both share, so clips stay paired. With one
+    seed each this is :func:`bootstrap` of the clips' differences; the interval then says nothing about other seeds. Two
+    or three seeds understate how seeds vary; read :func:`welch` beside it.
+
+    Args:
+        a, b: a number per seed and clip; the same clips in the same order. One seed may come without its axis.
+        seed, level, resamples, statistic: as in :func:`bootstrap`; clips are summarised after the mean over seeds.
+
+    Raises:
+        ValueError: the clips differ in number, there are none, or a value is not finite.
+    """
+    a, b = (np.atleast_2d(np.asarray(each, np.float64)) for each in (a, b))
+    if a.shape[1:] != b.shape[1:] or not a.size or not b.size or not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError(f"a paired interval needs a finite number per seed and clip, not {a.shape} and {b.shape}")
+    if a.shape[1] == 1:
+        return Estimate(float(a.mean() - b.mean()), None, None)
+    rng, summarise = np.random.default_rng(seed), _SUMMARIES[statistic]
+    clips = rng.integers(a.shape[1], size=(resamples, a.shape[1]))
+    over_seeds_a, over_seeds_b = (_share_of_seeds(len(each), resamples, rng) @ each for each in (a, b))
+    resampled = np.take_along_axis(over_seeds_a - over_seeds_b, clips, axis=1)
+    return _estimate(summarise(a.mean(0) - b.mean(0)), summarise(resampled, axis=1), level)
+
+
+def _share_of_seeds(seeds: int, resamples: int, rng: np.random.Generator) -> Float[np.ndarray, "R S"]:
+    """Returns how often each seed was drawn in each resample, as shares that add up to 1."""
+    drawn = rng.integers(seeds, size=(resamples, seeds))
+    return (drawn[:, :, None] == np.arange(seeds)).mean(1)
+
+
+def _estimate(value: float, resampled: Float[np.ndarray, " R"], level: float) -> Estimate:
+    low, high = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    return Estimate(float(value), float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Welch:
+    """Welch's t-test of two means, and the interval of their difference.
+
+    Attributes:
+        difference: mean of a - mean of b, with its t interval.
+        t: the statistic; ±inf where neither group varies and the means differ.
+        df: Welch–Satterthwaite degrees of freedom.
+        p: two-sided.
+    """
+
+    difference: Estimate
+    t: float
+    df: float
+    p: float
+
+
+def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float = 0.95) -> Welch | None:
+    """Tests whether the means of two groups of seeds differ; variances may differ. None with fewer than two seeds each.
+
+    Args:
+        a, b: one number per seed, such as a run's mean over clips.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if min(len(a), len(b)) < 2:
+        return None
+    difference, parts = float(a.mean() - b.mean()), (a.var(ddof=1) / len(a), b.var(ddof=1) / len(b))
+    error = float(np.sqrt(sum(parts)))
+    if not error:
+        same = difference == 0
+        interval = Estimate(difference, difference, difference)
+        return Welch(
+            interval, 0.0 if same else float(np.copysign(np.inf, difference)), len(a) + len(b) - 2.0, float(same)
+        )
+    df = error**4 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1))
+    t, half = difference / error, float(stdtrit(df, (1 + level) / 2)) * error
+    return Welch(
+        Estimate(difference, difference - half, difference + half), t, float(df), float(2 * stdtr(df, -abs(t)))
+    )
+
+
+def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
+    """Returns a share and Wilson's score interval, which stays within [0, 1] and serves few trials too.
+
+    Raises:
+        ValueError: no trial, or not 0 ≤ successes ≤ trials.
+    """
+    if not 0 <= successes <= trials or not trials:
+        raise ValueError(f"{successes} successes of {trials} trials have no share")
+    share, z = successes / trials, float(ndtri((1 + level) / 2))
+    centre, scale = share + z**2 / (2 * trials), 1 + z**2 / trials
+    half = z * np.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
+    return Estimate(share, float(max(0, (centre - half) / scale)), float(min(1, (centre + half) / scale)))
+
+
+def verdict(interval: Estimate | None, direction: Direction = "higher", margin: float = 0.0) -> Verdict:
+    """Returns what the interval of a difference a - b says of the claim that a is better than b by more than a margin.
+
+    Args:
+        interval: of the difference; without one, or with one bound missing, nothing can be told.
+        direction: whether higher or lower values are better.
+        margin: in the unit of the difference; a negative one claims that a is worse by less than ``-margin``.
+
+    Returns:
+        "holds" if the whole interval lies beyond the margin, "does not hold" if it ends before it, else "cannot tell".
+    """
+    if interval is None or interval.low is None or interval.high is None:
+        return "cannot tell"
+    low, high = (interval.low, interval.high) if direction == "higher" else (-interval.high, -interval.low)
+    return "holds" if low > margin else "does not hold" if high < margin else "cannot tell"

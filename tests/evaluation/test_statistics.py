@@ -1,7 +1,16 @@
 import numpy as np
 import pytest
+from scipy import stats
 
-from rsjax.evaluation.statistics import bootstrap, over_predicted_frames
+from rsjax.evaluation.statistics import (
+    Estimate,
+    bootstrap,
+    over_predicted_frames,
+    paired_bootstrap,
+    verdict,
+    welch,
+    wilson,
+)
 
 
 def test_mean_over_predicted_frames_only():
@@ -42,3 +51,72 @@ def test_one_clip_has_a_mean_but_no_interval():
 def test_bad_values_are_refused(values):
     with pytest.raises(ValueError, match="one finite number per clip"):
         bootstrap(np.array(values))
+
+
+@pytest.mark.parametrize("statistic", ["mean", "median"])
+def test_paired_bootstrap_of_one_seed_is_the_bootstrap_of_differences(statistic):
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(2, 1, 25))
+    got = paired_bootstrap(a, b, statistic=statistic)
+    expected = bootstrap((a - b)[0], statistic=statistic)
+    np.testing.assert_allclose([got.value, got.low, got.high], [expected.value, expected.low, expected.high])
+
+
+def test_paired_bootstrap_removes_what_clips_share_and_keeps_what_seeds_vary():
+    rng = np.random.default_rng(3)
+    clips = rng.normal(0, 10, 60)
+    seeds_a, seeds_b = rng.normal(0, 1, (5, 1)), rng.normal(0, 1, (4, 1))
+    got = paired_bootstrap(clips + seeds_a, clips + seeds_b)  # differences of clips are equal: only seeds vary
+    error = np.sqrt(seeds_a.var() / 5 + seeds_b.var() / 4)
+    assert got.value == pytest.approx(seeds_a.mean() - seeds_b.mean())
+    np.testing.assert_allclose((got.high - got.low) / 2, 1.96 * error, rtol=0.1)
+    swapped = paired_bootstrap(clips + seeds_b, clips + seeds_a)
+    np.testing.assert_allclose([swapped.low, swapped.high], [-got.high, -got.low], atol=0.15)
+
+
+def test_welch_agrees_with_scipy():
+    a, b = np.array([21.3, 21.9, 20.8, 21.1]), np.array([20.1, 20.9, 20.6])
+    got, expected = welch(a, b), stats.ttest_ind(a, b, equal_var=False)
+    interval = expected.confidence_interval()
+    np.testing.assert_allclose([got.t, got.p, got.df], [expected.statistic, expected.pvalue, expected.df])
+    np.testing.assert_allclose([got.difference.low, got.difference.high], [interval.low, interval.high])
+
+
+def test_welch_without_variance_or_seeds():
+    assert welch([1.0], [2.0, 3.0]) is None
+    assert welch([1.0, 1.0], [1.0, 1.0]).p == 1
+    assert welch([1.0, 1.0], [2.0, 2.0]).t == -np.inf
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 8), (3, 10), (17, 20), (50, 50)])
+def test_wilson_agrees_with_scipy(successes, trials):
+    expected = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+    got = wilson(successes, trials)
+    np.testing.assert_allclose([got.low, got.high], [expected.low, expected.high], atol=1e-12)
+    with pytest.raises(ValueError, match="have no share"):
+        wilson(trials + 1, trials)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "direction", "margin", "expected"),
+    [
+        (0.1, 0.5, "higher", 0, "holds"),
+        (0.1, 0.5, "lower", 0, "does not hold"),
+        (-0.1, 0.5, "higher", 0, "cannot tell"),
+        (-0.5, -0.1, "lower", 0, "holds"),
+        (0.1, 0.5, "higher", 0.2, "cannot tell"),
+        (0.1, 0.15, "higher", 0.2, "does not hold"),
+        (-0.1, 0.1, "higher", -0.2, "holds"),
+        (-0.1, 0.1, "lower", -0.2, "holds"),
+        (None, None, "higher", 0, "cannot tell"),
+    ],
+)
+def test_a_verdict_is_what_the_interval_says(low, high, direction, margin, expected):
+    assert verdict(Estimate(0.0, low, high), direction, margin) == expected
+    assert verdict(None) == "cannot tell"
+
+
+@pytest.mark.parametrize("other", [np.zeros((2, 4)), np.full((1, 3), np.nan), np.zeros((0, 3))])
+def test_clips_that_cannot_be_paired_are_refused(other):
+    with pytest.raises(ValueError, match="finite number per seed and clip"):
+        paired_bootstrap(np.zeros((2, 3)), other)
