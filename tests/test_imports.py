@@ -25,6 +25,7 @@ ORDER = [
     "evaluation",
     "report",
     "pipeline",
+    "policies",
     "ablation",
     "bench",
     "describe",

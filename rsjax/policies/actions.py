@@ -1,0 +1,54 @@
+"""Checks the actions that somebody's policy gives to an environment."""
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from rsjax.errors import UserError
+
+OutOfRange: TypeAlias = Literal["clip", "refuse"]
+
+
+class ActionError(UserError):
+    """An action of the wrong shape, with a value that is not finite, or out of range. The message says which."""
+
+
+def checked_actions(
+    actions: object,
+    low: Float[np.ndarray, "*B A"],
+    high: Float[np.ndarray, "*B A"],
+    out_of_range: OutOfRange,
+    unit: str,
+) -> tuple[Float32[np.ndarray, "*B A"], int]:
+    """Returns actions as float32 within their range, and how many of their numbers were clipped to it.
+
+    Args:
+        actions: what a policy answered.
+        low: the least values; its shape is the shape that actions must have.
+        high: the greatest values.
+        out_of_range: "clip" moves numbers into the range and counts them, "refuse" raises.
+        unit: what the numbers are, for messages.
+
+    Raises:
+        ActionError: another shape or type, a value that is not finite, or, with "refuse", one out of range.
+    """
+    try:
+        given = np.asarray(actions, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ActionError(
+            f"an action is {type(actions).__name__}; expected floats of shape {low.shape}, {unit}"
+        ) from error
+    if given.shape != low.shape:
+        raise ActionError(f"actions have shape {given.shape}; expected {low.shape}, {unit}")
+    if not np.isfinite(given).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(given))[0])
+        raise ActionError(f"actions[{', '.join(map(str, where))}] is {given[where]}; expected finite numbers, {unit}")
+    outside = (given < low) | (given > high)
+    if outside.any() and out_of_range == "refuse":
+        where = tuple(int(i) for i in np.argwhere(outside)[0])
+        raise ActionError(
+            f"actions[{', '.join(map(str, where))}] is {given[where]:g}; expected {low[where]:g} to {high[where]:g}, "
+            f'{unit}; out_of_range="clip" clips and counts instead'
+        )
+    return np.clip(given, low, high), int(outside.sum())

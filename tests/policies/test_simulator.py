@@ -1,0 +1,68 @@
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from rsjax.config import SimConfig
+from rsjax.policies.actions import ActionError
+from rsjax.policies.simulator import LiftEnv, clip_seed, run_episode, skilled_expert
+from rsjax.sim import collect
+from rsjax.sim.lift import LiftSim
+
+CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, camera="near")
+
+
+@pytest.fixture(scope="module")
+def env(gl: str) -> Iterator[LiftEnv]:
+    env = LiftEnv(CONFIG, max_steps=3)
+    yield env
+    env.close()
+
+
+def test_replaying_a_clip_gives_its_frames(env: LiftEnv) -> None:
+    with LiftSim(CONFIG.camera, CONFIG.image_size) as sim:
+        clip = collect.run_episode(sim, CONFIG, 2)
+    rows = iter(clip.actions[1:])
+    episode = run_episode(env, lambda seen: next(rows), clip_seed(clip.provenance))
+    np.testing.assert_array_equal(episode.rgb, clip.rgb)
+    np.testing.assert_array_equal(episode.depth, clip.depth)
+    np.testing.assert_array_equal(episode.actions, clip.actions)
+    np.testing.assert_array_equal(episode.success, clip.success)
+    assert episode.clipped == 0
+
+
+def test_the_expert_lifts_and_its_actions_lift_again(gl: str) -> None:
+    env = LiftEnv(SimConfig(camera="near", image_size=16), max_steps=20)
+    expert = skilled_expert(0)
+    first = run_episode(env, lambda seen: expert.act, 11)
+    assert first.success[-1] and not first.success[:-1].any()
+    rows = iter(first.actions[1:])
+    again = run_episode(env, lambda seen: next(rows), 11)
+    np.testing.assert_array_equal(first.rgb, again.rgb)
+    assert again.success[-1]
+    env.close()
+
+
+def test_gymnasiums_checker_passes(env: LiftEnv) -> None:
+    check_env(env, skip_render_check=True)
+    assert "rsjax/Lift-v0" in gymnasium.registry
+
+
+def test_actions_are_clipped_and_counted_or_refused(env: LiftEnv) -> None:
+    env.reset(seed=0)
+    wide = np.zeros(CONFIG.action_dim)
+    wide[[3, 8]] = 1.5, -7
+    assert env.step(wide)[4]["clipped"] == 2
+    assert env.step(wide)[4]["clipped"] == 4
+    env._out_of_range = "refuse"
+    with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D pose"):
+        env.step(wide)
+    env._out_of_range = "clip"
+    with pytest.raises(ActionError, match=r"shape \(7,\); expected \(28,\)"):
+        env.step(np.zeros(7))
+    with pytest.raises(ActionError, match=r"actions\[5\] is nan"):
+        env.step(np.where(np.arange(28) == 5, np.nan, 0))
+    with pytest.raises(ActionError, match="an action is str"):
+        env.step("left")
