@@ -16,6 +16,7 @@ ORDER = [
     "config",
     "clip",
     "data",
+    "export",
     "sim",
     "ingest",
     "trainable",

@@ -3,8 +3,9 @@
 Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
@@ -116,3 +117,17 @@ def load_clips(store: Store, count: int) -> Clips:
     if not found:
         raise StoreError(f"{store.path}: its test split has no readable clip; delete it and make it again")
     return Clips.stacked([clip for _, clip in found], [number for number, _ in found])
+
+
+def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
+    """Returns the frames per second of a store's clips, by one of them; None where nothing says it.
+
+    Args:
+        manifest: the store's; of simulated clips it has the control steps between two frames.
+    """
+    origin = clip["provenance"]
+    frames, fps, control = origin.get("frames", ()), origin.get("fps"), origin.get("control_hz")
+    if fps and len(frames) > 1:
+        return float(fps) * (len(frames) - 1) / (frames[-1] - frames[0])
+    steps = (manifest.get("config") or {}).get("control_steps") or origin.get("control_steps")
+    return float(control) / steps if control and steps else None

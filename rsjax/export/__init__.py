@@ -1,0 +1,1 @@
+"""Writes stores of clips in formats that other projects train on."""
