@@ -12,12 +12,10 @@ from rich.tree import Tree
 
 from rsjax.bench import inputs
 from rsjax.config import Config, TransformerConfig
-from rsjax.models.base import create_model
+from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import empty_cache
-from rsjax.tokenizers.flops import tokenizer_flops
-from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Params, StepContext, combine
 from rsjax.training.state import make_optimizer
 
@@ -68,8 +66,8 @@ def _part(path: tuple[str, ...]) -> str:
 
 
 def _tokenizer(config: Config) -> Shapes:
-    shapes = jax.eval_shape(TokenizerTraining.create(config).init, jax.random.key(0))
-    if config.tokenizer_train.adversarial_weight:
+    shapes = jax.eval_shape(create_autoencoder(config).init, jax.random.key(0))
+    if "generator" in shapes:
         return shapes["generator"] | {"discriminator": shapes["discriminator"]}
     return shapes
 
@@ -99,8 +97,7 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
     }
     if flops:
         numbers |= {"flops_per_frame": flops["forward"] // frames, "flops_train_per_clip": flops["train"]}
-    if config.model.uses_tokenizer:
-        pixels = tokenizer_flops(config.tokenizer, config.clips.image_size)
+    if config.model.uses_tokenizer and (pixels := create_autoencoder(config).flops()):
         numbers |= {"flops_encode_per_image": pixels["encoder"], "flops_decode_per_image": pixels["decoder"]}
     numbers |= {
         "bytes_train_state": _train_state_bytes(config, world),

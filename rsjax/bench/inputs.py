@@ -9,10 +9,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rsjax.clip import Video
 from rsjax.config import Config
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
-from rsjax.models.base import WorldModel
+from rsjax.models.base import Assets, WorldModel, create_autoencoder
 from rsjax.models.roboscape.architecture import Architecture
 
 
@@ -20,6 +21,21 @@ def normalization(config: Config) -> Normalization:
     """Returns the identity normalization."""
     width = config.clips.action_dim
     return Normalization((0.0,) * width, (1.0,) * width, (0.1, 1.0))
+
+
+def assets(config: Config) -> Assets:
+    """Returns the identity normalization and, if the model uses one, a fresh autoencoder."""
+    if not config.model.uses_tokenizer:
+        return Assets(normalization(config), None)
+    autoencoder = create_autoencoder(config)
+    params = jax.jit(lambda key: autoencoder.tokenizer_params(autoencoder.init(key)))(jax.random.key(0))
+    return Assets(normalization(config), params)
+
+
+def video(config: Config, size: int, frames: int) -> Video:
+    """Returns random RGB frames, (size, frames, H, W, 3)."""
+    side = config.clips.image_size
+    return Video(np.random.default_rng(0).integers(0, 256, (size, frames, side, side, 3), np.uint8))
 
 
 def arrays(model: WorldModel[Any], config: Config, size: int) -> Arrays:

@@ -22,11 +22,9 @@ from rsjax.data import loader
 from rsjax.data.curriculum import plan
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
-from rsjax.models.base import create_model
+from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.rollout import rollout
-from rsjax.tokenizers.codec import Codec
-from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
 from rsjax.training.step import train_step
@@ -93,12 +91,12 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
 def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
     """Measures seconds per generated frame of a batch for each rollout length, with and without the temporal cache.
 
-    Without it, only the last frames of a rollout are decoded, since each costs a pass over all frames. Only RoboScape
-    and Genie are measured.
+    Without it, only the last frames of a rollout are decoded, since each costs a pass over all frames. Families other
+    than RoboScape and Genie are measured from pixels to pixels.
     """
     model, key = create_model(config), jax.random.key(0)
     if not isinstance(model, RoboScape):
-        return {}
+        return _sample_pixels(config, batch, budget, horizons)
     arch, settings = model.architecture, model.config.sample
     params = jax.jit(model.init)(jax.random.key(0))
     numbers: Numbers = {"sample_steps": settings.steps, "sample_prompt_frames": PROMPT_FRAMES}
@@ -118,17 +116,31 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
     return numbers
 
 
+def _sample_pixels(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
+    model, assets = create_model(config), inputs.assets(config)
+    params = jax.jit(model.init)(jax.random.key(0))
+    numbers: Numbers = {"sample_prompt_frames": PROMPT_FRAMES}
+    for frames in horizons:
+        prompt = inputs.video(config, batch, PROMPT_FRAMES)
+        actions = np.random.default_rng(1).normal(size=(batch, frames, config.clips.action_dim)).astype(np.float32)
+        run = partial(model.generate, params, assets, prompt, actions)
+        numbers[f"sample_s_per_frame_{frames}"] = median_seconds(run, budget) / (frames - PROMPT_FRAMES)
+    return numbers | {"sample_s_per_frame": numbers[f"sample_s_per_frame_{horizons[0]}"]}
+
+
 def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
     """Measures encoded and decoded frames a second, with images on the host, for all frames of a batch of clips."""
-    params = jax.jit(Tokenizer(config.tokenizer).init_params)(jax.random.key(0))
-    codec = Codec(config.tokenizer, params, inputs.normalization(config))
-    size, rng = config.clips.image_size, np.random.default_rng(0)
-    images = rng.integers(0, 256, (batch * config.clips.frames, size, size, 3), np.uint8)
-    tokens = codec.encode_rgb(images)
+    if not config.model.uses_tokenizer:
+        return {}
+    assets = inputs.assets(config)
+    assert assets.tokenizer is not None
+    codec = create_autoencoder(config).codec(assets.tokenizer, assets.normalization)
+    video, no_depth = inputs.video(config, batch, config.clips.frames), np.zeros(batch, bool)
+    tokens, frames = codec.encode(video), batch * config.clips.frames
     return {
-        "tokenizer_encode_frames_per_s": len(images) / median_seconds(lambda: codec.encode_rgb(images), budget),
-        "tokenizer_decode_frames_per_s": len(images) / median_seconds(lambda: codec.decode_rgb(tokens), budget),
-        "tokenizer_frames": len(images),
+        "tokenizer_encode_frames_per_s": frames / median_seconds(lambda: codec.encode(video), budget),
+        "tokenizer_decode_frames_per_s": frames / median_seconds(lambda: codec.decode(tokens, no_depth).rgb, budget),
+        "tokenizer_frames": frames,
     }
 
 

@@ -20,7 +20,8 @@ class ModelConfig:
 
     Attributes:
         family: its registered name.
-        uses_tokenizer: whether the family models the tokens of ``Config.tokenizer``; if not, no tokenizer is trained.
+        uses_tokenizer: whether a tokenizer is trained before the model: that of ``Config.tokenizer``, or the family's
+            own (:attr:`own_autoencoder`).
     """
 
     family: ClassVar[str] = ""
@@ -33,6 +34,14 @@ class ModelConfig:
     def loss_weights(self) -> dict[str, float]:
         """The weight of each active loss term by name; by default the nonzero fields ``NAME_weight``."""
         return loss_weights(self)
+
+    @property
+    def own_autoencoder(self) -> Any:
+        """Settings of the family's own autoencoder, a frozen dataclass, in place of ``Config.tokenizer``; None: none.
+
+        :mod:`rsjax.tokenizers.autoencoder` says how a family comes to have one.
+        """
+        return None
 
     @property
     def uses_depth(self) -> bool:

@@ -45,7 +45,7 @@ class Config:
     prompt_frames: int = 1  # frames that generation starts from; 1 in the paper
     sim: SimConfig = SimConfig()  # ignored if data names a store
     data: DataConfig = DataConfig()
-    tokenizer: TokenizerConfig = TokenizerConfig()  # ignored, like tokenizer_train, by a model without tokens
+    tokenizer: TokenizerConfig = TokenizerConfig()  # ignored by a model without tokens or with its own autoencoder
     tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
     model: ModelConfig = RoboScapeConfig()
     train: LoopConfig = LoopConfig()
@@ -65,7 +65,7 @@ class Config:
             f"eval.clips is {self.eval.clips} of {test_clips} {clips.test_clips}; both must be at least 2, "
             f"so that a clip can be generated under another one's actions",
         )
-        if self.model.uses_tokenizer:
+        if self.model.uses_tokenizer and self.autoencoder is self.tokenizer:
             self.tokenizer.grid(clips.image_size)
         self.model.check(clips)
 
@@ -86,6 +86,12 @@ class Config:
     def clips(self) -> ClipShape:
         """The shape of the clips that the run learns from."""
         return self.data.clips if self.data.key else self.sim.clips
+
+    @property
+    def autoencoder(self) -> Any:
+        """Settings of what maps frames to tokens or latents: the model's own autoencoder, or ``tokenizer``."""
+        own = self.model.own_autoencoder
+        return self.tokenizer if own is None else own
 
     @property
     def grid(self) -> int:

@@ -1,18 +1,21 @@
 """The token sets beside a store's clips: one store of token grids for each tokenizer that made them."""
 
+from typing import Any
+
 from rsjax.config import TokenizerConfig, content_key
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
 
 
-def tokenizer_key(config: TokenizerConfig, weights: str) -> str:
+def tokenizer_key(config: Any, weights: str) -> str:
     """Returns the key of everything that decides an image's tokens: the tokenizer and how depth becomes an image.
 
     Args:
+        config: settings of the tokenizer or of a family's own autoencoder (``Config.autoencoder``).
         weights: fingerprint of the tokenizer's weights.
     """
-    return content_key("tokenizer", weights, config.depth_scale)
+    return content_key("tokenizer", weights, config.depth_scale if isinstance(config, TokenizerConfig) else config)
 
 
 def tokens_key(clips: str, tokenizer: str) -> str:

@@ -19,6 +19,8 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Params, Trainable
 
 B = TypeVar("B", contravariant=True)
@@ -31,7 +33,7 @@ class Assets:
 
     Attributes:
         normalization: of actions and depth, from the training split.
-        tokenizer: parameters of the run's tokenizer; None for a family without tokens.
+        tokenizer: parameters of the run's tokenizer or of the family's own autoencoder; None for a family without one.
     """
 
     normalization: Normalization
@@ -53,6 +55,15 @@ class WorldModel(Trainable[B], Protocol[B]):
         By default, the only field of the dataclass is the whole configuration.
         """
         return cls(config)  # type: ignore[call-arg]
+
+    @classmethod
+    def autoencoder(cls, config: Config) -> Autoencoder[Any]:
+        """Returns what the stage before the model's trains, for a family whose settings say ``uses_tokenizer``.
+
+        By default the tokenizer of ``config.tokenizer``; :mod:`rsjax.tokenizers.autoencoder` says how a family has its
+        own.
+        """
+        return TokenizerTraining.create(config)
 
     @property
     def loss_weights(self) -> dict[str, float]:
@@ -175,7 +186,16 @@ def create_model(config: Config) -> WorldModel[Any]:
     Raises:
         ConfigError: its family has no registered implementation.
     """
+    return _implementation(config).create(config)
+
+
+def create_autoencoder(config: Config) -> Autoencoder[Any]:
+    """Returns what the stage "tokenizer" trains; the family must use one. Errors as in :func:`create_model`."""
+    return _implementation(config).autoencoder(config)
+
+
+def _implementation(config: Config) -> type[WorldModel[Any]]:
     kind = MODELS.get(type(config.model))
     if kind is None:
         raise ConfigError(f"model family {config.model.family!r} has settings but no implementation; import its module")
-    return kind.create(config)
+    return kind

@@ -107,7 +107,7 @@ class TrainedModel:
         return _first(video) if single else video
 
     def _codec(self) -> Codec:
-        if self.assets.tokenizer is None:
+        if self.assets.tokenizer is None or self.config.model.own_autoencoder is not None:
             raise UserError(f"a model of family {self.config.model.family!r} has no tokens; use generate")
         return Codec(self.config.tokenizer, self.assets.tokenizer, self.assets.normalization)
 

@@ -46,6 +46,8 @@ def check_batch(config: Config, loop: LoopConfig, stage: Literal["tokenizer", "w
 
 def _clip_bytes(config: Config, stage: str) -> int:
     """Returns bytes of a clip that the backward pass reads at least: features of one layer, or the input of a block."""
+    if stage == "tokenizer" and config.autoencoder is not config.tokenizer:
+        return config.tokenizer_train.frames_per_clip * config.clips.image_size**2
     if stage == "tokenizer":
         cells = (config.clips.image_size // config.tokenizer.patch_size) ** 2
         return 2 * config.tokenizer_train.frames_per_clip * cells * config.tokenizer.channels

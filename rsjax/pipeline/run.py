@@ -93,7 +93,7 @@ class Run:
         key = self.config.data.key
         if not key or not self.config.model.uses_tokenizer:
             return not key or prepared.get("key") == key
-        tokenizer = tokenizer_key(self.config.tokenizer, str(prepared.get("tokenizer")))
+        tokenizer = tokenizer_key(self.config.autoencoder, str(prepared.get("tokenizer")))
         return prepared.get("key") == tokens_key(key, tokenizer)
 
     def keys(self) -> dict[str, str]:
@@ -102,7 +102,7 @@ class Run:
         key = content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
-            "tokenizer": (cfg.tokenizer, cfg.tokenizer_train),
+            "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
             "tokens": (),
             "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
             "evaluation": (sampling_settings(cfg.model), cfg.eval),
@@ -162,7 +162,7 @@ class Run:
         except (FileError, TypeError):
             return "its config.json is missing or damaged"
         there, here = (
-            {name: value for part in DECIDED_BY[stage] for name, value in _deciding(getattr(config, part), part)}
+            {name: value for part in DECIDED_BY[stage] for name, value in _deciding(*_section(config, part))}
             for config in (saved, self.config)
         )
         pairs = {name: (there.get(name, "not set"), here.get(name, "not set")) for name in here | there}
@@ -215,6 +215,12 @@ class Run:
     def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
         content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
         write_json(self.directory / stage / MARK, content)
+
+
+def _section(config: Config, part: str) -> tuple[Any, str]:
+    """Returns a section of the configuration and its dotted name; the tokenizer may be the model's own autoencoder."""
+    own = config.model.own_autoencoder if part == "tokenizer" else None
+    return (getattr(config, part), part) if own is None else (own, "model.autoencoder")
 
 
 def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -11,10 +11,9 @@ from rsjax.data.curriculum import LoaderFactory, plan
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
-from rsjax.models.base import create_model
+from rsjax.models.base import create_autoencoder, create_model
 from rsjax.pipeline.run import Run
 from rsjax.progress import note
-from rsjax.tokenizers.training import TokenizerImages, TokenizerTraining, image_batch
 from rsjax.trainable import Params, Trainable
 from rsjax.training.checkpoint import load_weights
 from rsjax.training.distributed import is_lead
@@ -45,11 +44,10 @@ def tokenizer_setup(run: Run) -> Setup:
     Raises:
         StoreError: the clips are missing, or the curriculum of ``tokenizer_train`` does not fit them.
     """
-    cfg, train = run.config, run.config.tokenizer_train
-    model = TokenizerTraining.create(cfg)
-    transform = TokenizerImages(train.frames_per_clip, train.depth_share, cfg.tokenizer.depth_scale, train.flip)
+    train, model = run.config.tokenizer_train, create_autoencoder(run.config)
+    transform = model.transform()
     loop, loader = plan(train, run.open_clips(), lambda store: transform, run.directory / "tokenizer")
-    return Setup(model, loop, loader, image_batch, starting(model, train.start_from, "tokenizer"))
+    return Setup(model, loop, loader, model.batch, starting(model, train.start_from, "tokenizer"))
 
 
 def world_model_setup(run: Run) -> Setup:

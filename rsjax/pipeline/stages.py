@@ -9,7 +9,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard
-from rsjax.models.base import Assets, create_model
+from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.pipeline.limits import check_batch, check_episodes
 from rsjax.pipeline.provenance import record_data, record_start
 from rsjax.pipeline.run import TRAINED, Run, link
@@ -19,7 +19,6 @@ from rsjax.pipeline.trained import load, load_tokenizer
 from rsjax.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.sim.collect import collect
-from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.training.checkpoint import save_weights
 from rsjax.training.distributed import agree, barrier, is_lead, on_lead
 from rsjax.training.loop import Monitor, fit
@@ -77,7 +76,7 @@ def _check_starts(run: Run) -> None:
     if not cfg.data.key and not run.finished("collect"):
         check_episodes(cfg.sim, run.clips)
     trained: dict[Literal["tokenizer", "world_model"], tuple[LoopConfig, Callable[[Config], Any]]] = {
-        "tokenizer": (cfg.tokenizer_train, TokenizerTraining.create),
+        "tokenizer": (cfg.tokenizer_train, create_autoencoder),
         "world_model": (cfg.train, create_model),
     }
     for name, (loop, create) in trained.items():
@@ -119,13 +118,13 @@ def collect_clips(run: Run) -> None:
 
 
 def train_tokenizer(run: Run, resume: bool) -> None:
-    """Stage 2: trains the tokenizer, for a model on tokens."""
+    """Stage 2: trains the tokenizer, or the model's own autoencoder."""
     train, directory = run.config.tokenizer_train, run.directory / "tokenizer"
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
     # Checks the world model's curriculum before the tokenizer is trained.
     check_stages(run.config.train, run.open_clips())
-    setup, model = tokenizer_setup(run), TokenizerTraining.create(run.config)
+    setup, model = tokenizer_setup(run), create_autoencoder(run.config)
     note_curriculum(setup.loader)
     state = fit(
         model,

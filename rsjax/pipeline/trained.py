@@ -8,9 +8,8 @@ from rsjax.config import Config, ConfigError, from_dict
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.files import read_json
-from rsjax.models.base import Assets, create_model
+from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.trained import TrainedModel
-from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights
 
@@ -52,8 +51,7 @@ def load_assets(config: Config, run: Path) -> Assets:
 
 
 def load_tokenizer(config: Config, run: Path) -> Params | None:
-    """Loads the trained tokenizer's parameters; None for a model without tokens."""
+    """Loads the trained tokenizer's or autoencoder's parameters; None for a model without one."""
     if not config.model.uses_tokenizer:
         return None
-    shapes = jax.eval_shape(Tokenizer(config.tokenizer).init_params, jax.random.key(0))
-    return load_weights(run / "tokenizer" / "weights", shapes)
+    return load_weights(run / "tokenizer" / "weights", create_autoencoder(config).shapes())

@@ -20,12 +20,11 @@ from rsjax.data.order import Arrays
 from rsjax.data.store import RecordSource, Store
 from rsjax.evaluation.metrics.psnr import psnr
 from rsjax.evaluation.registry import Scene, Unavailable, metrics
-from rsjax.models.base import Assets, WorldModel, create_model
+from rsjax.models.base import Assets, WorldModel, create_autoencoder, create_model
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load_tokenizer
 from rsjax.report.figures import ClipFigure, filmstrip
 from rsjax.tokenizers.codec import Codec
-from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Params
 from rsjax.training.validation import Validation, validation_loss
 
@@ -107,7 +106,7 @@ def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class TokenizerValidation:
-    """Scores the reconstruction of frames and depth maps of ``eval.clips`` test clips.
+    """Scores the reconstruction of frames, and of depth maps if they are encoded, of ``eval.clips`` test clips.
 
     It opens the run's store at its first call.
     """
@@ -121,12 +120,13 @@ class TokenizerValidation:
             StoreError: the run's store is missing, or its test split has no readable clip.
         """
         cfg, clips = self.run.config, self._clips
-        codec = Codec(cfg.tokenizer, TokenizerTraining.create(cfg).tokenizer_params(weights), self._normalization)
-        rgb = codec.decode_rgb(codec.encode_rgb(clips.rgb))
+        autoencoder = create_autoencoder(cfg)
+        codec = autoencoder.codec(autoencoder.tokenizer_params(weights), self._normalization)
+        rgb = codec.decode(codec.encode(Video(clips.rgb)), np.zeros(len(clips.rgb), bool)).rgb
         shown = {number: [(clips.rgb[row], rgb[row])] for row, number in enumerate(clips.index)}
         of_rgb = _psnr(clips.rgb, rgb)
         metric, scalars = -of_rgb, {"validation/psnr": of_rgb}
-        if clips.has_depth.any() and self._normalization.depth_range:
+        if isinstance(codec, Codec) and clips.has_depth.any() and self._normalization.depth_range:
             true = clips.depth[clips.has_depth]
             colors = depth_to_color(true, *self._normalization.depth_range, cfg.tokenizer.depth_scale).astype(np.uint8)
             depth = codec.decode_rgb(codec.encode_depth(true))

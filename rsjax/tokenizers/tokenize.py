@@ -6,8 +6,9 @@ tokens instead of pixels; actions stay in the data's units. The manifest lists u
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,7 +35,29 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
 
     Args:
         codec: the trained tokenizer.
-        image_size: pixels per side of the tokenizer's images.
+        image_size, place, max_damaged: as for :func:`prepare_store`, whose errors it raises.
+    """
+    return prepare_store(
+        clips, codec.config, codec.params, lambda clip: token_record(codec, clip), image_size, place, max_damaged
+    )
+
+
+def prepare_store(
+    clips: Store,
+    config: Any,
+    params: Params,
+    encode: Callable[[Record], Record],
+    image_size: int,
+    place: Path,
+    max_damaged: float,
+) -> Store:
+    """Makes what an autoencoder maps every clip to, unless it exists.
+
+    Args:
+        config: the autoencoder's settings (``Config.autoencoder``).
+        params: its trained parameters.
+        encode: returns a clip's token record, with the fields of :func:`described` beside its tokens or latents.
+        image_size: pixels per side of its images.
         place: a directory for the list of damaged clips, and for the tokens if the store is write-protected.
         max_damaged: the share of a split's clips that may be damaged.
 
@@ -48,7 +71,8 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
     if side != image_size:
         raise StoreError(f"{clips.path}: its pictures have {side} pixels a side, the tokenizer takes {image_size}")
     (place / QUARANTINE).unlink(missing_ok=True)  # all clips are checked again
-    tokenizer = tokenizer_key(codec.config, fingerprint(codec.params))
+    weights = fingerprint(params)
+    tokenizer = tokenizer_key(config, weights)
     key = tokens_key(str(clips.manifest.get("key")), tokenizer)
     out = beside = clips.path.resolve() / FOLDER / tokenizer
     if _is_made(beside, key, clips):
@@ -57,7 +81,7 @@ def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max
         out = place.resolve() / "own" / tokenizer
     with making(out, wait=True):
         if not _is_made(out, key, clips):
-            _write(out, clips, codec, key)
+            _write(out, clips, encode, {"key": key, "tokenizer": weights})
     return _listed(out, clips, max_damaged, place)
 
 
@@ -78,7 +102,7 @@ def _writable(out: Path) -> bool:
     return os.access(parent, os.W_OK) and (not lock.exists() or os.access(lock, os.W_OK))
 
 
-def _write(out: Path, clips: Store, codec: Codec, key: str) -> None:
+def _write(out: Path, clips: Store, encode: Callable[[Record], Record], keys: dict[str, Any]) -> None:
     total = sum(len(clips.source(split)) for split in clips.splits)
     left_out: dict[str, list[int]] = {split: [] for split in clips.splits}
     with Progress("tokens", total, "clips") as progress:
@@ -90,13 +114,13 @@ def _write(out: Path, clips: Store, codec: Codec, key: str) -> None:
             missing = set(range(len(source)))
             for number, clip in readable(source, tell=lambda _: None):
                 missing.remove(number)
-                yield token_record(codec, clip)
+                yield encode(clip)
                 done += 1
                 progress.update(done)
             left_out[split] = sorted(missing)
 
         meta = {name: clips.manifest[name] for name in UNITS if name in clips.manifest}
-        meta |= {"key": key, "source": str(clips.path), "tokenizer": fingerprint(codec.params), _LEFT_OUT: left_out}
+        meta |= keys | {"source": str(clips.path), _LEFT_OUT: left_out}
         write_store(out, "tokens", {split: tokenized(split) for split in clips.splits}, meta, labels)
 
 
@@ -123,6 +147,13 @@ def token_record(codec: Codec, clip: Record) -> Record:
     return {
         "rgb": codec.encode_rgb(clip["rgb"]),
         "depth": None if clip["depth"] is None else codec.encode_depth(clip["depth"]),
+        **described(clip),
+    }
+
+
+def described(clip: Record) -> Record:
+    """Returns the fields that a clip's token record has beside its tokens: actions, tracks, labels."""
+    return {
         "actions": clip["actions"],
         "tracks": clip["tracks"],
         "visible": clip["visible"],

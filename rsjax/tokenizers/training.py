@@ -17,15 +17,19 @@ from rsjax.config import Config, ConfigError, TokenizerConfig, TokenizerTrainCon
 from rsjax.config.fields import differences
 from rsjax.data.codec import Record
 from rsjax.data.depth_color import depth_to_color
-from rsjax.data.order import Arrays
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
 from rsjax.errors import UserError
 from rsjax.files import read_json
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages, updated_averages
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
+from rsjax.tokenizers.flops import tokenizer_flops
 from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
 from rsjax.tokenizers.magvit2 import Tokenizer, to_unit
-from rsjax.trainable import Extra, Params, Scalar, StepContext, Term, Trainable
+from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 
 Images: TypeAlias = Float[Array, "B H W 3"]
 Latents: TypeAlias = Float[Array, "B h w D"]
@@ -34,7 +38,7 @@ FREE = {"vocabularies", "depth_scale"}  # fields that may differ between the sav
 
 
 @dataclass(frozen=True)
-class TokenizerTraining(Trainable[Images]):
+class TokenizerTraining(Autoencoder[Images]):
     """Learns to reconstruct RGB frames and colourised depth maps. A batch is images 0–255, (B, H, W, 3).
 
     Parameters are the tokenizer's; with an adversarial term, {"generator": the tokenizer's, "discriminator": …}.
@@ -143,9 +147,22 @@ class TokenizerTraining(Trainable[Images]):
         logits = (means["real_logit"], means["fake_logit"])
         return extra | {"lecam": updated_averages(extra["lecam"], *logits, decay=self.train.lecam_decay)}
 
+    def transform(self) -> Transform:
+        train = self.train
+        return TokenizerImages(train.frames_per_clip, train.depth_share, self.tokenizer.depth_scale, train.flip)
+
+    def batch(self, arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
+        return image_batch(arrays)
+
     def tokenizer_params(self, params: Params) -> Params:
         """Returns the tokenizer's parameters without the discriminator's."""
         return params["generator"] if self.train.adversarial_weight else params
+
+    def codec(self, params: Params, normalization: Normalization) -> Codec:
+        return Codec(self.tokenizer, params, normalization)
+
+    def flops(self) -> dict[str, int]:
+        return tokenizer_flops(self.tokenizer, self.image_size)
 
     def pretrained_shapes(self, directory: Path) -> Params:
         """Returns the shapes of the tokenizer's weights in a directory that training may start from.

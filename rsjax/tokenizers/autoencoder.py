@@ -1,0 +1,85 @@
+"""The interface of what maps frames to tokens or latents and back, trained in the stage "tokenizer" before the model.
+
+The MAGVIT-2 tokenizer implements it (:class:`rsjax.tokenizers.training.TokenizerTraining`), and so may a family of
+world models with an autoencoder of its own. Such a family
+
+- has in its settings ``uses_tokenizer = True`` and a property ``own_autoencoder``, which returns the network's settings
+  (a nested dataclass, such as its field ``autoencoder``). Steps, batch, optimizer, frames per clip and the weights of
+  common loss terms are ``Config.tokenizer_train``'s, as for every tokenizer;
+- overrides :meth:`rsjax.models.base.WorldModel.autoencoder` to return a subclass of :class:`Autoencoder`;
+- makes the records that its model trains on in ``prepare``, by :func:`rsjax.tokenizers.tokenize.prepare_store`, and
+  reads the trained parameters as ``assets.tokenizer``.
+
+Public weights that stay frozen are a stage of no steps: ``tokenizer_train.start_from`` names their directory and
+``tokenizer_train.steps`` is 0. Resuming, logging, replaying, validation, describe and bench need nothing else.
+"""
+
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from rsjax.clip import Video
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.errors import UserError
+from rsjax.trainable import Params, Trainable
+
+B = TypeVar("B", contravariant=True)
+
+
+class VideoCodec(Protocol):
+    """A trained autoencoder that takes and returns numpy arrays."""
+
+    def encode(self, video: Video) -> dict[str, Any]:
+        """Returns the video's tokens or latents, arrays (B, …) by name."""
+        ...
+
+    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"]) -> Video:
+        """Inverts :meth:`encode`, with depth for the clips that have it if the codec encodes depth."""
+        ...
+
+
+class Autoencoder(Trainable[B], Protocol[B]):
+    """What the stage "tokenizer" trains: a frozen dataclass of settings, without arrays."""
+
+    def transform(self) -> Transform:
+        """Returns the function that converts a clip's record to arrays of fixed shapes, in the loader.
+
+        It must be picklable and use only numpy.
+        """
+        ...
+
+    def batch(self, arrays: Arrays) -> Any:
+        """Returns the batch for ``loss_terms`` from stacked arrays; each array's rows are clips, or a multiple."""
+        ...
+
+    def tokenizer_params(self, params: Params) -> Params:
+        """Returns the parameters that later stages use, without those that only the loss needs (a discriminator's)."""
+        return params
+
+    def codec(self, params: Params, normalization: Normalization) -> VideoCodec:
+        """Returns the trained codec with these :meth:`tokenizer_params`."""
+        ...
+
+    def shapes(self) -> Params:
+        """Returns the shapes of :meth:`tokenizer_params`, without allocating them."""
+        return jax.eval_shape(lambda key: self.tokenizer_params(self.init(key)), jax.random.key(0))
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        """Returns the shapes of the weights ``directory/tokenizer/weights``, which training may start from.
+
+        Raises:
+            UserError: this autoencoder cannot start from other weights, or they are of another network.
+        """
+        raise UserError(f"{directory}: tokenizer_train.start_from is set, but this autoencoder starts from no weights")
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
+        return saved
+
+    def flops(self) -> dict[str, int]:
+        """Returns floating-point operations per frame, "encoder" and "decoder"; empty if there are no counts."""
+        return {}
