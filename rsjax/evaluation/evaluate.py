@@ -3,13 +3,14 @@
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rsjax.clip import Video
 from rsjax.config import EvalConfig
@@ -25,6 +26,7 @@ from rsjax.evaluation.shown import shown_arrays
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
 from rsjax.ingest.annotators.protocols import DepthEstimator
+from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tokenizers.lpips import load_lpips
@@ -94,7 +96,7 @@ def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
             reasons[metric.name] = str(reason)
         else:
             scores |= _summarised(metric, scored)
-            per_clip |= scored
+            per_clip |= {name: values for name, values in scored.items() if values.ndim}
     scores["clips"] = float(len(clips.rgb))
     if (share := store.manifest.get("success_share")) is not None:
         scores["success_share"] = float(share)
@@ -134,8 +136,7 @@ def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: b
     """Generates the videos of all clips in batches of one shape, so that one program is compiled."""
     size, prompt = trained.config.eval.batch_size, clips.video.frames(0, trained.config.prompt_frames)
     parts = []
-    for start in range(0, len(actions), size):
-        rows = np.minimum(np.arange(start, start + size), len(actions) - 1)
+    for rows in _batches(len(actions), size):
         inputs = (trained.params, trained.assets, prompt[rows], actions[rows])
         parts.append(trained.model.generate(*inputs, index=clips.index[rows], depth=depth))
     rgb = np.concatenate([part.rgb for part in parts])[: len(actions)]
@@ -143,6 +144,28 @@ def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: b
         return Video(rgb)
     unknown = [np.full(part.rgb.shape[:-1], np.nan, np.float32) if part.depth is None else part.depth for part in parts]
     return Video(rgb, np.concatenate(unknown)[: len(actions)])
+
+
+def _teacher_forced(trained: TrainedModel, clips: Clips) -> TeacherForced | None:
+    """Predicts every frame of all clips from the true frames before it; None if the model cannot."""
+    parts = []
+    for rows in _batches(len(clips.rgb), trained.config.eval.batch_size):
+        inputs = (trained.params, trained.assets, clips.video[rows], clips.actions[rows])
+        parts.append(trained.model.teacher_forced(*inputs, trained.config.prompt_frames))
+    if any(part is None for part in parts):
+        return None
+
+    def joined(name: str) -> dict[str, np.ndarray]:
+        fields = [getattr(part, name) for part in parts]
+        return {branch: np.concatenate([field[branch] for field in fields])[: len(clips.rgb)] for branch in fields[0]}
+
+    return TeacherForced(joined("cross_entropy"), joined("accuracy"))
+
+
+def _batches(clips: int, size: int) -> Iterator[Int[np.ndarray, " size"]]:
+    """Yields the numbers of all clips in batches of one size, the last filled up, so that one program is compiled."""
+    for start in range(0, clips, size):
+        yield np.minimum(np.arange(start, start + size), clips - 1)
 
 
 def _locate(trained: TrainedModel, store: Store, records: Sequence[Record]) -> Callable[[Video, bool], Located] | None:
@@ -176,6 +199,8 @@ def _scenes(
         shown["_tokenizer"] = reconstruction
     rgb = {suffix: video.rgb for suffix, video in shown.items()}
     estimated = estimate_depth(estimator, truth.rgb, rgb) if estimator else {}
+    teacher_forced = _teacher_forced(trained, clips)
+    truth_cache: dict[Any, Any] = {}
     return {
         suffix: Scene(
             truth,
@@ -184,7 +209,9 @@ def _scenes(
             {} if suffix else alternatives,
             estimated.get(suffix),
             locate(video, not suffix) if locate else None,
-            settings,
+            None if suffix else teacher_forced,
+            settings=settings,
+            truth_cache=truth_cache,
         )
         for suffix, video in shown.items()
     }
@@ -214,6 +241,9 @@ def _summarised(metric: Metric, per_clip: dict[str, PerClip]) -> dict[str, float
     """Returns the mean or median over clips of each score, and its interval."""
     flat: dict[str, float] = {}
     for name, values in per_clip.items():
+        if not values.ndim:  # one number for all clips
+            flat[name] = float(values)
+            continue
         estimate = bootstrap(values, statistic=metric.statistic)
         flat |= estimate.flat(name) if metric.interval else {name: estimate.value}
     return flat | ({f"{metric.name}_repeat_first": 0.0} if metric.needs else {})  # this baseline ignores actions

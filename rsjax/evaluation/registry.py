@@ -13,10 +13,12 @@ from jaxtyping import Bool, Float
 from rsjax.clip import Video
 from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation.statistics import Statistic
+from rsjax.models.base import TeacherForced
 
-PerClip: TypeAlias = Float[np.ndarray, " B"]
+PerClip: TypeAlias = Float[np.ndarray, " B"]  # without the clips that have no score, if the truth alone decides that
 PerFrame: TypeAlias = Float[np.ndarray, "B P"]  # P predicted frames; NaN where a frame has no score
-Scores: TypeAlias = PerClip | dict[str, PerClip]  # a dict has several scores by suffix; "" is the metric itself
+Score: TypeAlias = PerClip | float  # of each clip, or one of the whole set of clips
+Scores: TypeAlias = Score | dict[str, Score]  # a dict has several scores by suffix; "" is the metric itself
 # Videos generated under another clip's actions, or under uniform random actions.
 Need = Literal["other", "uniform"]
 T = TypeVar("T")
@@ -83,7 +85,10 @@ class Scene:
         alternatives: videos generated under other actions, by kind; one for each draw of actions.
         estimated: depth estimated from the frames; None without an estimator.
         located: where things are in the last frame; None if the clips do not record it.
+        teacher_forced: how well the model predicts each frame's tokens; None for a baseline or a model without tokens.
+        second_take: the same scenes recorded once more (same start, same task), for Physics-IQ's score.
         settings: with the paths of weights.
+        truth_cache: what :meth:`of_truth` computed; scenes of the same truth share it.
     """
 
     truth: Video
@@ -92,16 +97,27 @@ class Scene:
     alternatives: Mapping[str, Sequence[Video]] = field(default_factory=dict)
     estimated: EstimatedDepth | None = None
     located: Located | None = None
+    teacher_forced: TeacherForced | None = None
+    second_take: Video | None = None
     settings: EvalConfig = field(default_factory=EvalConfig)
+    truth_cache: dict[Any, Any] = field(default_factory=dict, repr=False)
     _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
     def shared(self, function: Callable[..., T], *arguments: Any) -> T:
         """Returns ``function(self, *arguments)``, which is computed once for all metrics that share it."""
-        key = (function, *arguments)
-        if key not in self._shared:
-            self._shared[key] = function(self, *arguments)
-        result: T = self._shared[key]
-        return result
+        return _once(self._shared, function, self, arguments)
+
+    def of_truth(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Returns ``function(self, *arguments)``, which reads only the truth: computed once for all scenes of it."""
+        return _once(self.truth_cache, function, self, arguments)
+
+
+def _once(cache: dict[Any, Any], function: Callable[..., T], scene: Scene, arguments: tuple[Any, ...]) -> T:
+    key = (function, *arguments)
+    if key not in cache:
+        cache[key] = function(scene, *arguments)
+    result: T = cache[key]
+    return result
 
 
 @dataclass(frozen=True)
@@ -119,8 +135,8 @@ class Metric:
         interval: whether its bootstrap interval is reported.
         statistic: what summarises the clips.
         column: whether tables have a column for it.
-        function: scores a scene, one number per clip, or raises :class:`Unavailable`; None for a number that is not
-            computed from videos.
+        function: scores a scene, one number per clip or one for all, or raises :class:`Unavailable`; None for a number
+            that is not computed from videos.
         per_frame: scores every predicted frame of a scene, or raises :class:`Unavailable`; None for a metric without a
             curve over frames.
     """
@@ -209,5 +225,5 @@ def metrics() -> dict[str, Metric]:
     import rsjax.evaluation.metrics  # noqa: F401 - registers the built-in metrics
 
     depth = [name for name in _METRICS if name.startswith("depth_")]
-    first = ("psnr", "ssim", "lpips_alex", "lpips_vgg", *depth, "delta_psnr", "delta_psnr_uniform")
+    first = ("psnr", "psnr_motion", "ssim", "lpips_alex", "lpips_vgg", *depth, "delta_psnr", "delta_psnr_uniform")
     return {name: _METRICS[name] for name in (*first, *(name for name in _METRICS if name not in first))}

@@ -40,6 +40,20 @@ class Assets:
     tokenizer: Params | None
 
 
+@dataclass(frozen=True)
+class TeacherForced:
+    """How well a model predicts the tokens of single frames from all true frames before them.
+
+    Attributes:
+        cross_entropy: mean over a frame's cells of -log p of their tokens in nats (the sum over vocabularies), by
+            branch; p is predicted with the whole frame masked. NaN for clips without this branch.
+        accuracy: the share of a frame's cells whose most probable token is the true one, likewise.
+    """
+
+    cross_entropy: dict[str, Float[np.ndarray, "B P"]]
+    accuracy: dict[str, Float[np.ndarray, "B P"]]
+
+
 class WorldModel(Trainable[B], Protocol[B]):
     """A world model: a frozen dataclass of settings, without arrays.
 
@@ -147,6 +161,19 @@ class WorldModel(Trainable[B], Protocol[B]):
         """Returns a video's reconstruction from the model's tokens or latents, the upper bound of its quality.
 
         None for a family that predicts pixels.
+        """
+        return None
+
+    def teacher_forced(
+        self, params: Params, assets: Assets, video: Video, actions: Float[np.ndarray, "B T A"], prompt_frames: int = 1
+    ) -> TeacherForced | None:
+        """Predicts each of the P = T - ``prompt_frames`` frames after the prompt from all true frames before it.
+
+        None for a family that has no tokens, or does not implement it.
+
+        Args:
+            video: whole recorded clips.
+            actions: as for :meth:`generate`.
         """
         return None
 

@@ -48,6 +48,15 @@ def merge_tokens(sub_tokens: Int[Array, "*batch n"], code_bits: int) -> Int[Arra
     return jnp.sum(sub_tokens << shifts, axis=-1, dtype=sub_tokens.dtype)
 
 
+def token_cross_entropy(
+    logits: Float[Array, "B T S n V"], tokens: Int[Array, "B T H W"], code_bits: int
+) -> Float[Array, "B T H W"]:
+    """Returns -log p of each cell's token: the sum of its vocabularies' cross-entropies, in nats."""
+    sub_tokens = split_tokens(tokens, code_bits, logits.shape[-2]).reshape(logits.shape[:-1])
+    chosen = jnp.take_along_axis(logits, sub_tokens[..., None], axis=-1)[..., 0]
+    return jnp.sum(jax.nn.logsumexp(logits, axis=-1) - chosen, axis=-1).reshape(tokens.shape)
+
+
 def vocabulary_codes(code_bits: int, vocabularies: int) -> Float[Array, "V d"]:
     """Returns the code bits in {-1, +1} of every entry of one factorised vocabulary, d = D/n."""
     width = code_bits // vocabularies

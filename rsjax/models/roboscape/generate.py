@@ -1,4 +1,4 @@
-"""Generates videos from pixels to pixels: encodes the prompt, rolls out tokens, decodes them."""
+"""Generates videos from pixels to pixels (encodes the prompt, rolls out tokens, decodes them); scores recorded ones."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +7,10 @@ from jaxtyping import Array, Float, Float32, Int
 
 from rsjax.clip import Video
 from rsjax.config import TokenModelConfig
+from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import Tokens, encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.teacher import score_tokens
 from rsjax.tokenizers.codec import Codec
 from rsjax.trainable import Params
 
@@ -54,6 +56,22 @@ def plan(
     key, index = jax.random.key(sample.seed), jnp.zeros(n, jnp.int32)
     made = rollout_from(arch, sample, params, start, inputs[:, past:], key, index)
     return codec.decode(made, np.repeat(has_depth & depth, n))
+
+
+def teacher_forced(
+    config: TokenModelConfig,
+    arch: Architecture,
+    codec: Codec,
+    params: Params,
+    video: Video,
+    actions: Float[np.ndarray, "B T A"],
+    past: int,
+) -> TeacherForced:
+    """Implements :meth:`rsjax.models.base.WorldModel.teacher_forced`. T may exceed the trained positions."""
+    tokens, has_depth = _prompt(arch, codec, video)
+    if arch.use_depth and "depth" not in tokens:
+        tokens["depth"] = jnp.zeros_like(tokens["rgb"])
+    return score_tokens(arch, config.sample, params, tokens, _inputs(config, codec, actions), ~has_depth, past)
 
 
 def _prompt(arch: Architecture, codec: Codec, prompt: Video) -> tuple[Tokens, np.ndarray]:

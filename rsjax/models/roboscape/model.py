@@ -21,11 +21,11 @@ from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
-from rsjax.models.base import Assets, WorldModel, implements
+from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
 from rsjax.models.roboscape import masking, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
-from rsjax.models.roboscape.generate import generate, plan
+from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.transformer import Transformer
@@ -57,7 +57,7 @@ class Predictions:
     def cross_entropy(self) -> dict[str, Float[Array, "B T H W"]]:
         """-log p of each cell's target by branch, in nats."""
         bits = self.model.architecture.code_bits
-        return {branch: token_cross_entropy(self.logits[branch], self.clean[branch], bits) for branch in self.clean}
+        return {branch: lfq.token_cross_entropy(self.logits[branch], self.clean[branch], bits) for branch in self.clean}
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -132,15 +132,6 @@ def keypoint_term(of: Predictions) -> Term:
         mask = of.mask.reshape(*of.mask.shape[:2], -1)  # B T S
         weight = weight * jnp.take_along_axis(mask[:, 1:], cells[:, 1:], axis=2)
     return jnp.sum(distance * weight), jnp.sum(weight)
-
-
-def token_cross_entropy(
-    logits: Float[Array, "B T S n V"], tokens: Int[Array, "B T H W"], code_bits: int
-) -> Float[Array, "B T H W"]:
-    """Returns -log p of each cell's token: the sum of its vocabularies' cross-entropies, in nats."""
-    sub_tokens = lfq.split_tokens(tokens, code_bits, logits.shape[-2]).reshape(logits.shape[:-1])
-    chosen = jnp.take_along_axis(logits, sub_tokens[..., None], axis=-1)[..., 0]
-    return jnp.sum(jax.nn.logsumexp(logits, axis=-1) - chosen, axis=-1).reshape(tokens.shape)
 
 
 def expected_codes(logits: Float[Array, "*B n V"], code_bits: int) -> Float[Array, "*B D"]:
@@ -238,6 +229,12 @@ class RoboScape(WorldModel[Batch]):
     def reconstruct(self, assets: Assets, video: Video) -> Video:
         codec = self._codec(assets)
         return codec.decode(codec.encode(video), video.has_depth)
+
+    def teacher_forced(
+        self, params: Params, assets: Assets, video: Video, actions: Float[np.ndarray, "B T A"], prompt_frames: int = 1
+    ) -> TeacherForced:
+        inputs = (params, video, actions, prompt_frames)
+        return teacher_forced(self.config, self.architecture, self._codec(assets), *inputs)
 
     def pretrained_shapes(self, directory: Path) -> Params:
         return pretrained.shapes(self.architecture, directory)

@@ -13,6 +13,7 @@ from rsjax.models.roboscape import model as losses
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map
 from rsjax.models.roboscape.model import Predictions
+from rsjax.tokenizers import lfq
 from rsjax.trainable import Term, combine
 from tests.models.roboscape.toy import roboscape
 
@@ -46,7 +47,7 @@ def plain_cross_entropy(attention: np.ndarray) -> tuple[float, float]:
 
 
 def cross_entropy() -> jax.Array:
-    return losses.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
+    return lfq.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
 
 
 def predictions(keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, **loss: Any) -> Predictions:
@@ -67,7 +68,7 @@ def assert_term(term: Term, expected: tuple[float, float]) -> None:
 def test_cross_entropy_of_a_token_is_that_of_the_whole_vocabulary() -> None:
     """Factorised heads define p(token) as the product over vocabularies: over all 2^D tokens it sums to one."""
     one = jnp.array(LOGITS[:1, :1, :1])
-    everything = [losses.token_cross_entropy(one, jnp.full((1, 1, 1, 1), token), BITS) for token in range(2**BITS)]
+    everything = [lfq.token_cross_entropy(one, jnp.full((1, 1, 1, 1), token), BITS) for token in range(2**BITS)]
     np.testing.assert_allclose(np.sum(np.exp(-np.array(everything))), 1.0, rtol=1e-5)
     np.testing.assert_allclose(cross_entropy()[1, 2, 0, 1], -log_p(1, 2, 0, 1), rtol=1e-5)
 

@@ -1,0 +1,94 @@
+"""Teacher forcing: predicts the tokens of each frame, all masked, from the true frames before it.
+
+The true frames are encoded into the temporal cache once; then each frame is one pass over its masked cells, which reads
+the slots before its own. Clips that are longer than the positions are scored window by window, as a rollout is.
+
+Axes: B clips, T frames, H×W = S cells, A action dimensions.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from rsjax.clip import Array
+from rsjax.config import SampleConfig
+from rsjax.models.base import TeacherForced
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.maskgit import sample_tokens
+from rsjax.models.roboscape.transformer import Transformer, empty_cache
+from rsjax.models.roboscape.window import window_actions, window_start
+from rsjax.tokenizers import lfq
+from rsjax.trainable import Params
+
+Tokens = dict[str, Int[Array, "B T H W"]]
+Scores = dict[str, Float[Array, "B T"]]
+
+
+def score_tokens(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    tokens: Tokens,
+    actions: Float[Array, "B T A"],
+    no_depth: Bool[np.ndarray, " B"],
+    past: int,
+) -> TeacherForced:
+    """Predicts each frame after the prompt from all true frames before it.
+
+    Args:
+        sample: for the stride of the window.
+        tokens: of the true frames, by branch; "depth" is zeros for clips without.
+        actions: normalised; row t led into frame t.
+        no_depth: True for clips without depth.
+        past: prompt frames, which are not scored.
+    """
+    frames = actions.shape[1]
+    size = frames if arch.positions == "rotary" else arch.frames
+    starts = [int(window_start(arch, sample, t)) for t in range(frames)]
+    parts = []
+    for base in dict.fromkeys(starts[past:]):
+        window = {name: _window(grid, base, size) for name, grid in tokens.items()}
+        rows = window_actions(arch, _window(actions, 0, frames + size), base, base, size)
+        scores = _score_window(arch, params, window, rows, no_depth)
+        scored = [t - base for t in range(past, frames) if starts[t] == base]
+        parts.append(jax.tree.map(lambda x, scored=scored: np.asarray(x)[:, scored], scores))
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
+    if "depth" in joined[0]:
+        for scores in joined:
+            scores["depth"][no_depth] = np.nan
+    return TeacherForced(*joined)
+
+
+def _window(x: Array, start: int, size: int) -> Array:
+    """Returns ``size`` frames from ``start`` on, padded with zeros where there are none."""
+    x = jnp.asarray(x)[:, start : start + size]
+    return jnp.pad(x, [(0, 0), (0, size - x.shape[1]), *[(0, 0)] * (x.ndim - 2)])
+
+
+@partial(jax.jit, static_argnums=0)
+def _score_window(
+    arch: Architecture, params: Params, tokens: Tokens, actions: Float[Array, "B T A"], no_depth: Bool[Array, " B"]
+) -> tuple[Scores, Scores]:
+    """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
+    clips, frames = actions.shape[:2]
+    transformer = partial(Transformer(arch).apply, {"params": params}, no_depth=no_depth if arch.use_depth else None)
+    slots = frames if arch.positions == "learned" else max(arch.frames + 1, frames)
+    visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
+    _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
+
+    def score(t: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        frame = {name: jax.lax.dynamic_slice_in_dim(grid, t, 1, axis=1) for name, grid in tokens.items()}
+        action = jax.lax.dynamic_slice_in_dim(actions, t, 1, axis=1)
+        logits, _ = transformer(frame, ~visible[:, :1], action, t, cache)
+        likeliest = {
+            name: sample_tokens(jax.random.key(0), x, 0.0, arch.code_bits)[0].reshape(frame[name].shape)
+            for name, x in logits.items()
+        }
+        nats = {name: lfq.token_cross_entropy(x, frame[name], arch.code_bits) for name, x in logits.items()}
+        right = {name: (grid == frame[name]).astype(jnp.float32) for name, grid in likeliest.items()}
+        return jax.tree.map(lambda x: x.mean((1, 2, 3)), (nats, right))
+
+    return jax.tree.map(lambda x: x.T, jax.lax.map(score, jnp.arange(frames)))
