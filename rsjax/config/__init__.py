@@ -8,6 +8,7 @@ out, so changing it never invalidates finished work.
 """
 
 from rsjax.config.data import ClipShape, DataConfig
+from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
 from rsjax.config.fields import (
     ConfigError,
     check_numbers,
@@ -19,6 +20,7 @@ from rsjax.config.fields import (
     sampling_settings,
     to_dict,
 )
+from rsjax.config.irasim import DiTConfig
 from rsjax.config.model import (
     FAMILIES,
     GenieConfig,
@@ -44,12 +46,15 @@ __all__ = [
     "ConfigError",
     "CurriculumStageConfig",
     "DataConfig",
+    "DenoiseConfig",
+    "DiTConfig",
     "EvalConfig",
     "GenieConfig",
     "LoopConfig",
     "LossConfig",
     "MaskConfig",
     "ModelConfig",
+    "NoiseConfig",
     "OptimizerConfig",
     "RoboScapeConfig",
     "SampleConfig",

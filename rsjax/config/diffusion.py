@@ -1,0 +1,54 @@
+"""Settings of diffusion models: the forward process and the sampler."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from rsjax.config.fields import require, require_range
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """The forward process: how latents turn into noise, and what of it the network predicts."""
+
+    steps: int = 1000
+    beta_start: float = 1e-4
+    beta_end: float = 0.02
+    betas: Literal["linear", "scaled_linear"] = "linear"  # scaled_linear: their roots grow linearly
+    prediction: Literal["noise", "velocity"] = "noise"
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.noise", 2, math.inf, "steps")
+        require(
+            0 < self.beta_start <= self.beta_end < 1,
+            f"model.noise.beta_start is {self.beta_start} and beta_end {self.beta_end}; they grow, above 0 and below 1",
+        )
+
+
+@dataclass(frozen=True)
+class DenoiseConfig:
+    """Settings of the sampler. Names and definitions are those of the package ``diffusers``."""
+
+    # ddim: one network call a step. pndm: Runge-Kutta at first, which makes it steps + 9 calls.
+    sampler: Literal["pndm", "ddim"] = "pndm"
+    steps: int = 50
+    # Which steps of the forward process are visited: from 0 to the last (linspace), multiples of one number from 0 on
+    # (leading), or such a series that ends with the last one (trailing).
+    spacing: Literal["linspace", "leading", "trailing"] = "linspace"
+    # ᾱ after the last step is 1; False: that of the first step of the forward process. The public IRASim has False.
+    end_clean: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        least = 4 if self.sampler == "pndm" else 1
+        require(
+            self.steps >= least,
+            f"model.sample.steps is {self.steps}; the sampler {self.sampler} takes at least {least}",
+        )
+
+    def check(self, noise: NoiseConfig) -> None:
+        """Raises :class:`rsjax.config.ConfigError` if the forward process has fewer steps than the sampler visits."""
+        require(
+            self.steps <= noise.steps,
+            f"model.sample.steps is {self.steps} of model.noise.steps {noise.steps}; take at most as many",
+        )

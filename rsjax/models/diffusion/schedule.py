@@ -1,0 +1,45 @@
+"""The forward process: x_t = √ᾱ_t · x + √(1 - ᾱ_t) · noise, and what the network predicts of it.
+
+Axes: B clips; latents have any number of axes, the first over clips.
+"""
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int
+
+from rsjax.config import NoiseConfig
+
+Latents: TypeAlias = Float[Array, "*N"]
+
+
+def alphas(noise: NoiseConfig) -> Float64[np.ndarray, " steps"]:
+    """Returns ᾱ_t, the share of the signal's power that is left after step t, falling with t."""
+    if noise.betas == "linear":
+        betas = np.linspace(noise.beta_start, noise.beta_end, noise.steps)
+    else:
+        betas = np.linspace(noise.beta_start**0.5, noise.beta_end**0.5, noise.steps) ** 2
+    return np.cumprod(1.0 - betas)
+
+
+def scales(noise: NoiseConfig, t: Int[Array, " B"], axes: int) -> tuple[Latents, Latents]:
+    """Returns √ᾱ_t and √(1 - ᾱ_t) with ones for the axes after the first, ``axes`` in all."""
+    left = alphas(noise)
+    shape = (-1, *(1,) * (axes - 1))
+    signal, spread = (jnp.asarray(np.sqrt(x), jnp.float32)[t].reshape(shape) for x in (left, 1 - left))
+    return signal, spread
+
+
+def add_noise(noise: NoiseConfig, latents: Latents, drawn: Latents, t: Int[Array, " B"]) -> Latents:
+    """Returns x_t for drawn noise of unit variance."""
+    signal, spread = scales(noise, t, latents.ndim)
+    return signal * latents + spread * drawn
+
+
+def target(noise: NoiseConfig, latents: Latents, drawn: Latents, t: Int[Array, " B"]) -> Latents:
+    """Returns what the network is trained to predict: the noise, or the velocity √ᾱ·noise - √(1-ᾱ)·x."""
+    if noise.prediction == "noise":
+        return drawn
+    signal, spread = scales(noise, t, latents.ndim)
+    return signal * drawn - spread * latents

@@ -1,0 +1,160 @@
+"""IRASim's transformer: noisy latents of a clip and its actions to the noise.
+
+Axes: B clips, T frames (t: T, or 1 for all), h×w cells of latents with C channels, S tokens of a frame, D width, A
+action inputs.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from rsjax.config import DiTConfig
+from rsjax.models.diffusion.layers import TimeEmbedding, grid_positions, modulate, positions
+from rsjax.models.roboscape.attention import Dense, attend, attend_cells
+from rsjax.trainable import Params
+
+XAVIER = nn.initializers.xavier_uniform()
+ZEROS = nn.initializers.zeros
+Tokens = Float[Array, "B T S D"]
+Condition = Float[Array, "B t 1 D"]
+
+
+@dataclass(frozen=True)
+class Architecture(DiTConfig):
+    """All settings of the network.
+
+    Attributes:
+        frames: of a clip that the network processes at once.
+        rows, columns: cells of a frame's latents.
+        channels: of latents.
+        action_inputs: numbers of an action.
+    """
+
+    frames: int = 16
+    rows: int = 32
+    columns: int = 32
+    channels: int = 4
+    action_inputs: int = 7
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of a frame's tokens."""
+        return self.rows // self.patch_size, self.columns // self.patch_size
+
+
+class Block(nn.Module):
+    """Attention among tokens along one axis, then an MLP, each with adaptive LayerNorm and gate (adaLN-Zero)."""
+
+    config: Architecture
+    over_time: bool
+
+    @nn.compact
+    def __call__(self, x: Tokens, condition: Condition) -> Tokens:
+        cfg = self.config
+        dense = partial(Dense, bf16=cfg.compute_dtype == "bfloat16", kernel_init=XAVIER)
+        ada = nn.Dense(6 * cfg.width, kernel_init=ZEROS, name="ada")(nn.silu(condition))
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = jnp.split(ada, 6, axis=-1)
+        qkv = dense(3 * cfg.width, name="qkv")(modulate(x, shift_a, scale_a))
+        x = x + gate_a * dense(cfg.width, name="proj")(self._attend(qkv))
+        hidden = dense(cfg.mlp_ratio * cfg.width, name="fc1")(modulate(x, shift_m, scale_m))
+        return x + gate_m * dense(cfg.width, name="fc2")(nn.gelu(hidden, approximate=True))
+
+    def _attend(self, qkv: Float[Array, "B T S D3"]) -> Tokens:
+        cfg = self.config
+        q, k, v = (x.reshape(*x.shape[:-1], cfg.heads, -1) for x in jnp.split(qkv, 3, axis=-1))
+        if self.over_time:
+            out = attend(q.swapaxes(1, 2), k.swapaxes(1, 2), v.swapaxes(1, 2), None).swapaxes(1, 2)
+        else:
+            out = attend_cells(q, k, v, cfg.compute_dtype == "bfloat16")
+        return out.reshape(*out.shape[:-2], cfg.width)
+
+
+class Pair(nn.Module):
+    """A block within frames, then one over time; the signature is that of ``nn.scan``."""
+
+    config: Architecture
+
+    @nn.compact
+    def __call__(
+        self, x: Tokens, conditions: tuple[Condition, Condition], first: Bool[Array, ""]
+    ) -> tuple[Tokens, None]:
+        cfg = self.config
+        x = Block(cfg, over_time=False, name="spatial")(x, conditions[0])
+        x = x + jnp.where(first, positions(cfg.frames, cfg.width)[:, None], 0.0)
+        return Block(cfg, over_time=True, name="temporal")(x, conditions[1]), None
+
+
+class DiT(nn.Module):
+    """The network."""
+
+    config: Architecture
+
+    @nn.compact
+    def __call__(
+        self,
+        latents: Float[Array, "B T h w C"],
+        t: Int[Array, " B"],
+        actions: Float[Array, "B T A"],
+        drop: Bool[Array, " B"] | None = None,
+    ) -> Float[Array, "B T h w C"]:
+        """Returns the noise in latents at step ``t``.
+
+        Args:
+            latents: noisy, except for frames that are known.
+            t: step of the forward process.
+            actions: row t led into frame t; row 0 is not read.
+            drop: clips whose actions are replaced by the learned embedding.
+        """
+        cfg = self.config
+        if latents.shape[2:] != (cfg.rows, cfg.columns, cfg.channels) or latents.shape[1] > cfg.frames:
+            raise ValueError(
+                f"latents are {latents.shape[1:]}, not {(cfg.frames, cfg.rows, cfg.columns, cfg.channels)}"
+            )
+        patch = (cfg.patch_size, cfg.patch_size)
+        x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
+        x = x.reshape(*x.shape[:2], -1, cfg.width) + grid_positions(*cfg.grid, cfg.width)
+        time = TimeEmbedding(cfg.width, name="time")(t)[:, None, None]
+        acted = time + self._action(actions, drop)[:, :, None]
+        # In the public Frame-Ada model the last layer does not see the actions, an oversight that its weights carry.
+        plain = acted if cfg.conditioning == "video" else time
+        pair = nn.remat(Pair) if cfg.remat == "blocks" else Pair
+        scan = nn.scan(pair, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=(nn.broadcast, 0))
+        pairs = cfg.blocks // 2
+        x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
+        return self._unpatchify(self._final(x, plain))
+
+    def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
+        """Returns the actions' embedding: of each frame, or of all together."""
+        cfg = self.config
+        unknown = self.param("unknown_action", nn.initializers.normal(1.0), (1, cfg.width))  # torch's default
+        known = actions[:, 1:]
+        if cfg.conditioning == "video":
+            known = known.reshape(len(known), 1, -1)
+        x = nn.Dense(cfg.mlp_ratio * cfg.width, kernel_init=XAVIER, name="action_fc1")(known)
+        x = nn.gelu(x, approximate=True) if cfg.action_activation == "gelu" else x
+        x = nn.Dense(cfg.width, kernel_init=XAVIER, name="action_fc2")(x)
+        if cfg.conditioning == "frame":
+            x = jnp.concatenate([jnp.broadcast_to(unknown, (len(x), 1, cfg.width)), x], axis=1)
+        return x if drop is None else jnp.where(drop[:, None, None], unknown, x)
+
+    def _final(self, x: Tokens, condition: Condition) -> Float[Array, "B T S out"]:
+        cfg = self.config
+        ada = nn.Dense(2 * cfg.width, kernel_init=ZEROS, name="final_ada")(nn.silu(condition))
+        shift, scale = jnp.split(ada, 2, axis=-1)
+        return nn.Dense(cfg.patch_size**2 * cfg.channels, kernel_init=ZEROS, name="final")(modulate(x, shift, scale))
+
+    def _unpatchify(self, x: Float[Array, "B T S out"]) -> Float[Array, "B T h w C"]:
+        cfg = self.config
+        p, (rows, columns) = cfg.patch_size, cfg.grid
+        x = x.reshape(*x.shape[:2], rows, columns, p, p, cfg.channels).swapaxes(3, 4)
+        return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.channels)
+
+    def init_params(self, key: Key[Array, ""]) -> Params:
+        """Returns fresh parameters, with which the network predicts zeros."""
+        cfg = self.config
+        latents = jnp.zeros((1, cfg.frames, cfg.rows, cfg.columns, cfg.channels))
+        actions = jnp.zeros((1, cfg.frames, cfg.action_inputs))
+        return self.init(key, latents, jnp.zeros(1, jnp.int32), actions)["params"]

@@ -1,0 +1,92 @@
+"""IRASim's transformer against an independent implementation, and by what must and must not change its output."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.convert.irasim import from_public, to_public
+from rsjax.models.irasim.dit import Architecture, DiT
+from tests.models.irasim import public
+
+RNG = np.random.default_rng(1)
+BATCH = 3
+VARIANTS = {
+    "frame": public.Network(),
+    "video": public.Network(video=True),
+    "linear": public.Network(linear=True, actions=2),
+}
+
+
+def inputs(net: public.Network) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Latents (B, F, C, h, w), steps, actions (B, F - 1, A), dropped clips."""
+    rows, columns = (net.patch * size for size in net.grid)
+    latents = RNG.normal(size=(BATCH, net.frames, net.channels, rows, columns)).astype(np.float32)
+    actions = RNG.normal(size=(BATCH, net.frames - 1, net.actions)).astype(np.float32)
+    return latents, np.array([0, 17, 999]), actions, np.array([False, True, False])
+
+
+def rows_of(actions: np.ndarray) -> np.ndarray:
+    """Actions with row 0, which nobody reads."""
+    return np.concatenate([np.full_like(actions[:, :1], 1e3), actions], axis=1)
+
+
+@cache
+def model(variant: str) -> tuple[Architecture, Any]:
+    net = VARIANTS[variant]
+    config, params, aside = from_public("file", public.random_weights(net), heads=net.heads)
+    assert aside == 2
+    return config, params
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_output_is_the_public_networks(variant: str) -> None:
+    net = VARIANTS[variant]
+    latents, t, actions, drop = inputs(net)
+    expected = public.forward(net, public.random_weights(net), latents, t, actions, drop)
+    assert expected.std() > 0.3
+    config, params = model(variant)
+    made: Any = jax.jit(DiT(config).apply)(
+        {"params": params}, latents.transpose(0, 1, 3, 4, 2), t, rows_of(actions), drop
+    )
+    np.testing.assert_allclose(made, expected.transpose(0, 1, 3, 4, 2), atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_export_returns_the_public_file(variant: str) -> None:
+    tensors = public.random_weights(VARIANTS[variant])
+    exported = to_public(*model(variant))
+    assert exported.keys() == tensors.keys()
+    for name, x in tensors.items():
+        np.testing.assert_allclose(exported[name], x, atol=1e-7, err_msg=name)
+
+
+def test_bf16_rounds_and_remat_changes_nothing() -> None:
+    config, params = model("frame")
+    latents, t, actions, _ = inputs(VARIANTS["frame"])
+    args = (jnp.asarray(latents.transpose(0, 1, 3, 4, 2)), t, rows_of(actions))
+
+    def out(**changes: Any) -> Any:
+        return jax.jit(DiT(replace(config, **changes)).apply)({"params": params}, *args)
+
+    plain, rounded = out(), out(compute_dtype="bfloat16")
+    assert 0 < np.abs(rounded - plain).max() < 0.05 * np.abs(plain).max()
+    np.testing.assert_allclose(out(remat="blocks"), plain, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("width", "blocks", "heads", "total"),
+    [(384, 12, 6, 33_206_416), (768, 12, 12, 132_178_192), (1024, 24, 16, 461_372_432), (1152, 28, 16, 679_397_776)],
+)
+def test_counts_are_the_public_ones(width: int, blocks: int, heads: int, total: int) -> None:
+    config = Architecture(width=width, blocks=blocks, heads=heads, rows=32, columns=40)
+    shapes = jax.eval_shape(DiT(config).init_params, jax.random.key(0))
+    trained, fixed = sum(x.size for x in jax.tree.leaves(shapes)), (16 * 20 + 16) * width
+    net = public.Network(width, blocks, heads, frames=16, grid=(16, 20))
+    assert sum(map(math.prod, public.shapes(net).values())) == total
+    assert trained + fixed == total
