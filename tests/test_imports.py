@@ -15,6 +15,7 @@ ORDER = [
     "command",
     "config",
     "clip",
+    "devices",
     "data",
     "export",
     "sim",

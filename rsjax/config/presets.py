@@ -175,6 +175,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             checkpoint_every=1000,
             eval_every=5000,
         ),
+        eval=EvalConfig(clips=1200, repetitions=5),  # the authors' numbers
     )
 
 

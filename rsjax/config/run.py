@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rsjax.config.data import ClipShape, DataConfig
-from rsjax.config.fields import check_numbers, require, require_range
+from rsjax.config.fields import added, check_numbers, require, require_range
 from rsjax.config.model import ModelConfig, RoboScapeConfig, converted
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
@@ -17,6 +17,7 @@ class EvalConfig:
     """Settings of the evaluation on the test split."""
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
+    repetitions: int = added(1)  # with other random draws
     loss_clips: int = 1000  # clips of the validation loss during training, likewise
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
@@ -29,7 +30,16 @@ class EvalConfig:
 
     def __post_init__(self) -> None:
         require_range(
-            self, "eval", 1, math.inf, "loss_clips", "batch_size", "action_draws", "report_clips", "localiser_steps"
+            self,
+            "eval",
+            1,
+            math.inf,
+            "repetitions",
+            "loss_clips",
+            "batch_size",
+            "action_draws",
+            "report_clips",
+            "localiser_steps",
         )
 
 

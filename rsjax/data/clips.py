@@ -4,7 +4,7 @@ Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,11 @@ class Clips:
             task=tuple(record["task"] for record in records),
             **fields,
         )
+
+    def first(self, frames: int) -> "Clips":
+        """Returns the clips cut to their first frames."""
+        whole = {name: getattr(self, name)[:, :frames] for name in ("rgb", "depth", "actions", "success")}
+        return replace(self, tracks=self.tracks[:, :, :frames], visible=self.visible[:, :, :frames], **whole)
 
     @property
     def video(self) -> Video:

@@ -1,38 +1,39 @@
-"""Evaluates a world model: generates from first frames of the test split and scores all registered metrics.
+"""Evaluates a world model: generates from first frames of held-out clips and scores all registered metrics.
 
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from rsjax.clip import Video
 from rsjax.config import EvalConfig
+from rsjax.config.data import ClipShape
 from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import Store, StoreError
-from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
+from rsjax.devices import replicate
+from rsjax.evaluation.depth_estimator import choose_estimator
 from rsjax.evaluation.frame_curves import Curves, frame_curves
-from rsjax.evaluation.localiser import recorded_places, train_localiser
+from rsjax.evaluation.generation import OWN, Generation, teacher_forced
 from rsjax.evaluation.metrics import delta_psnr
-from rsjax.evaluation.registry import Located, Metric, PerClip, Places, Scene, Unavailable, metrics
+from rsjax.evaluation.protocols import Protocol, check, of_run
+from rsjax.evaluation.registry import Scene
+from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
+from rsjax.evaluation.scoring import Scored, mean_curves, mean_scores, sample_scores, score_all, summarised, with_best
 from rsjax.evaluation.shown import shown_arrays
-from rsjax.evaluation.statistics import bootstrap
 from rsjax.files import write_atomically
-from rsjax.ingest.annotators.protocols import DepthEstimator
-from rsjax.models.base import TeacherForced
+from rsjax.models.base import Assets
 from rsjax.models.trained import TrainedModel
-from rsjax.progress import Progress
 from rsjax.tokenizers.lpips import load_lpips
 
-LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
+KEPT_CLIPS = 24  # whose frames are kept for comparisons, spread evenly over the scored ones
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,13 @@ class Evaluation:
         metrics: scores by name.
         reasons: why a registered metric has no score, by name.
         shown: arrays of the clips in the report, with a leading axis over clips.
-        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the test split.
+        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the split; with several
+            repetitions, their means.
         curves: means over the clips at each predicted frame, as in curves.json.
+        repetitions: the scores of each repetition.
+        clips: the scored clips: ``number`` in the split, ``episode`` if known, ``sha256`` of frames and actions.
+        kept: frames of some of the clips: ``rows`` among the scored ones, ``truth``, ``prediction``, and
+            ``reconstruction`` by the tokenizer if the model has one, each (n, T, H, W, 3).
     """
 
     metrics: dict[str, float]
@@ -52,6 +58,9 @@ class Evaluation:
     shown: dict[str, np.ndarray]
     per_clip: dict[str, list[float]] = field(default_factory=dict)
     curves: Curves = field(default_factory=dict)
+    repetitions: list[dict[str, float]] = field(default_factory=list)
+    clips: list[dict[str, Any]] = field(default_factory=list)
+    kept: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def check_files(settings: EvalConfig) -> None:
@@ -66,193 +75,157 @@ def check_files(settings: EvalConfig) -> None:
     choose_estimator(settings)
 
 
-def evaluate(trained: TrainedModel, store: Store) -> Evaluation:
-    """Scores a model on the test split, and two baselines: repeating the last prompt frame, and reconstruction.
+@dataclass(frozen=True)
+class HeldOut:
+    """The clips of one split that a protocol scores.
+
+    Attributes:
+        protocol: with its horizon and resolution as numbers.
+        records: of the scored clips, whole.
+        clips: the same, cut to the protocol's frames.
+    """
+
+    store: Store
+    split: str
+    protocol: Protocol
+    records: Sequence[Record]
+    clips: Clips
+
+    @classmethod
+    def read(cls, store: Store, split: str, protocol: Protocol, shape: ClipShape) -> "HeldOut":
+        """Reads the clips.
+
+        Args:
+            shape: of the clips that the model learned from.
+
+        Raises:
+            StoreError: there is no such split, it has fewer than two clips, or one is damaged.
+            UserError: the clips are shorter than the protocol, or of another size.
+        """
+        source, where = store.source(split), f"the {split} split of {store.path}"
+        numbers = spread(source, protocol.clips)
+        if len(numbers) < 2:
+            raise StoreError(f"{where} has {len(numbers)} clips; an evaluation takes two at least: name another split")
+        records = [source[number] for number in numbers]
+        frames, size = records[0]["rgb"].shape[:2]
+        actions = records[0]["actions"].shape[1]
+        if (size, actions) != (shape.image_size, shape.action_dim):
+            raise StoreError(
+                f"{where} has frames of {size} pixels per side and {actions} numbers an action; the model takes "
+                f"{shape.image_size} and {shape.action_dim}: name clips that were made alike"
+            )
+        protocol = check(protocol, frames, size, where)
+        clips = Clips.stacked(records, numbers).first(protocol.prompt_frames + protocol.horizon)
+        return cls(store, split, protocol, records, clips)
+
+    def ids(self) -> list[dict[str, Any]]:
+        """Returns what identifies each clip: its number in the split, its episode, and a hash of its whole content."""
+        return [
+            {"number": int(number), "episode": record["provenance"].get("episode"), "sha256": _hash(record)}
+            for number, record in zip(self.clips.index, self.records, strict=True)
+        ]
+
+
+def _hash(record: Record) -> str:
+    return hashlib.sha256(record["rgb"].tobytes() + record["actions"].tobytes()).hexdigest()[:16]
+
+
+def evaluate(
+    trained: TrainedModel,
+    store: Store,
+    protocol: Protocol | None = None,
+    held_out: HeldOut | None = None,
+    folder: Path | None = None,
+) -> Evaluation:
+    """Scores a model on held-out clips, and two baselines: repeating the last prompt frame, and reconstruction.
 
     Args:
-        store: the clips of the run; the test split is scored, the train split determines the range of
-            uniform random actions.
+        store: the clips of the run; the train split determines the range of uniform random actions.
+        protocol: how; None: by the run's own configuration.
+        held_out: the clips to score; None: of the store's test split.
+        folder: where generated batches are kept until the evaluation is finished; None: in memory.
 
     Raises:
         StoreError: a test clip is damaged.
         UserError: a file of weights is missing, damaged or of another network, or the depth estimator cannot run.
     """
-    source, config = store.source("test"), trained.config
-    check_files(config.eval)
-    estimator = choose_estimator(config.eval, load=True)
-    numbers = spread(source, config.eval.clips)
-    records = [source[number] for number in numbers]
-    clips = Clips.stacked(records, numbers)
-    videos = _generate_all(trained, clips, store)
-    scenes = _scenes(trained, clips, videos, estimator, _locate(trained, store, records))
-
-    scores: dict[str, float] = {}
-    reasons: dict[str, str] = {}
-    per_clip: dict[str, PerClip] = {}
-    for metric in metrics().values():
-        try:
-            scored = _score(metric, scenes)
-        except Unavailable as reason:
-            reasons[metric.name] = str(reason)
-        else:
-            scores |= _summarised(metric, scored)
-            per_clip |= {name: values for name, values in scored.items() if values.ndim}
+    settings = trained.config.eval
+    check_files(settings)
+    estimator = choose_estimator(settings, load=True)
+    if held_out is None:
+        wanted = protocol or of_run(trained.config)
+        held_out = HeldOut.read(store, "test", wanted, trained.config.clips)
+    generation = plan(trained, store, held_out, folder)
+    generation.make()
+    trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
+    locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
+    taught = teacher_forced(trained, protocol, clips)
+    repetitions: list[tuple[Scored, Curves]] = []
+    first: dict[str, Scene] = {}
+    for run in range(protocol.repetitions):
+        scenes = make_scenes(trained, protocol, clips, generation.videos(run), estimator, locate, taught)
+        scored = with_best(score_all(scenes, protocol), scenes[""], generation.samples(run), protocol)
+        repetitions.append((scored, frame_curves(scenes)))
+        first = first or scenes
+    scored = mean_scores([scored for scored, _ in repetitions])
+    scores = summarised(scored)
     scores["clips"] = float(len(clips.rgb))
-    if (share := store.manifest.get("success_share")) is not None:
+    if (share := held_out.store.manifest.get("success_share")) is not None:
         scores["success_share"] = float(share)
-    shown = shown_arrays(clips, scenes, per_clip["psnr"], config.eval.report_clips)
-    rows = {name: values.tolist() for name, values in per_clip.items()}
-    return Evaluation(scores, reasons, shown, rows, frame_curves(scenes))
+    return Evaluation(
+        scores,
+        scored.reasons,
+        shown_arrays(clips, first, scored.per_clip()["psnr"], settings.report_clips),
+        {name: values.tolist() for name, values in scored.per_clip().items()},
+        mean_curves([curves for _, curves in repetitions]),
+        [summarised(each, interval=False) for each, _ in repetitions],
+        held_out.ids(),
+        _kept(first),
+    )
 
 
-def _generate_all(trained: TrainedModel, clips: Clips, store: Store) -> dict[str, list[Video]]:
-    """Generates videos under the clips' own actions and under every draw of others, by kind."""
-    draws = _draws(trained, clips.actions, store)
-    total = sum(map(len, draws.values())) * len(clips.rgb)
-    videos: dict[str, list[Video]] = {}
-    with Progress("evaluation", total, "rollouts") as progress:
-        done = 0
-        for kind, sequences in draws.items():
-            for actions in sequences:
-                videos.setdefault(kind, []).append(_generate(trained, clips, actions, depth=kind == "own"))
-                progress.update(done := done + len(clips.rgb))
-    return videos
+def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | None = None) -> Generation:
+    """Returns all that an evaluation generates; with several processes, each makes its share of it."""
+    trained = replace(trained, params=replicate(trained.params), assets=_assets(trained.assets))
+    clips, protocol = held_out.clips, held_out.protocol
+    truth = scored_frames(trained, protocol, clips) if protocol.samples > 1 else clips.video
+    return Generation(
+        trained,
+        protocol,
+        clips,
+        _draws(clips.actions, protocol.action_draws, store),
+        len(held_out.store.source(held_out.split)),
+        lambda rows, video: sample_scores(truth[rows], video, protocol, trained.config.eval),
+        folder,
+    )
 
 
-def _draws(trained: TrainedModel, actions: Float[np.ndarray, "B T A"], store: Store) -> dict[str, np.ndarray]:
+def _assets(assets: Assets) -> Assets:
+    return assets if assets.tokenizer is None else replace(assets, tokenizer=replicate(assets.tokenizer))
+
+
+def _draws(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dict[str, np.ndarray]:
     """Returns the actions to generate under by kind, each (R, B, T, A)."""
-    draws, train = trained.config.eval.action_draws, store.source("train")
+    if not draws:
+        return {OWN: actions[None]}
+    train = store.source("train")
     low, high = delta_psnr.action_range(
         np.stack([clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))])
     )
     return {
-        "own": actions[None],
+        OWN: actions[None],
         "other": actions[delta_psnr.other_clips(len(actions), draws, seed=0)],
         "uniform": delta_psnr.uniform_actions(actions, low, high, draws, seed=0),
     }
 
 
-def _generate(trained: TrainedModel, clips: Clips, actions: np.ndarray, depth: bool) -> Video:
-    """Generates the videos of all clips in batches of one shape, so that one program is compiled."""
-    size, prompt = trained.config.eval.batch_size, clips.video.frames(0, trained.config.prompt_frames)
-    parts = []
-    for rows in _batches(len(actions), size):
-        inputs = (trained.params, trained.assets, prompt[rows], actions[rows])
-        parts.append(trained.model.generate(*inputs, index=clips.index[rows], depth=depth))
-    rgb = np.concatenate([part.rgb for part in parts])[: len(actions)]
-    if all(part.depth is None for part in parts):
-        return Video(rgb)
-    unknown = [np.full(part.rgb.shape[:-1], np.nan, np.float32) if part.depth is None else part.depth for part in parts]
-    return Video(rgb, np.concatenate(unknown)[: len(actions)])
-
-
-def _teacher_forced(trained: TrainedModel, clips: Clips) -> TeacherForced | None:
-    """Predicts every frame of all clips from the true frames before it; None if the model cannot."""
-    parts = []
-    for rows in _batches(len(clips.rgb), trained.config.eval.batch_size):
-        inputs = (trained.params, trained.assets, clips.video[rows], clips.actions[rows])
-        parts.append(trained.model.teacher_forced(*inputs, trained.config.prompt_frames))
-    if any(part is None for part in parts):
-        return None
-
-    def joined(name: str) -> dict[str, np.ndarray]:
-        fields = [getattr(part, name) for part in parts]
-        return {branch: np.concatenate([field[branch] for field in fields])[: len(clips.rgb)] for branch in fields[0]}
-
-    return TeacherForced(joined("cross_entropy"), joined("accuracy"))
-
-
-def _batches(clips: int, size: int) -> Iterator[Int[np.ndarray, " size"]]:
-    """Yields the numbers of all clips in batches of one size, the last filled up, so that one program is compiled."""
-    for start in range(0, clips, size):
-        yield np.minimum(np.arange(start, start + size), clips - 1)
-
-
-def _locate(trained: TrainedModel, store: Store, records: Sequence[Record]) -> Callable[[Video, bool], Located] | None:
-    """Trains a localiser and returns a function that compares its reading of a video's last frames with the truth.
-
-    None if the clips do not record where things are.
-    """
-    recorded, train = recorded_places(records), store.source("train")
-    if recorded is None:
-        return None
-    places, width = recorded
-    last = Places(places.xy[:, -1], places.lifted[:, -1])
-    clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))]
-    localiser = train_localiser(clips, trained.config.eval.localiser_steps)
-    on_truth = localiser(np.stack([record["rgb"][-1] for record in records]))
-    return lambda video, own: Located(last, width, on_truth if own else None, localiser(video.rgb[:, -1]))
-
-
-def _scenes(
-    trained: TrainedModel,
-    clips: Clips,
-    videos: dict[str, list[Video]],
-    estimator: DepthEstimator | None,
-    locate: Callable[[Video, bool], Located] | None,
-) -> dict[str, Scene]:
-    """Returns the prediction's scene as "", and those of both baselines by their suffix of names."""
-    settings, prompt, truth = trained.config.eval, trained.config.prompt_frames, clips.metric_video
-    alternatives = dict(videos)
-    shown = {"": alternatives.pop("own")[0], "_repeat_first": _repeat_first(truth, prompt)}
-    if (reconstruction := trained.model.reconstruct(trained.assets, clips.video)) is not None:
-        shown["_tokenizer"] = reconstruction
-    rgb = {suffix: video.rgb for suffix, video in shown.items()}
-    estimated = estimate_depth(estimator, truth.rgb, rgb) if estimator else {}
-    teacher_forced = _teacher_forced(trained, clips)
-    truth_cache: dict[Any, Any] = {}
-    return {
-        suffix: Scene(
-            truth,
-            video,
-            prompt,
-            {} if suffix else alternatives,
-            estimated.get(suffix),
-            locate(video, not suffix) if locate else None,
-            None if suffix else teacher_forced,
-            settings=settings,
-            truth_cache=truth_cache,
-        )
-        for suffix, video in shown.items()
-    }
-
-
-def _score(metric: Metric, scenes: dict[str, Scene]) -> dict[str, PerClip]:
-    """Scores the clips of the prediction and of both baselines with a metric, by name.
-
-    Raises:
-        Unavailable: the prediction cannot be scored. A baseline that cannot is left out.
-    """
-    scores = _named(metric, scenes[""], "")
-    for suffix in filter(None, scenes if not metric.needs else ()):
-        with suppress(Unavailable):
-            scores |= _named(metric, scenes[suffix], suffix)
-    return scores
-
-
-def _named(metric: Metric, scene: Scene, suffix: str) -> dict[str, PerClip]:
-    assert metric.function is not None
-    scored = metric.function(scene)
-    parts = scored if isinstance(scored, dict) else {"": scored}
-    return {f"{metric.name}{suffix}{part}": np.asarray(per_clip) for part, per_clip in parts.items()}
-
-
-def _summarised(metric: Metric, per_clip: dict[str, PerClip]) -> dict[str, float]:
-    """Returns the mean or median over clips of each score, and its interval."""
-    flat: dict[str, float] = {}
-    for name, values in per_clip.items():
-        if not values.ndim:  # one number for all clips
-            flat[name] = float(values)
-            continue
-        estimate = bootstrap(values, statistic=metric.statistic)
-        flat |= estimate.flat(name) if metric.interval else {name: estimate.value}
-    return flat | ({f"{metric.name}_repeat_first": 0.0} if metric.needs else {})  # this baseline ignores actions
-
-
-def _repeat_first(video: Video, prompt_frames: int) -> Video:
-    """Returns the last prompt frame repeated for the whole video: the baseline without motion."""
-    last, frames = video.frames(prompt_frames - 1, prompt_frames), video.rgb.shape[1]
-    return Video(np.repeat(last.rgb, frames, 1), None if last.depth is None else np.repeat(last.depth, frames, 1))
+def _kept(scenes: dict[str, Scene]) -> dict[str, np.ndarray]:
+    truth = scenes[""].truth.rgb
+    rows = np.array(spread(truth, KEPT_CLIPS))
+    arrays = {"rows": rows, "truth": truth[rows], "prediction": scenes[""].prediction.rgb[rows]}
+    if "_tokenizer" in scenes:
+        arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
+    return arrays
 
 
 def save(path: Path, result: Evaluation) -> None:

@@ -29,8 +29,8 @@ def _scored(metric: Metric, scenes: Mapping[str, Scene]) -> Iterator[tuple[str, 
     if metric.per_frame is None:
         return
     for suffix, scene in scenes.items():
-        if suffix and metric.needs:
-            continue  # baselines have no videos under other actions
+        if not scene.alternatives.keys() >= set(metric.needs):
+            continue  # as of baselines, which have no videos under other actions
         with suppress(Unavailable):
             yield suffix, metric.per_frame(scene)
 

@@ -35,7 +35,7 @@ def choose_clips(
 
 def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count: int) -> dict[str, np.ndarray]:
     """Returns arrays of the clips in the report, in the order of :func:`choose_clips`."""
-    ends, own, other = clips.success[:, -1], scenes[""].prediction, scenes[""].alternatives["other"][0]
+    ends, own, others = clips.success[:, -1], scenes[""].prediction, scenes[""].alternatives.get("other")
     rows, ranks = choose_clips(psnr, ends, count)
     arrays: dict[str, Any] = {
         "clip": clips.index[rows],
@@ -44,7 +44,6 @@ def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count
         "rank": ranks,
         "truth": clips.rgb[rows],
         "prediction": own.rgb[rows],
-        "other_actions": other.rgb[rows],
         "has_depth": clips.has_depth[rows],
         "metric": clips.metric[rows],
         "true_depth": clips.depth[rows],
@@ -52,6 +51,8 @@ def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count
         "visible": clips.visible[rows],
         "success": ends[rows],
     }
+    if others:
+        arrays["other_actions"] = others[0].rgb[rows]
     if "_tokenizer" in scenes:
         arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
     return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})

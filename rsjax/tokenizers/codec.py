@@ -13,6 +13,7 @@ from rsjax.clip import Video
 from rsjax.config import TokenizerConfig
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
+from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -93,7 +94,8 @@ class Codec:
         for start in range(0, len(flat), size):
             chunk = flat[start : start + size]
             padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
-            out.append(np.asarray(_apply(self.config, method, self.params, padded))[: len(chunk)])
+            made = _apply(self.config, method, self.params, divide(padded, self.params))
+            out.append(np.asarray(made)[: len(chunk)])
         joined = np.concatenate(out)
         return joined.reshape(*lead, *joined.shape[1:])
 

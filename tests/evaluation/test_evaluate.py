@@ -6,11 +6,15 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import EvalConfig, SampleConfig
-from rsjax.data.codec import encode
+from rsjax.data.codec import Record, encode
 from rsjax.data.store import Store, StoreError
+from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.evaluate import Evaluation, evaluate
+from rsjax.evaluation.evaluate import Evaluation, HeldOut, evaluate
+from rsjax.evaluation.generation import Batch, Generation
 from rsjax.evaluation.metrics.delta_psnr import other_clips
+from rsjax.evaluation.metrics.psnr import psnr as pixels
+from rsjax.evaluation.protocols import find, of_run
 from rsjax.evaluation.registry import metrics
 from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
@@ -153,3 +157,68 @@ def test_a_result_without_curves_is_read(tmp_path: Path) -> None:
     old = evaluation.load(tmp_path / "old")
     assert (old.metrics, old.per_clip, old.curves) == ({"psnr": 20.0}, {}, {})
     assert old.shown.keys() == {"clip"}
+
+
+def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
+    clips: Store, trained: TrainedModel, result: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held_out = HeldOut.read(clips, "test", of_run(trained.config), trained.config.clips)
+    for process in range(2):  # two processes share the work; the second is killed over its last file
+        evaluation.plan(trained, clips, held_out, tmp_path).make(process, 2)
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 5 * 3  # own, 2 × other, 2 × uniform actions; 5 clips by 2
+    files[4].write_bytes(files[4].read_bytes()[:-1])
+    made, generate = [], Generation._generate
+
+    def counted(self: Generation, batch: Batch) -> Record:
+        made.append(batch)
+        return generate(self, batch)
+
+    monkeypatch.setattr(Generation, "_generate", counted)
+    again = evaluate(trained, clips, folder=tmp_path)
+    assert [batch.name for batch in made] == [files[4].name]
+    assert (again.metrics, again.per_clip) == (result.metrics, result.per_clip)
+    assert [clip["number"] for clip in again.clips] == list(range(toy.TEST))
+    assert len({clip["sha256"] for clip in again.clips}) == toy.TEST
+
+
+def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: Path) -> None:
+    config = toy.with_model(toy.config(), sample=SampleConfig(temperature=1.0))
+    trained = toy.trained(clips, config)
+    protocol = replace(of_run(config), repetitions=2, action_draws=0, samples=2)
+    found = evaluate(trained, clips, protocol, folder=tmp_path)
+    first, second = (each["psnr"] for each in found.repetitions)
+    assert first != second
+    assert found.metrics["psnr"] == found.metrics["psnr_n1_pred_only"] == pytest.approx((first + second) / 2)
+    assert "generates no videos under other actions" in found.reasons["delta_psnr"]
+    held_out = HeldOut.read(clips, "test", protocol, config.clips)
+    generation = evaluation.plan(trained, clips, held_out, tmp_path)  # reads what was generated
+    best = []
+    for run in range(2):
+        own = np.asarray(pixels(TRUTH["rgb"], generation.videos(run)["own"][0].rgb)).mean(1)  # the prompt included
+        best.append(np.maximum(own, generation.samples(run)[0]["psnr"]))
+        assert (best[-1] != own).any()
+    np.testing.assert_allclose(found.per_clip["psnr_best2_incl_ctx"], np.mean(best, axis=0), rtol=1e-5)
+
+
+def test_a_teacher_forced_frame_follows_true_frames(clips: Store, trained: TrainedModel) -> None:
+    protocol = replace(of_run(trained.config), clips=2, teacher_forced=True, horizon=2, action_draws=0)
+    held_out = HeldOut.read(clips, "test", protocol, trained.config.clips)
+    made = evaluation.plan(trained, clips, held_out).videos(0)["own"][0]
+    rows, prompt = held_out.clips.index, trained.config.prompt_frames
+    whole = TRUTH["rgb"][rows], TRUTH["actions"][rows], TRUTH["depth"][rows]
+    later = trained.generate(whole[0][:, : prompt + 1], whole[1][:, : prompt + 2], whole[2][:, : prompt + 1])
+    np.testing.assert_array_equal(made.rgb[:, -1], later.rgb[:, -1])
+    assert made.rgb.shape[1] == prompt + 2
+
+
+def test_clips_that_are_too_short_or_small_are_refused(clips: Store, trained: TrainedModel) -> None:
+    shape, long = trained.config.clips, find("horizon48", trained.config)
+    with pytest.raises(UserError, match=f"predicts 48 frames after 1, so it takes clips of 49 .* have {shape.frames}"):
+        HeldOut.read(clips, "test", long, shape)
+    with pytest.raises(UserError, match=f"scores frames of 99 pixels per side; .* have {shape.image_size}"):
+        HeldOut.read(clips, "test", replace(find("ivideogpt-bair", trained.config), horizon=1, resolution=99), shape)
+    with pytest.raises(UserError, match="unknown protocol 'papr'; did you mean 'paper'"):
+        find("papr", trained.config)
+    with pytest.raises(StoreError, match="no split 'unseen'; it has train, test"):
+        HeldOut.read(clips, "unseen", of_run(trained.config), shape)

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Float32, Int
 
 from rsjax.clip import Video
 from rsjax.config import TokenModelConfig
+from rsjax.devices import divide
 from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import Tokens, encode_prompt, rollout, rollout_from
@@ -27,8 +28,9 @@ def generate(
 ) -> Video:
     """Implements :meth:`rsjax.models.base.WorldModel.generate`. T may exceed the trained positions."""
     tokens, has_depth = _prompt(arch, codec, prompt)
-    sample, inputs = config.sample, _inputs(config, codec, actions)
-    key, no_depth = jax.random.key(sample.seed), ~has_depth
+    tokens, inputs = divide((tokens, _inputs(config, codec, actions)), params)
+    sample, no_depth = config.sample, ~has_depth
+    key = jax.random.key(sample.seed)
     made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=no_depth)
     return codec.decode(made, has_depth & depth)
 

@@ -1,0 +1,36 @@
+"""Computes one batch on all of this process's devices: parameters on each, the batch's rows divided among them."""
+
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+Tree = TypeVar("Tree")  # a tree of arrays
+
+_ROWS = "rows"
+
+
+def replicate(params: Tree) -> Tree:
+    """Puts parameters on every device of this process; with one device, returns them as they are."""
+    devices = jax.local_devices()
+    if len(devices) == 1:
+        return params
+    mesh = Mesh(np.array(devices), (_ROWS,), axis_types=(AxisType.Auto,))
+    return jax.device_put(params, NamedSharding(mesh, P()))
+
+
+def divide(batch: Tree, params: Any) -> Tree:
+    """Puts a batch where its parameters are: rows divided among their devices if they can be, else all rows on each.
+
+    Without :func:`replicate` before, the batch is returned as it is.
+    """
+    place = getattr(next(iter(jax.tree.leaves(params)), None), "sharding", None)
+    if not isinstance(place, NamedSharding) or place.mesh.axis_names != (_ROWS,):
+        return batch
+
+    def put(x: Any) -> Any:
+        return jax.device_put(x, NamedSharding(place.mesh, P() if np.shape(x)[0] % place.mesh.size else P(_ROWS)))
+
+    return jax.tree.map(put, batch)

@@ -1,0 +1,200 @@
+"""Generates the videos of an evaluation in batches, on all devices, and keeps each batch, so that it can go on later.
+
+Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of actions.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from rsjax.clip import Video
+from rsjax.data.clips import Clips
+from rsjax.data.codec import Record, decode, encode
+from rsjax.evaluation.protocols import Protocol
+from rsjax.files import write_file
+from rsjax.models.base import TeacherForced
+from rsjax.models.trained import TrainedModel
+from rsjax.progress import Progress
+
+OWN = "own"  # the kind of videos under the clips' own actions
+SAMPLE = "sample"  # the kind of further samples under them, of which only scores are kept
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some clips under one draw of actions.
+
+    Attributes:
+        kind: of the actions, :data:`OWN`, "other" or "uniform"; or :data:`SAMPLE`.
+        draw: which of the draws of actions, or which sample.
+        start: the first clip's row.
+    """
+
+    run: int
+    kind: str
+    draw: int
+    start: int
+
+    @property
+    def name(self) -> str:
+        """Its file's."""
+        return f"{self.run:03d}-{self.kind}-{self.draw:03d}-{self.start:06d}.msgpack"
+
+
+@dataclass(frozen=True)
+class Generation:
+    """All that one evaluation generates.
+
+    Attributes:
+        trained: its parameters are on all devices that take part (:func:`rsjax.devices.replicate`).
+        protocol: with its horizon as a number.
+        clips: cut to the protocol's frames.
+        draws: the actions to generate under by kind, each (R, B, T, A).
+        split_size: clips of the whole split, which keeps the random draws of repetitions apart.
+        score: returns the scores of a sample's videos of these rows by name, each (rows,); of which the best count.
+        folder: where batches are kept; None: in memory.
+    """
+
+    trained: TrainedModel
+    protocol: Protocol
+    clips: Clips
+    draws: Mapping[str, Float[np.ndarray, "R B T A"]]
+    split_size: int
+    score: Callable[[Int[np.ndarray, " n"], Video], Record]
+    folder: Path | None = None
+
+    def make(self, index: int = 0, count: int = 1) -> None:
+        """Generates the batches that are not there yet, or process ``index``'s share of them among ``count``."""
+        batches = list(self._batches())[index::count]
+        clips = [min(self._size, len(self.clips.rgb) - batch.start) for batch in batches]
+        with Progress("evaluation", sum(clips), "rollouts") as progress:
+            done = 0
+            for batch, number in zip(batches, clips, strict=True):
+                if self._read(batch) is None:
+                    self._keep(batch, self._generate(batch))
+                progress.update(done := done + number)
+
+    def videos(self, run: int) -> dict[str, list[Video]]:
+        """Returns one repetition's videos of all clips by kind, one for each draw."""
+        return {
+            kind: [
+                _joined([self._video(batch) for batch in self._row(run, kind, draw)]) for draw in range(len(actions))
+            ]
+            for kind, actions in self.draws.items()
+        }
+
+    def samples(self, run: int) -> list[dict[str, np.ndarray]]:
+        """Returns the scores of each further sample of one repetition by name, in the order of the clips."""
+        out = []
+        for sample in range(1, self.protocol.samples):
+            records = [self._record(batch) for batch in self._row(run, SAMPLE, sample)]
+            out.append({name: np.concatenate([record[name] for record in records]) for name in records[0]})
+        return out
+
+    def _batches(self) -> Iterator[Batch]:
+        for run in range(self.protocol.repetitions):
+            for kind, actions in self.draws.items():
+                for draw in range(len(actions)):
+                    yield from self._row(run, kind, draw)
+            for sample in range(1, self.protocol.samples):
+                yield from self._row(run, SAMPLE, sample)
+
+    def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
+        yield from (Batch(run, kind, draw, start) for start in range(0, len(self.clips.rgb), self._size))
+
+    @cached_property
+    def _size(self) -> int:
+        """Clips of a batch: the run's, rounded up so that the devices share them evenly."""
+        devices = jax.local_device_count()
+        return -(-self.trained.config.eval.batch_size // devices) * devices
+
+    @cached_property
+    def _truth(self) -> Video:
+        return self.clips.video
+
+    @cached_property
+    def _memory(self) -> dict[Batch, Record]:
+        return {}
+
+    def _record(self, batch: Batch) -> Record:
+        record = self._read(batch)
+        if record is None:  # a file that was damaged or deleted meanwhile
+            record = self._generate(batch)
+            self._keep(batch, record)
+        return record
+
+    def _video(self, batch: Batch) -> Video:
+        record = self._record(batch)
+        return Video(record["rgb"], record["depth"])
+
+    def _read(self, batch: Batch) -> Record | None:
+        if self.folder is None:
+            return self._memory.get(batch)
+        try:
+            return decode((self.folder / batch.name).read_bytes())
+        except (OSError, ValueError):
+            return None
+
+    def _keep(self, batch: Batch, record: Record) -> None:
+        if self.folder is None:
+            self._memory[batch] = record
+        else:
+            write_file(self.folder / batch.name, encode(record))
+
+    def _generate(self, batch: Batch) -> Record:
+        """Generates a batch; the last one is filled up, so that one program is compiled."""
+        clips, sampled = len(self.clips.rgb), batch.kind == SAMPLE
+        rows = np.arange(batch.start, min(batch.start + self._size, clips))
+        padded = np.minimum(np.arange(batch.start, batch.start + self._size), clips - 1)
+        actions = self.draws[OWN][0] if sampled else self.draws[batch.kind][batch.draw]
+        repetition = batch.run * self.protocol.samples + (batch.draw if sampled else 0)
+        index = self.clips.index[padded] + repetition * self.split_size
+        with_depth = batch.kind == OWN
+        generate = partial(
+            self.trained.model.generate, self.trained.params, self.trained.assets, index=index, depth=with_depth
+        )
+        video = _rolled_out(generate, self.protocol, self._truth[padded], actions[padded])[: len(rows)]
+        return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth}
+
+
+def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
+    """Predicts every frame's tokens of all clips from the true frames before it; None if the model cannot."""
+    size, count, video, parts = trained.config.eval.batch_size, len(clips.rgb), clips.video, list[TeacherForced]()
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)
+        inputs = (trained.params, trained.assets, video[rows], clips.actions[rows])
+        part = trained.model.teacher_forced(*inputs, protocol.prompt_frames)
+        if part is None:
+            return None
+        parts.append(part)
+
+    def joined(name: str) -> dict[str, np.ndarray]:
+        fields = [getattr(part, name) for part in parts]
+        return {branch: np.concatenate([field[branch] for field in fields])[:count] for branch in fields[0]}
+
+    return TeacherForced(joined("cross_entropy"), joined("accuracy"))
+
+
+def _rolled_out(
+    generate: Callable[..., Video], protocol: Protocol, truth: Video, actions: Float[np.ndarray, "B T A"]
+) -> Video:
+    """Returns the generated videos, whose frames follow the generated ones before them, or the recorded ones."""
+    prompt, frames = protocol.prompt_frames, actions.shape[1]
+    if not protocol.teacher_forced:
+        return generate(truth.frames(0, prompt), actions)
+    steps = [generate(truth.frames(0, past), actions[:, : past + 1]) for past in range(prompt, frames)]
+    return _joined([steps[0], *(step.frames(-1) for step in steps[1:])], axis=1)
+
+
+def _joined(parts: list[Video], axis: int = 0) -> Video:
+    """Joins videos of several batches, or the frames of one; NaN where a part has no depth but another has."""
+    rgb = np.concatenate([part.rgb for part in parts], axis)
+    if all(part.depth is None for part in parts):
+        return Video(rgb)
+    unknown = [np.full(part.rgb.shape[:-1], np.nan, np.float32) if part.depth is None else part.depth for part in parts]
+    return Video(rgb, np.concatenate(unknown, axis))

@@ -1,0 +1,190 @@
+"""Protocols: how a model is evaluated, as data. Published ones differ in every field, so results name them all."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+from rsjax.config import Config, require, to_dict
+from rsjax.config.fields import check_numbers, require_range
+from rsjax.errors import UserError, did_you_mean
+
+OWN = "run"  # the protocol of a run's own configuration, which its evaluation stage uses
+SAMPLING = ("steps", "temperature", "top_k", "unmask")  # fields that replace those of model.sample
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is generated and which frames of it count.
+
+    Attributes:
+        name: one of :data:`PROTOCOLS`, or "run".
+        prompt_frames: recorded frames that generation starts from.
+        horizon: predicted frames; 0: to the clips' end.
+        resolution: pixels per side of the frames that are scored; 0: those of the run's clips.
+        steps, temperature, top_k, unmask: settings of sampling; None: the run's own.
+        samples: videos per clip. Scores are those of the first; with more, pixel scores are also reduced to the best
+            of each clip and metric, over all frames with the prompt as the model sees it, as ``NAME_bestN_incl_ctx``.
+        clips: how many of the split's clips, spread evenly; all if it has fewer.
+        repetitions: with other random draws; a clip's score is the mean over them.
+        action_draws: random action sequences per clip and kind of ΔPSNR; 0: no ΔPSNR.
+        teacher_forced: whether each frame is predicted from the recorded frames before it, not from generated ones.
+        reference: what predictions are compared with: recorded frames, or the tokenizer's reconstruction of them.
+        depth_alignment, depth_source: which of the depth scores tables show.
+        splits: the splits whose clips are scored, each by itself; one that ends in ``*`` stands for all that begin so.
+        origin: who evaluates so.
+    """
+
+    name: str
+    prompt_frames: int = 1
+    horizon: int = 15
+    resolution: int = 0
+    steps: int | None = None
+    temperature: float | None = None
+    top_k: int | None = None
+    unmask: Literal["random", "greedy"] | None = None
+    samples: int = 1
+    clips: int = 100
+    repetitions: int = 1
+    action_draws: int = 3
+    teacher_forced: bool = False
+    reference: Literal["recorded", "reconstruction"] = "recorded"
+    depth_alignment: Literal["none", "median", "affine_disparity", "l1_scale"] = "median"
+    depth_source: Literal["branch", "estimator"] = "branch"
+    splits: tuple[str, ...] = ("test",)
+    origin: str = ""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "--", dash=True)
+        low = {
+            "prompt_frames": 1,
+            "horizon": 0,
+            "resolution": 0,
+            "samples": 1,
+            "clips": 2,
+            "repetitions": 1,
+            "action_draws": 0,
+        }
+        for name, least in low.items():
+            require_range(self, f"protocol {self.name}", least, 2**31, name)
+        require(bool(self.splits), f"protocol {self.name}: name a split, such as test")
+
+    @property
+    def sampling(self) -> dict[str, Any]:
+        """The settings of sampling that it fixes."""
+        return {name: value for name in SAMPLING if (value := getattr(self, name)) is not None}
+
+    @property
+    def depth_suffix(self) -> str:
+        """What follows ``depth_absrel`` in the names of the depth scores that tables show."""
+        return "" if self.depth_alignment == "none" else f"_{self.depth_alignment}_{self.depth_source}"
+
+    def described(self) -> dict[str, Any]:
+        """Returns the fields, JSON-ready, with the frames that count in words."""
+        frames = {
+            "scores": "predicted frames",
+            "best of samples": "all frames, the prompt as the model sees it included",
+        }
+        return to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
+
+
+PAPER = Protocol(
+    "paper",
+    origin="RoboScape, Table 1: 16-frame clips at 2 Hz, one given; resolution, sampling and alignment are not stated",
+)
+PROTOCOLS = {
+    each.name: each
+    for each in (
+        PAPER,
+        Protocol(
+            "1xgpt",
+            prompt_frames=8,
+            horizon=8,
+            steps=2,
+            temperature=0.0,
+            unmask="random",
+            action_draws=0,
+            teacher_forced=True,
+            reference="reconstruction",
+            origin="1xgpt evaluate.py: 8 of 16 frames given, each frame from true ones, against decoded true tokens",
+        ),
+        Protocol(
+            "ivideogpt-bair",
+            resolution=64,
+            temperature=1.0,
+            top_k=100,
+            samples=100,
+            clips=256,
+            action_draws=0,
+            origin="iVideoGPT on BAIR: one frame given, best of 100 samples per metric, the context frame included",
+        ),
+        replace(PAPER, name="horizon48", horizon=48, origin="RoboScape: rollouts to 48 frames"),
+        replace(
+            PAPER, name="unseen", splits=("unseen*",), origin="RoboScape: tasks, cameras or objects never trained on"
+        ),
+    )
+}
+
+
+def of_run(config: Config) -> Protocol:
+    """Returns the protocol of a run's own configuration: its prompt, whole clips, its settings of sampling."""
+    settings = config.eval
+    return Protocol(
+        OWN,
+        prompt_frames=config.prompt_frames,
+        horizon=0,
+        clips=settings.clips,
+        repetitions=settings.repetitions,
+        action_draws=settings.action_draws,
+        depth_alignment="none",
+        origin="the run's configuration",
+    )
+
+
+def find(name: str, config: Config) -> Protocol:
+    """Returns a protocol; a preset that asks for more clips or repetitions than the protocol gets them.
+
+    Raises:
+        UserError: there is none of this name.
+    """
+    if name == OWN:
+        return of_run(config)
+    if name not in PROTOCOLS:
+        known = (*PROTOCOLS, OWN)
+        raise UserError(f"unknown protocol {name!r}{did_you_mean(name, known)} (protocols: {', '.join(known)})")
+    found, settings = PROTOCOLS[name], config.eval
+    repetitions = max(found.repetitions, settings.repetitions)
+    return replace(found, clips=max(found.clips, settings.clips), repetitions=repetitions)
+
+
+def label(protocol: Protocol, standard: Protocol) -> str:
+    """Returns the protocol's name with the fields in which it differs from the standard one: ``paper,clips=20``."""
+    changed = [
+        f"{field.name}={value}"
+        for field in fields(Protocol)
+        if field.name != "splits" and (value := getattr(protocol, field.name)) != getattr(standard, field.name)
+    ]
+    return ",".join([protocol.name, *changed])
+
+
+def check(protocol: Protocol, frames: int, image_size: int, where: str) -> Protocol:
+    """Returns the protocol with its horizon and resolution as numbers, for clips of this shape.
+
+    Args:
+        where: the store, for the errors.
+
+    Raises:
+        UserError: it predicts more frames than the clips have, or scores more pixels.
+    """
+    horizon = protocol.horizon or frames - protocol.prompt_frames
+    needed = protocol.prompt_frames + max(horizon, 1)
+    if frames < needed:
+        raise UserError(
+            f"protocol {protocol.name} predicts {horizon if protocol.horizon else 'some'} frames after "
+            f"{protocol.prompt_frames}, so it takes clips of {needed} frames; those of {where} have {frames}: lower "
+            f"--horizon, or name a store of longer clips with --data"
+        )
+    if protocol.resolution > image_size:
+        raise UserError(
+            f"protocol {protocol.name} scores frames of {protocol.resolution} pixels per side; those of {where} have "
+            f"{image_size}: set --resolution {image_size} or less, and say so beside the numbers"
+        )
+    return replace(protocol, horizon=horizon, resolution=protocol.resolution or image_size)
