@@ -26,6 +26,7 @@ class EvalConfig:
     # Without these files, which are not part of this project, the metrics are null.
     lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips
     lpips_vgg_weights: str = ""
+    fvd_weights: str = ""  # i3d_torchscript.pt, for which PyTorch is needed
     depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth
 
     def __post_init__(self) -> None:

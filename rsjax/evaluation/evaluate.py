@@ -21,7 +21,7 @@ from rsjax.devices import replicate
 from rsjax.evaluation.depth_estimator import choose_estimator
 from rsjax.evaluation.frame_curves import Curves, frame_curves
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced
-from rsjax.evaluation.metrics import delta_psnr
+from rsjax.evaluation.metrics import delta_psnr, fvd
 from rsjax.evaluation.protocols import Protocol, check, of_run
 from rsjax.evaluation.registry import Scene
 from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
@@ -72,6 +72,8 @@ def check_files(settings: EvalConfig) -> None:
     for path, net in ((settings.lpips_alex_weights, "alexnet"), (settings.lpips_vgg_weights, "vgg16")):
         if path:
             load_lpips(path, net)
+    if settings.fvd_weights:
+        fvd.check_i3d(settings.fvd_weights)
     choose_estimator(settings)
 
 

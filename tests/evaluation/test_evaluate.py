@@ -105,7 +105,7 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
 def test_every_registered_metric_has_a_score_or_a_reason(result: Evaluation) -> None:
     assert {name for name in metrics() if name in result.metrics} == metrics().keys() - result.reasons.keys()
     assert {name for name in result.reasons if "estimator" not in name} == {
-        *("lpips_alex", "lpips_vgg", "physics_iq_score"),
+        *("lpips_alex", "lpips_vgg", "fvd", "physics_iq_score"),
         *PLACES,
     }
     assert result.metrics["depth_absrel_median_branch_repeat_first"] > 0

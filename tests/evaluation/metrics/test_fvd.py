@@ -1,0 +1,102 @@
+"""FVD: the distance against other computations of it, and the network's part on a small network in its place."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from rsjax.clip import Video
+from rsjax.config import EvalConfig
+from rsjax.evaluation.evaluate import check_files
+from rsjax.evaluation.metrics.fvd import FvdError, frechet_distance
+from rsjax.evaluation.registry import Scene, Unavailable
+from tests.evaluation.metrics.scored import score
+
+
+def features(count: int, size: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, size)) @ rng.normal(size=(size, size)) + rng.normal(size=size)
+
+
+def test_the_distance_is_that_of_the_matrix_square_root() -> None:
+    """With more videos than features; scipy computes the root that published code takes."""
+    one, other = features(200, 12, 0), features(150, 12, 1)
+    (mean, cov), (mean2, cov2) = ((x.mean(0), np.cov(x, rowvar=False, bias=True)) for x in (one, other))
+    root = linalg.sqrtm(cov @ cov2)
+    expected = np.square(mean - mean2).sum() + np.trace(cov + cov2 - 2 * np.real(root))
+    assert frechet_distance(one, other) == pytest.approx(expected, rel=1e-9)
+
+
+def test_fewer_videos_than_features() -> None:
+    """The eigenvalues of Σ₁Σ₂ are real and not negative: the trace of its root is the sum of their roots."""
+    one, other = features(9, 30, 2), features(7, 30, 3)
+    cov, cov2 = (np.cov(x, rowvar=False, bias=True) for x in (one, other))
+    roots = np.sqrt(np.maximum(np.linalg.eigvals(cov @ cov2).real, 0)).sum()
+    expected = np.square(one.mean(0) - other.mean(0)).sum() + np.trace(cov) + np.trace(cov2) - 2 * roots
+    assert frechet_distance(one, other) == pytest.approx(expected, rel=1e-4)
+
+
+def test_one_feature_by_hand_and_a_set_with_itself() -> None:
+    """Means 1 and 4, deviations 1 and 3: (1 - 4)² + (1 - 3)²."""
+    assert frechet_distance(np.array([[0.0], [2.0]]), np.array([[1.0], [7.0]])) == pytest.approx(9 + 4)
+    same = features(20, 5, 4)
+    assert frechet_distance(same, same[::-1]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that is called as I3D is, of which features are means over channels, first frame and last frame."""
+    torch = pytest.importorskip("torch")
+    path = tmp_path_factory.mktemp("fvd") / "network.pt"
+    code = """
+def forward(self, x: Tensor, rescale: bool, resize: bool, return_features: bool) -> Tensor:
+    assert rescale and resize and return_features and x.dim() == 5 and x.size(1) == 3
+    if x.size(2) < 3:
+        raise RuntimeError("too short")
+    x = x / 255
+    return torch.cat([x.mean((2, 3, 4)), x[:, :, 0].mean((2, 3)), x[:, :, -1].mean((2, 3))], 1)
+"""
+    scripted = torch.jit.ScriptModule()
+    scripted.define(code)
+    scripted.save(str(path))
+    return path
+
+
+def scene(settings: EvalConfig, frames: int = 6) -> Scene:
+    truth, made = np.random.default_rng(0).integers(0, 256, (2, 9, frames, 8, 10, 3), np.uint8)
+    return Scene(Video(truth), Video(made), prompt_frames=2, settings=settings)
+
+
+def test_the_network_sees_the_predicted_frames_as_channels_first_videos(network: Path) -> None:
+    given = scene(EvalConfig(fvd_weights=str(network)))
+
+    def seen(video: Video) -> np.ndarray:
+        later = video.rgb[:, 2:] / 255
+        return np.concatenate([later.mean((1, 2, 3)), later[:, 0].mean((1, 2)), later[:, -1].mean((1, 2))], axis=1)
+
+    expected = frechet_distance(seen(given.truth), seen(given.prediction))
+    assert score("fvd", given) == pytest.approx(expected, rel=1e-3)
+    assert score("fvd", Scene(given.truth, given.truth, settings=given.settings)) == pytest.approx(0, abs=1e-6)
+
+
+def test_clips_that_are_too_short_have_a_reason(network: Path) -> None:
+    with pytest.raises(Unavailable, match="I3D refuses 2 frames of a clip"):
+        score("fvd", scene(EvalConfig(fvd_weights=str(network)), frames=4))
+
+
+def test_without_network_or_torch_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Unavailable, match=r"no network: --eval.fvd-weights i3d_torchscript.pt"):
+        score("fvd", scene(EvalConfig()))
+    monkeypatch.setattr("rsjax.evaluation.metrics.fvd.find_spec", lambda name: None)
+    with pytest.raises(Unavailable, match="FVD needs PyTorch: pip install"):
+        score("fvd", scene(EvalConfig(fvd_weights="i3d_torchscript.pt")))
+
+
+def test_a_missing_or_damaged_file_is_refused_at_the_start(tmp_path: Path) -> None:
+    with pytest.raises(FvdError, match=r"none.pt: no such I3D network; mend eval.fvd_weights"):
+        check_files(EvalConfig(fvd_weights="none.pt"))
+    pytest.importorskip("torch")
+    (tmp_path / "bad.pt").write_bytes(b"no network")
+    with pytest.raises(FvdError, match=r"bad.pt: not a TorchScript network"):
+        check_files(EvalConfig(fvd_weights=str(tmp_path / "bad.pt")))
