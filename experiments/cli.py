@@ -24,6 +24,8 @@ FIRST_FIELDS = {
     "sim.episodes": "Simulated episodes, those of the test split included.",
     "sim.test-episodes": "Episodes of the test split.",
     "sim.seed": "Seed of the simulated episodes.",
+    "sim.env": "The simulator: lift or metaworld (docs/simulators.md).",
+    "sim.tasks": "Tasks of Meta-World to train on, such as reach drawer-open.",
     "tokenizer-train.steps": "Training steps of the tokenizer.",
     "tokenizer-train.batch-size": "Clips of a batch, over all devices.",
     "tokenizer-train.optimizer.learning-rate": "Peak learning rate of the tokenizer.",

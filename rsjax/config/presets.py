@@ -18,6 +18,7 @@ from rsjax.config import (
     TokenizerTrainConfig,
 )
 from rsjax.config.curriculum import parse_stage
+from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.errors import did_you_mean
 
 
@@ -101,6 +102,30 @@ def tiny() -> Config:
             eval_every=950,
         ),
         eval=EvalConfig(clips=100, batch_size=20, report_clips=6),
+    )
+
+
+def multitask() -> Config:
+    """Trains on the ten training tasks of Meta-World's ML10, in about three quarters of an hour on 2 CPU cores.
+
+    The five tasks that ML10 holds out are those of the protocol "unseen".
+    """
+    small = tiny()
+    return replace(
+        small,
+        name="multitask",
+        sim=SimConfig(
+            episodes=1000,
+            test_episodes=100,
+            control_steps=7,  # 11 frames a second: 105 control steps, in which most experts finish
+            camera="near",
+            env="metaworld",
+            tasks=ML10,
+            unseen_tasks=ML10_UNSEEN,
+        ),
+        # Half as many steps again as for one task.
+        tokenizer_train=replace(small.tokenizer_train, steps=2700),
+        train=replace(small.train, steps=2800),
     )
 
 
@@ -194,7 +219,9 @@ def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
     return presets
 
 
-PRESETS = collect(debug, tiny, roboscape_s, roboscape_m, roboscape_l, genie_35m, genie_138m, genie_35m_actions)
+PRESETS = collect(
+    debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l, genie_35m, genie_138m, genie_35m_actions
+)
 
 
 def get(name: str) -> Config:

@@ -5,25 +5,33 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import require, require_range, runtime
+from rsjax.config.fields import added, require, require_range, runtime
+from rsjax.config.metaworld import ML45, ML45_UNSEEN, TASKS
+from rsjax.errors import did_you_mean
+
+CONTROLS = {"lift": 7, "metaworld": 4}  # numbers of a control step: pose delta (6-D, or position alone) and gripper
 
 
 @dataclass(frozen=True)
 class SimConfig:
-    """Lift episodes collected in the simulator (:mod:`rsjax.sim`)."""
+    """Episodes collected in a simulator (:mod:`rsjax.sim`)."""
 
     episodes: int = 200
     test_episodes: int = 20  # the last ones collected, never used in training
     frames: int = 16
-    control_steps: int = 4  # 20 Hz control steps between frames; a frame's action is their concatenation
+    # Control steps between frames, at 20 Hz in lift and 80 Hz in metaworld; a frame's action is their concatenation.
+    control_steps: int = 4
     image_size: int = 64
-    camera: str = "agentview"  # near: our own, in which cube and gripper are larger
+    camera: str = "agentview"  # near: our own, in which objects and gripper are larger
     tracks: int = 256  # N₀: dense keypoint tracks per clip
     # Where tracks start. grid: evenly over the image, as in the paper, which avoids segmentation on purpose.
-    # objects: up to half on a grid, the others on the cube and the arm's moving links, found by segmentation.
+    # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0
     workers: int = runtime(0)  # 0: one process per core
+    env: Literal["lift", "metaworld"] = added("lift")
+    tasks: tuple[str, ...] = added(())  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
+    unseen_tasks: tuple[str, ...] = added(())  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")
@@ -34,13 +42,43 @@ class SimConfig:
         )
         require_range(self, "sim", 1, math.inf, "control_steps", "image_size", "tracks")
         require_range(self, "sim", 0, math.inf, "workers")
+        self._check_tasks()
+
+    def _check_tasks(self) -> None:
+        named = {"tasks": self.tasks, "unseen_tasks": self.unseen_tasks}
+        for field, tasks in named.items():
+            for task in tasks:
+                require(
+                    self.env == "metaworld",
+                    f"sim.{field} names {task!r}, but sim.env is {self.env}, which has one task",
+                )
+                require(task in TASKS, f"sim.{field} names {task!r}, no task of Meta-World{did_you_mean(task, TASKS)}")
+        require(self.env != "metaworld" or self.camera != "agentview", _NO_AGENTVIEW)
+        both = sorted(set(self.train_tasks) & set(self.held_out_tasks))
+        require(
+            not both, f"sim.unseen_tasks has {', '.join(both)}, which sim.tasks trains on; a task is seen or unseen"
+        )
+
+    @property
+    def train_tasks(self) -> tuple[str, ...]:
+        """The tasks of the train and test splits; none in lift, which has one."""
+        return (self.tasks or ML45) if self.env == "metaworld" else ()
+
+    @property
+    def held_out_tasks(self) -> tuple[str, ...]:
+        """The tasks that training never sees."""
+        chosen = self.unseen_tasks or tuple(task for task in ML45_UNSEEN if task not in self.tasks)
+        return chosen if self.env == "metaworld" else ()
 
     @property
     def action_dim(self) -> int:
-        """Width of one frame's action: ``control_steps`` controls of 7 (6-D pose delta, gripper)."""
-        return 7 * self.control_steps
+        """Width of one frame's action: ``control_steps`` controls."""
+        return CONTROLS[self.env] * self.control_steps
 
     @property
     def clips(self) -> ClipShape:
         """The shape of its clips; each episode is one clip."""
         return ClipShape(self.frames, self.image_size, self.tracks, self.action_dim, self.test_episodes)
+
+
+_NO_AGENTVIEW = "sim.camera is 'agentview', which Meta-World does not have; choose near, or one of its own, e.g. corner"

@@ -32,9 +32,10 @@ def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, 
     objects = [clip["provenance"].get("objects") for clip in clips]
     if not all(objects):
         return None
-    xy = np.stack([np.stack([each[name] for name in OBJECTS], axis=1) for each in objects])
+    cube = "cube" if "cube" in objects[0] else "object"  # Meta-World's main object stands for the cube
+    xy = np.stack([np.stack([each[name] for name in (cube, "gripper")], axis=1) for each in objects])
     lifted = np.stack([clip["success"] for clip in clips])
-    return Places(np.clip(xy, 0, 1), lifted), np.array([each["cube_width"] for each in objects])
+    return Places(np.clip(xy, 0, 1), lifted), np.array([each[f"{cube}_width"] for each in objects])
 
 
 class Network(nn.Module):

@@ -58,7 +58,7 @@ class Run:
     @property
     def clips(self) -> Path:
         """The path of the store of clips, which all runs on the same episodes share."""
-        return Path(self.config.data.store or self.data_directory / f"lift-{self.keys()['collect']}")
+        return Path(self.config.data.store or self.data_directory / f"{self.config.sim.env}-{self.keys()['collect']}")
 
     def open_clips(self) -> Store:
         """Opens the store of clips.

@@ -94,7 +94,9 @@ def _check_starts(run: Run) -> None:
 def _collecting(run: Run) -> str:
     if run.config.data.key:
         return f"the clips of {run.clips}"
-    return f"simulating {run.config.sim.episodes} Lift episodes into {run.clips}"
+    sim = run.config.sim
+    what = "Lift episodes" if sim.env == "lift" else f"Meta-World episodes of {len(sim.train_tasks)} tasks"
+    return f"simulating {sim.episodes} {what} into {run.clips}"
 
 
 def _record_start(run: Run, command: str) -> None:

@@ -73,7 +73,12 @@ def draw_manner(rng: np.random.Generator) -> Manner:
 
 
 def difficulty(provenance: dict[str, Any]) -> str:
-    """Returns a clip's difficulty for a curriculum: simple or difficult by its expert's mode, unknown without one."""
+    """Returns a clip's difficulty for a curriculum: its task's; else simple or difficult by its expert's mode.
+
+    Unknown without either.
+    """
+    if "difficulty" in provenance:
+        return str(provenance["difficulty"])
     expert = provenance.get("expert")
     if expert is None:
         return "unknown"

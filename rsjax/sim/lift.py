@@ -12,8 +12,11 @@ from jaxtyping import Bool, Float, Int32
 from rsjax.config import require
 from rsjax.sim.gl import choose_gl
 from rsjax.sim.render import Camera, Renderer, View
+from rsjax.sim.scenery import SEEN, Scenery, Variation, aim
 
 TASK = "lift the red cube"
+ANY_TASK = "lift the cube"  # of another colour
+CENTRE = (0.0, 0.0, 0.85)  # of the workspace, metres
 CUBE_BODY = "cube_main"
 # Our own camera: position and the point it looks at in metres, vertical field of view in degrees. The cube is 9 of 64
 # pixels wide there, against 5 in robosuite's "agentview", and the gripper is in the picture from the first frame on.
@@ -63,7 +66,7 @@ class LiftSim:
     def __init__(self, camera: str = "agentview", image_size: int = 64) -> None:
         robosuite = _load_robosuite()
         # robosuite draws the cube's size when it builds the scene: fix it, or episodes would depend on the process.
-        with _global_seed(0):
+        with global_seed(0):
             self._env = robosuite.make(
                 "Lift",
                 robots="Panda",
@@ -80,6 +83,7 @@ class LiftSim:
         _compute_once(self._env.sim)
         self._camera_id = _camera_id(self._model, camera)
         self._cube_id = self._model.body(CUBE_BODY).id
+        self._scenery = Scenery(self._model, self._camera_id, [self._cube_id], CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size)
 
     def __enter__(self) -> "LiftSim":
@@ -93,9 +97,10 @@ class LiftSim:
         self._renderer.close()
         self._env.close()
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
-        with _global_seed(seed):
+        self._scenery.apply(variation)
+        with global_seed(seed):
             self._env.reset()
 
     def step(self, action: Float[np.ndarray, " 7"]) -> None:
@@ -131,6 +136,21 @@ class LiftSim:
             self._data.cam_xmat[self._camera_id].reshape(3, 3).copy(),
             float(self._model.cam_fovy[self._camera_id]),
         )
+
+    @property
+    def places(self) -> dict[str, Float[np.ndarray, " 3"]]:
+        """Returns where the object and the gripper are, in metres in the world."""
+        state = self.state
+        return {"cube": state.cube, "gripper": state.gripper}
+
+    @property
+    def object_width(self) -> float:
+        return self.cube_width
+
+    @property
+    def object_bodies(self) -> Int32[np.ndarray, " N"]:
+        """Returns the body ids of the objects in :meth:`segment` and :meth:`body_poses`."""
+        return np.array([self._cube_id], np.int32)
 
     @property
     def cube_body(self) -> int:
@@ -171,13 +191,7 @@ def _camera_id(model: Any, name: str) -> int:
     if name != own:
         require(name in names, f"sim.camera is {name!r}; this scene has {own}, {', '.join(names)}")
         return names.index(name)
-    backward = np.array(position) - np.array(target)
-    right = np.cross([0, 0, 1], backward)
-    axes = np.stack([right, np.cross(backward, right), backward], -1)
-    import mujoco
-
-    mujoco.mju_mat2Quat(model.cam_quat[0], (axes / np.linalg.norm(axes, axis=0)).ravel())
-    model.cam_pos[0], model.cam_fovy[0] = position, fovy
+    aim(model, 0, position, target, fovy)
     return 0
 
 
@@ -208,7 +222,7 @@ def _compute_once(sim: Any) -> None:
 
 
 @contextmanager
-def _global_seed(seed: int) -> Iterator[None]:
+def global_seed(seed: int) -> Iterator[None]:
     """Seeds numpy's global generator, from which robosuite draws, and restores it afterwards."""
     state = np.random.get_state()
     np.random.seed(seed)

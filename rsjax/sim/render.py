@@ -76,12 +76,13 @@ class Renderer:
         model: a ``mujoco.MjModel``; its rendering quality and buffer size are set.
         camera_id: number of the camera in the model.
         size: S, pixels along each side.
+        hidden: groups of geoms that are left out, such as collision shapes (group 0 in robosuite).
 
     Raises:
         GLError: no OpenGL context can be made.
     """
 
-    def __init__(self, model: Any, camera_id: int, size: int) -> None:
+    def __init__(self, model: Any, camera_id: int, size: int, hidden: tuple[int, ...] = (0,)) -> None:
         import mujoco
 
         self._mj, self._model, self._size, self._fine = mujoco, model, size, size * SUPERSAMPLING
@@ -99,7 +100,7 @@ class Renderer:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
         self._options = mujoco.MjvOption()
-        self._options.geomgroup[0] = 0  # collision shapes
+        self._options.geomgroup[list(hidden)] = 0
         self._options.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED

@@ -41,27 +41,28 @@ def grid_pixels(size: int, count: int, rng: np.random.Generator) -> Int[np.ndarr
 def object_pixels(
     bodies: Int32[np.ndarray, "S S"],
     movable: Bool[np.ndarray, " bodies"],
-    cube: int,
+    objects: Int32[np.ndarray, " O"] | int,
     count: int,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, "count 2"]:
     """Returns (row, column) of N₀ pixels of frame 0 to track, many of them on what moves.
 
-    Up to half lie on a regular grid over the image. Of the others, half lie on the cube and half on moving links of the
-    arm, as far as these cover pixels; the rest lie anywhere.
+    Up to half lie on a regular grid over the image. Of the others, half lie on the objects and half on moving links
+    of the arm, as far as these cover pixels; the rest lie anywhere.
 
     Args:
         bodies: body id at each pixel.
         movable: whether each body can move.
-        cube: the cube's body id.
+        objects: the objects' body ids.
         count: N₀.
         rng: generator of the choice.
     """
     size, flat = bodies.shape[0], bodies.ravel()
     chosen = _grid(size, count // 2)
     free = np.setdiff1d(np.arange(flat.size), chosen)
-    on_cube, on_arm = free[flat[free] == cube], free[movable[flat[free]] & (flat[free] != cube)]
-    for pool, most in ((on_cube, (count - chosen.size) // 2), (on_arm, count)):
+    there = np.isin(flat[free], objects)
+    on_objects, on_arm = free[there], free[movable[flat[free]] & ~there]
+    for pool, most in ((on_objects, (count - chosen.size) // 2), (on_arm, count)):
         take = min(most, count - chosen.size, pool.size)
         chosen = np.concatenate([chosen, rng.choice(pool, take, replace=False)])
     return _unravel(_fill(chosen, count, size, rng), size)

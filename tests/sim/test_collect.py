@@ -15,12 +15,17 @@ from rsjax.files import FileError, making
 from rsjax.processes import WorkerDied
 from rsjax.sim import collect as collect_module
 from rsjax.sim import lift as lift_module
-from rsjax.sim.collect import CollectError, collect, collection_key, run_episode
+from rsjax.sim.collect import CollectError, collect, collection_key
+from rsjax.sim.episode import EpisodePlan, Simulators, run_episode
 from rsjax.sim.lift import LiftSim
 
 CONFIG = SimConfig(
     episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, workers=1
 )  # a simulator takes seconds to start
+
+
+def plan(episode: int) -> EpisodePlan:
+    return EpisodePlan(f"{episode:06d}", episode)
 
 
 def assert_same(left: Clip, right: Clip) -> None:
@@ -32,18 +37,18 @@ def assert_same(left: Clip, right: Clip) -> None:
 
 
 def test_an_episode_depends_only_on_seed_and_number(sim: LiftSim) -> None:
-    clips = [run_episode(sim, CONFIG, episode) for episode in range(4)]
-    assert_same(run_episode(sim, CONFIG, 3), clips[3])
+    clips = [run_episode(sim, CONFIG, plan(episode)) for episode in range(4)]
+    assert_same(run_episode(sim, CONFIG, plan(3)), clips[3])
     with LiftSim(image_size=64) as fresh:
-        assert_same(run_episode(fresh, CONFIG, 3), clips[3])
+        assert_same(run_episode(fresh, CONFIG, plan(3)), clips[3])
     assert not np.array_equal(clips[3].rgb[0], clips[2].rgb[0])
-    other = run_episode(sim, replace(CONFIG, seed=6), 3)
+    other = run_episode(sim, replace(CONFIG, seed=6), plan(3))
     assert not np.array_equal(other.actions, clips[3].actions)
 
 
 def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
     """Replaying the stored actions from the same start gives the same pictures."""
-    clip = run_episode(sim, CONFIG, 1)
+    clip = run_episode(sim, CONFIG, plan(1))
     assert clip.actions.shape == (4, CONFIG.action_dim)
     assert not clip.actions[0].any()
     sim.reset(int(np.random.default_rng([CONFIG.seed, 1]).integers(2**32)))
@@ -57,10 +62,10 @@ def test_actions_are_what_led_to_the_frame(sim: LiftSim) -> None:
 
 
 def test_computing_each_state_once_changes_no_physics(sim: LiftSim, monkeypatch: pytest.MonkeyPatch) -> None:
-    clip = run_episode(sim, CONFIG, 2)
+    clip = run_episode(sim, CONFIG, plan(2))
     monkeypatch.setattr(lift_module, "_compute_once", lambda sim: None)
     with LiftSim(image_size=64) as plain:
-        other = run_episode(plain, CONFIG, 2)
+        other = run_episode(plain, CONFIG, plan(2))
     np.testing.assert_allclose(clip.actions, other.actions, atol=1e-5)
     np.testing.assert_allclose(clip.tracks, other.tracks, atol=1e-5)
 
@@ -91,7 +96,7 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
     # an episode that is there is not simulated again: this one says so
     mark = kept[0]
     episode = int(mark.stem)
-    clip = run_episode(sim, CONFIG, episode)
+    clip = run_episode(sim, CONFIG, plan(episode))
     mark.write_bytes(encode(encode_clip(clip) | {"task": "marked"}))
 
     seen: list[int] = []
@@ -115,7 +120,7 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
     assert [c.provenance["episode"] for c in clips] == [0, 1, 2, 3]
     assert [c.task == "marked" for c in clips] == [i == episode for i in range(4)]
     untouched = next(i for i in range(4) if i != episode)
-    assert_same(run_episode(sim, CONFIG, untouched), clips[untouched])
+    assert_same(run_episode(sim, CONFIG, plan(untouched)), clips[untouched])
 
     actions = np.concatenate([c.actions[1:] for c in clips[:3]])
     np.testing.assert_allclose(store.manifest["action_mean"], actions.mean(0), atol=1e-6)
@@ -145,9 +150,9 @@ def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:
             provenance={"episode": i, "expert": {"mode": "lift"}},
         )
         if i in failed:
-            collect_module._error_file(partial, i).write_text("ArithmeticError: it diverged")
+            collect_module._error_file(partial, f"{i:06d}").write_text("ArithmeticError: it diverged")
         else:
-            collect_module._clip_file(partial, i).write_bytes(encode(encode_clip(clip)))
+            collect_module._clip_file(partial, f"{i:06d}").write_bytes(encode(encode_clip(clip)))
     return out
 
 
@@ -207,19 +212,23 @@ def test_a_simulator_failure_costs_one_episode_but_a_full_disk_stops(
 
         monkeypatch.setattr(collect_module, "run_episode", run)
 
+    simulators = Simulators(CONFIG)
+    simulators._sim = sim
     raising(ArithmeticError("it diverged"))
-    collect_module._work(sim, CONFIG, tmp_path, 2)
+    collect_module._work(simulators, CONFIG, tmp_path, plan(2))
     assert (tmp_path / "000002.error").read_text() == "ArithmeticError: it diverged"
     raising(OSError(errno.ENOSPC, "No space left on device"))
     with pytest.raises(OSError, match=r"No space"):
-        collect_module._work(sim, CONFIG, tmp_path, 3)
+        collect_module._work(simulators, CONFIG, tmp_path, plan(3))
     assert not (tmp_path / "000003.error").exists()
 
 
 def test_an_episode_that_kills_two_workers_stops_and_keeps_the_others(
     gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def run_items(make: object, items: list[int], workers: int, settle: Callable[[int, WorkerDied], None]) -> None:
+    def run_items(
+        make: object, items: list[EpisodePlan], workers: int, settle: Callable[[EpisodePlan, WorkerDied], None]
+    ) -> None:
         settle(items[0], WorkerDied())
 
     monkeypatch.setattr(collect_module, "run_items", run_items)

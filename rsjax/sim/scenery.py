@@ -1,0 +1,131 @@
+"""Changes of a scene's looks that training never sees: another place of the camera, other colours of the objects.
+
+They leave the physics alone, so an episode with such a change is the same episode, seen otherwise.
+"""
+
+import colorsys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.config import require
+
+Change = Literal["camera", "color"]
+YAW, PITCH = (10.0, 25.0), (-4.0, 8.0)  # degrees: to either side about the vertical, and upwards
+TURN = (0.25, 0.75)  # of the circle of hues
+DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, for which it takes the material's
+SATURATION, VALUE = 0.6, 0.5  # at least, so that grey objects get a hue too
+
+
+@dataclass(frozen=True)
+class Variation:
+    """A change of a scene's looks; none by default.
+
+    Attributes:
+        yaw: angle in degrees by which the camera moves about the vertical through the point that it looks at.
+        pitch: likewise upwards.
+        turn: share of the circle of hues by which the objects' colours turn.
+    """
+
+    yaw: float = 0.0
+    pitch: float = 0.0
+    turn: float = 0.0
+
+
+SEEN = Variation()  # none
+
+
+def draw_variation(change: Change, rng: np.random.Generator) -> Variation:
+    """Draws a change of the camera's place or of the objects' colours."""
+    if change == "color":
+        return Variation(turn=float(rng.uniform(*TURN)))
+    side = 1 if rng.random() < 0.5 else -1
+    return Variation(yaw=side * float(rng.uniform(*YAW)), pitch=float(rng.uniform(*PITCH)))
+
+
+class Scenery:
+    """The looks of a MuJoCo model, to change and to restore.
+
+    Args:
+        model: a ``mujoco.MjModel``.
+        camera_id: number of the camera that renders.
+        bodies: the bodies whose colours change.
+        centre: a point in the workspace, in metres; the camera turns about the point of its axis nearest to it.
+    """
+
+    def __init__(self, model: Any, camera_id: int, bodies: Sequence[int], centre: Sequence[float]) -> None:
+        self._model, self._camera, self._centre = model, camera_id, np.array(centre)
+        self._position, self._quaternion = model.cam_pos[camera_id].copy(), model.cam_quat[camera_id].copy()
+        self._geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+        self._materials, self._colors = model.geom_matid.copy(), model.geom_rgba.copy()
+
+    def apply(self, variation: Variation) -> None:
+        """Gives the model the looks of a variation, whatever it looked like; kinematics have to be computed again.
+
+        Raises:
+            ConfigError: the camera is to move but rides on the arm.
+        """
+        model = self._model
+        model.cam_pos[self._camera], model.cam_quat[self._camera] = self._position, self._quaternion
+        model.geom_matid[:], model.geom_rgba[:] = self._materials, self._colors
+        if variation.yaw or variation.pitch:
+            self._move_camera(variation)
+        for geom in self._geoms if variation.turn else ():
+            color = self._color(geom)
+            model.geom_matid[geom], model.geom_rgba[geom] = -1, (*_turned(color[:3], variation.turn), color[3])
+
+    def _move_camera(self, variation: Variation) -> None:
+        require(
+            self._model.cam_bodyid[self._camera] == 0,
+            "sim.camera moves with the arm, so there is no unseen place for it; choose one that stands still",
+        )
+        import mujoco
+
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, self._quaternion)
+        right, _, backward = axes.reshape(3, 3).T
+        pivot = self._position - backward * ((self._position - self._centre) @ backward)
+        turn = _rotation(np.array([0, 0, 1.0]), variation.yaw) @ _rotation(right, -variation.pitch)
+        rotation, quaternion = turn @ axes.reshape(3, 3), np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        self._model.cam_pos[self._camera] = pivot + turn @ (self._position - pivot)
+        self._model.cam_quat[self._camera] = quaternion
+
+    def _color(self, geom: Any) -> Float[np.ndarray, " 4"]:
+        """Returns colour and opacity of a geom, 0 … 1; of a textured one the mean colour."""
+        model, material, own = self._model, self._materials[geom], np.array(self._colors[geom], np.float64)
+        if material < 0:
+            return own
+        color = np.array(model.mat_rgba[material], np.float64) if (own == DEFAULT_COLOR).all() else own
+        texture = max(model.mat_texid[material])
+        if texture < 0:
+            return color
+        start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+        pixels = model.tex_data[start : start + model.tex_height[texture] * model.tex_width[texture] * channels]
+        return np.append(color[:3] * pixels.reshape(-1, channels)[:, :3].mean(0) / 255, color[3])
+
+
+def aim(model: Any, camera_id: int, position: Sequence[float], target: Sequence[float], fovy: float) -> None:
+    """Moves a camera of a MuJoCo model to a position, upright, to look at a target, both in metres in its frame."""
+    import mujoco
+
+    backward = np.array(position) - np.array(target)
+    right = np.cross([0, 0, 1], backward)
+    axes = np.stack([right, np.cross(backward, right), backward], -1)
+    mujoco.mju_mat2Quat(model.cam_quat[camera_id], (axes / np.linalg.norm(axes, axis=0)).ravel())
+    model.cam_pos[camera_id], model.cam_fovy[camera_id] = position, fovy
+
+
+def _turned(color: Float[np.ndarray, " 3"], turn: float) -> tuple[float, float, float]:
+    hue, saturation, value = colorsys.rgb_to_hsv(*map(float, color))
+    return colorsys.hsv_to_rgb((hue + turn) % 1, max(saturation, SATURATION), max(value, VALUE))
+
+
+def _rotation(axis: Float[np.ndarray, " 3"], degrees: float) -> Float[np.ndarray, "3 3"]:
+    """Returns the rotation about a unit axis (Rodrigues)."""
+    angle = np.radians(degrees)
+    cross = np.cross(np.eye(3), axis)  # what it multiplies, it crosses with the axis
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
