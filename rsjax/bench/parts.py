@@ -22,9 +22,12 @@ from rsjax.data import loader
 from rsjax.data.curriculum import plan
 from rsjax.data.prefetch import Prefetch
 from rsjax.data.store import open_store, write_store
+from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.trained import TrainedModel
+from rsjax.policies.vector_env import WorldModelVectorEnv
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
 from rsjax.training.step import train_step
@@ -39,6 +42,7 @@ PROMPT_FRAMES = 1  # of rollouts, as in the paper, for every preset
 UNCACHED_FRAMES = 2  # frames decoded without the cache; all cost the same, so few are enough
 LOADER_CLIPS, LOADER_BATCHES = 64, 16
 FEED_CLIPS = 256
+ENVIRONMENTS = (1, 64)  # numbers of them that are stepped at once
 WARM_UP, LEAST, MOST = 3, 10, 200  # steps of the part "feed"
 
 
@@ -142,6 +146,28 @@ def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
         "tokenizer_decode_frames_per_s": frames / median_seconds(lambda: codec.decode(tokens, no_depth).rgb, budget),
         "tokenizer_frames": frames,
     }
+
+
+def environment(config: Config, budget: float) -> Numbers:
+    """Measures steps a second of 1 and of 64 environments in the world model, summed over them, without a judge.
+
+    A step goes from an action on the host to a frame on the host, with depth if the model has it, in windows that are
+    on average half full. Empty for a family that cannot generate frame by frame.
+    """
+    model, size = create_model(config), config.clips.image_size
+    trained = TrainedModel(config, model, jax.jit(model.init)(jax.random.key(0)), inputs.assets(config))
+    first = {"rgb": np.zeros((size, size, 3), np.uint8), "depth": np.ones((size, size), np.float32)}
+    numbers: Numbers = {}
+    for count in ENVIRONMENTS:
+        try:
+            env = WorldModelVectorEnv(trained, count, max_steps=10**9)
+        except UserError:
+            return {}
+        env.reset(seed=0, options=first if config.model.uses_depth else {"rgb": first["rgb"]})
+        steps, actions = config.clips.frames, np.zeros((count, config.clips.action_dim), np.float32)
+        seconds = median_seconds(lambda: [env.step(actions)[0]["rgb"] for _ in range(steps)], budget)  # noqa: B023
+        numbers[f"environment_steps_per_s_{count}"] = count * steps / seconds
+    return numbers
 
 
 def load(config: Config, batch: int, budget: float) -> Numbers:

@@ -16,7 +16,7 @@ from rsjax.bench.torch_part import check_torch, torch_baseline
 from rsjax.config import Config, require
 from rsjax.errors import did_you_mean
 
-PARTS = ("matmul", "train", "sample", "tokenizer", "loader", "feed")
+PARTS = ("matmul", "train", "sample", "tokenizer", "environment", "loader", "feed")
 MODEL_FACTS = ("blocks", "width", "use_depth", "compute_dtype", "remat")  # reported if the family has them
 BUDGET_SECONDS = 20.0  # per quantity, unless three runs take longer
 
@@ -58,6 +58,7 @@ def bench(
         "train": lambda: parts.train(config, batch, budget),
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
+        "environment": lambda: parts.environment(config, budget),
         "loader": lambda: parts.load(config, batch, budget),
         "feed": lambda: parts.feed(config, budget),
         "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),

@@ -75,19 +75,30 @@ class Normalization:
         return cls(tuple(mean), tuple(std), tuple(near_far) if near_far else None)
 
     def action_inputs(self, actions: Float[np.ndarray, "*B T A"], integrate: bool) -> Float32[np.ndarray, "*B T A2"]:
-        """Returns the inputs of the action encoder: actions at zero mean and unit variance; row 0 is zero.
-
-        So that a dimension that hardly varies is not blown up, its deviation counts as at least 0.001.
+        """Returns the inputs of the action encoder: actions as :meth:`scaled`; row 0 is zero.
 
         Args:
             actions: actions in the data's units; row t leads into frame t.
             integrate: append a quarter of their sum over the frames so far; A2 is then 2 A, otherwise A.
         """
-        scaled = (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
+        scaled = self.scaled(actions)
         scaled[..., 0, :] = 0.0
-        if integrate:
-            scaled = np.concatenate([scaled, np.cumsum(scaled, axis=-2) / 4.0], axis=-1)
-        return scaled.astype(np.float32)
+        return with_sums(scaled, np.cumsum(scaled, axis=-2) if integrate else None)
+
+    def scaled(self, actions: Float[np.ndarray, "*B A"]) -> Float64[np.ndarray, "*B A"]:
+        """Returns actions at zero mean and unit variance.
+
+        So that a dimension that hardly varies is not blown up, its deviation counts as at least 0.001.
+        """
+        return (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
+
+
+def with_sums(
+    scaled: Float[np.ndarray, "*B A"], sums: Float[np.ndarray, "*B A"] | None
+) -> Float32[np.ndarray, "*B A2"]:
+    """Returns the action encoder's inputs: scaled actions and, if given, a quarter of their sums over the frames."""
+    rows = scaled if sums is None else np.concatenate([scaled, sums / 4.0], axis=-1)
+    return rows.astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rsjax.clip import Video
 from rsjax.config import Config, ConfigError, ModelConfig
@@ -52,6 +52,27 @@ class TeacherForced:
 
     cross_entropy: dict[str, Float[np.ndarray, "B P"]]
     accuracy: dict[str, Float[np.ndarray, "B P"]]
+
+
+class Imagination(Protocol):
+    """B clips that a model generates frame by frame while the actions come in; each begins when it is restarted."""
+
+    def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " N"]) -> Video:
+        """Begins N of the clips anew.
+
+        Args:
+            which: those clips.
+            first: their first frame each, (N, 1, …), with depth if the model generates it.
+            index: decides their random draws, as for :meth:`WorldModel.generate`.
+
+        Returns:
+            These frames as the model sees them.
+        """
+        ...
+
+    def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
+        """Generates the next frame of every clip, (B, 1, …), under actions in the recording's units."""
+        ...
 
 
 class WorldModel(Trainable[B], Protocol[B]):
@@ -156,6 +177,14 @@ class WorldModel(Trainable[B], Protocol[B]):
         """
         repeated = prompt[np.zeros(len(actions), int)]
         return self.generate(params, assets, repeated, actions, index=np.zeros(len(actions), int), depth=depth)
+
+    def imagine(self, params: Params, assets: Assets, clips: int) -> Imagination:
+        """Returns a number of clips to be generated frame by frame: those that :meth:`generate` gives at once.
+
+        Raises:
+            UserError: the family does not implement it.
+        """
+        raise UserError(f"{type(self).__name__} cannot generate frame by frame, so it cannot be an environment")
 
     def reconstruct(self, assets: Assets, video: Video) -> Video | None:
         """Returns a video's reconstruction from the model's tokens or latents, the upper bound of its quality.

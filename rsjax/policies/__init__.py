@@ -4,27 +4,37 @@ Importing this package registers the environments with Gymnasium::
 
     import gymnasium, rsjax.policies
 
+    gymnasium.make("rsjax/WorldModel-v0", run="runs/tiny")
+    gymnasium.make_vec("rsjax/WorldModel-v0", num_envs=64, run="runs/tiny")
     gymnasium.make("rsjax/Lift-v0")
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rsjax.policies.env import WorldModelEnv
     from rsjax.policies.simulator import LiftEnv
+    from rsjax.policies.vector_env import WorldModelVectorEnv
 
-__all__ = ["LiftEnv", "register"]
+__all__ = ["LiftEnv", "WorldModelEnv", "WorldModelVectorEnv", "register"]
 
-_WHERE = {"LiftEnv": "simulator"}
-_ENVIRONMENTS = {"rsjax/Lift-v0": "rsjax.policies.simulator:LiftEnv"}
+_WHERE = {"LiftEnv": "simulator", "WorldModelEnv": "env", "WorldModelVectorEnv": "vector_env"}
+_ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    "rsjax/WorldModel-v0": {
+        "entry_point": "rsjax.policies.env:WorldModelEnv",
+        "vector_entry_point": "rsjax.policies.vector_env:WorldModelVectorEnv",
+    },
+    "rsjax/Lift-v0": {"entry_point": "rsjax.policies.simulator:LiftEnv"},
+}
 
 
 def register() -> None:
     """Registers the environments with Gymnasium, unless they are. Their modules are imported when one is made."""
     import gymnasium
 
-    for name, entry in _ENVIRONMENTS.items():
+    for name, entries in _ENVIRONMENTS.items():
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point=entry)
+            gymnasium.register(name, **entries)
 
 
 def __getattr__(name: str) -> Any:

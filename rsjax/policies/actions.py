@@ -3,7 +3,7 @@
 from typing import Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from rsjax.errors import UserError
 
@@ -20,8 +20,8 @@ def checked_actions(
     high: Float[np.ndarray, "*B A"],
     out_of_range: OutOfRange,
     unit: str,
-) -> tuple[Float32[np.ndarray, "*B A"], int]:
-    """Returns actions as float32 within their range, and how many of their numbers were clipped to it.
+) -> tuple[Float32[np.ndarray, "*B A"], Bool[np.ndarray, "*B A"]]:
+    """Returns actions as float32 within their range, and which of their numbers were clipped to it.
 
     Args:
         actions: what a policy answered.
@@ -51,4 +51,4 @@ def checked_actions(
             f"actions[{', '.join(map(str, where))}] is {given[where]:g}; expected {low[where]:g} to {high[where]:g}, "
             f'{unit}; out_of_range="clip" clips and counts instead'
         )
-    return np.clip(given, low, high), int(outside.sum())
+    return np.clip(given, low, high), outside

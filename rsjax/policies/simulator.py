@@ -116,7 +116,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
             box = self.action_space
             assert isinstance(box, spaces.Box)
             flat, clipped = checked_actions(action, box.low, box.high, self._out_of_range, UNIT)
-            done, self._clipped = flat.reshape(done.shape), self._clipped + clipped
+            done, self._clipped = flat.reshape(done.shape), self._clipped + int(clipped.sum())
         for number in range(len(done)):
             if callable(action):
                 done[number] = action(self._sim.state)

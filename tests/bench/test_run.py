@@ -27,6 +27,7 @@ def numbers() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parts, "CPU_PRODUCTS", ((64, 16, 32), (128, 64, 64)))
         patch.setattr(parts, "ACCELERATOR_PRODUCTS", ((64, 16, 32), (128, 64, 64)))
+        patch.setattr(parts, "ENVIRONMENTS", (1,))
         return bench(toy(), batch=2, horizons=(4, 6), budget=0.0)
 
 
@@ -46,6 +47,7 @@ def test_every_quantity_is_there_positive_and_flat(numbers: dict[str, Any]) -> N
         "sample_s_per_frame_uncached_6",
         "tokenizer_encode_frames_per_s",
         "tokenizer_decode_frames_per_s",
+        "environment_steps_per_s_1",
         "loader_clips_per_s",
         "feed_step_s",
         "data_wait_share",

@@ -49,22 +49,39 @@ class Decoder:
                 overwritten later.
         """
         tokens, cache = carry
-        b, _, cells = tokens["rgb"].shape
-        keys = self._step_keys(t)
         pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
-        mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
         actions = window_actions(self.arch, self.actions, base, t - 1, 2)
-        logits, cache = self.apply(pair, mask, actions, t - 1 - base, cache)
+        frame, cache = self.decode_pair(pair, actions, t - base, self._step_keys(t), cache)
+        return _put(tokens, frame, t), cache
+
+    def decode_pair(
+        self,
+        pair: Cells,
+        actions: Float[Array, "B 2 A"],
+        position: Array | int,
+        keys: Key[Array, "B steps"],
+        cache: Cache,
+    ) -> tuple[Frame, Cache]:
+        """Decodes the second of two frames: one pass over both, which commits the first one, then passes over it alone.
+
+        Args:
+            pair: tokens of both; the second one's have no effect.
+            actions: into both, as the window has them.
+            position: the second one's in the window.
+            cache: of the frames before the first one.
+        """
+        b, _, cells = pair["rgb"].shape
+        mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
+        logits, cache = self.apply(pair, mask, actions, position - 1, cache)
         frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1])
         frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
 
         def step(i: Array, frame: Frame) -> Frame:
             one = {name: grid[:, None] for name, grid in frame.tokens.items()}
-            logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], t - base, cache)
+            logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], position, cache)
             return self._unmask(keys[:, i], i, frame, {name: x[:, 0] for name, x in logits.items()})
 
-        frame = jax.lax.fori_loop(1, self.sample.steps, step, frame)
-        return _put(tokens, frame, t), cache
+        return jax.lax.fori_loop(1, self.sample.steps, step, frame), cache
 
     def encode_anew(self, base: Array, carry: tuple[Cells, Cache]) -> tuple[Cells, Cache]:
         """Fills the cache with the frames that a window beginning at ``base`` keeps, except the last of them."""
@@ -98,10 +115,15 @@ class Decoder:
         return _put(tokens, jax.lax.fori_loop(0, self.sample.steps, step, frame), t)
 
     def _step_keys(self, t: Array) -> Key[Array, "B steps"]:
-        return jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, t), self.sample.steps))(self.keys)
+        return jax.vmap(lambda key: step_keys(self.sample, key, t))(self.keys)
 
     def _unmask(self, keys: Array, step: Array | int, frame: Frame, logits: dict[str, Array]) -> Frame:
         return unmask_step(self.sample, self.arch.code_bits, keys, step, frame, logits, self.no_depth)
+
+
+def step_keys(sample: SampleConfig, key: Key[Array, ""], t: Array | int) -> Key[Array, " steps"]:
+    """Returns the keys of the decoding steps of a clip's frame t."""
+    return jax.random.split(jax.random.fold_in(key, t), sample.steps)
 
 
 def _put(tokens: Cells, frame: Frame, t: Array) -> Cells:

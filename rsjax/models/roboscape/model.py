@@ -26,6 +26,7 @@ from rsjax.models.roboscape import masking, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.generate import generate, plan, teacher_forced
+from rsjax.models.roboscape.imagine import Imagined
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.transformer import Transformer
@@ -225,6 +226,9 @@ class RoboScape(WorldModel[Batch]):
         self, params: Params, assets: Assets, prompt: Video, actions: Float[np.ndarray, "N T A"], depth: bool = True
     ) -> Video:
         return plan(self.config, self.architecture, self._codec(assets), params, prompt, actions, depth)
+
+    def imagine(self, params: Params, assets: Assets, clips: int) -> Imagined:
+        return Imagined(self.config, self.architecture, self._codec(assets), params, clips)
 
     def reconstruct(self, assets: Assets, video: Video) -> Video:
         codec = self._codec(assets)

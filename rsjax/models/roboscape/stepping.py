@@ -1,0 +1,173 @@
+"""Generates frame by frame while the actions come in, for many clips that began at different times.
+
+It gives the frames of :func:`rsjax.models.roboscape.rollout.rollout` with the same cache. A clip may have any length:
+what is kept of it is one window's tokens. As clips are at different positions, each one's window moves at its own time;
+a step in which none moves costs nothing for it.
+
+Axes: B clips, K frames kept, S cells, A numbers per frame that the action encoder reads.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Bool, Float, Int, Key
+
+from rsjax.clip import Array
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.decode import Decoder, step_keys
+from rsjax.models.roboscape.guidance import apply_guided, guided_cache
+from rsjax.models.roboscape.transformer import Cache
+from rsjax.models.roboscape.window import cache_slots, stride
+from rsjax.trainable import Params
+
+
+class Network(NamedTuple):
+    """The settings of a step; hashable, so that a program is compiled once for them."""
+
+    arch: Architecture
+    sample: SampleConfig
+    has_depth: bool  # False: no clip has depth, and a depth branch sees it masked
+
+
+@struct.dataclass
+class State:
+    """B clips between two frames.
+
+    Attributes:
+        tokens: of the last K frames by branch.
+        actions: into these frames, as a whole clip's (sums since its first frame).
+        base: the row of ``actions`` of the window's first frame.
+        cache: of the window's frames but the last; clips are axis 1.
+        position: the next frame's in its window.
+        frame: the next frame's number in its clip.
+        key: decides each clip's draws.
+    """
+
+    tokens: dict[str, Int[Array, "B K S"]]
+    actions: Float[Array, "B K A"]
+    base: Float[Array, "B A"]
+    cache: Cache
+    position: Int[Array, " B"]
+    frame: Int[Array, " B"]
+    key: Key[Array, " B"]
+
+
+AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0)  # type: ignore[arg-type]  # of clips
+
+
+def kept_frames(net: Network) -> int:
+    """Returns K: the frames that stay in a window when it moves, or the last one alone for a window that rolls."""
+    return 1 if net.arch.positions == "rotary" else net.arch.frames - stride(net.arch, net.sample)
+
+
+def begin(net: Network, clips: int) -> State:
+    """Returns the state of clips that have yet to be :func:`restart` ed."""
+    arch, kept = net.arch, kept_frames(net)
+    cache = guided_cache(arch, net.sample, clips, cache_slots(arch, 1))
+    copies = jax.tree.map(lambda x: x.reshape(len(x), clips, -1, *x.shape[2:]), cache)
+    numbers = jnp.ones(clips, jnp.int32)
+    return State(
+        tokens={name: jnp.zeros((clips, kept, arch.grid**2), jnp.int32) for name in arch.branches},
+        actions=jnp.zeros((clips, kept, arch.action_inputs)),
+        base=jnp.zeros((clips, arch.action_inputs)),
+        cache=copies,
+        position=numbers,
+        frame=numbers,
+        key=jax.random.split(jax.random.key(0), clips),
+    )
+
+
+def restart(
+    state: State, which: Bool[Array, " B"], first: dict[str, Int[Array, "B S"]], key: Key[Array, " B"]
+) -> State:
+    """Returns the state with some clips begun anew.
+
+    Args:
+        which: those clips.
+        first: tokens of all clips' first frames; those of other clips have no effect.
+        key: likewise.
+    """
+
+    def pick(new: Any, old: Any) -> Any:
+        return jnp.where(which.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    tokens = {name: grid.at[:, -1].set(pick(first[name], grid[:, -1])) for name, grid in state.tokens.items()}
+    # The cache stays: what is in it has positions that a clip has yet to reach, and is not read.
+    return replace(
+        state,
+        tokens=tokens,
+        actions=pick(0.0, state.actions),
+        base=pick(0.0, state.base),
+        position=pick(1, state.position),
+        frame=pick(1, state.frame),
+        key=pick(key, state.key),
+    )
+
+
+def advance(net: Network, params: Params, state: State, actions: Float[Array, "B A"]) -> State:
+    """Decodes the next frame of every clip; its tokens are ``state.tokens[name][:, -1]`` then.
+
+    Args:
+        actions: the row into that frame, as in a whole clip's inputs.
+    """
+    if net.arch.positions == "learned":
+        full = state.position == net.arch.frames
+        moved = jax.vmap(partial(_move_window, net, params), in_axes=(AXES, 0), out_axes=AXES)
+        state = jax.lax.cond(full.any(), moved, lambda kept, full: kept, state, full)
+    return jax.vmap(partial(_decode, net, params), in_axes=(AXES, 0), out_axes=AXES)(state, actions)
+
+
+def _decoder(net: Network, params: Params) -> Decoder:
+    hidden = jnp.ones(1, bool) if net.arch.use_depth and not net.has_depth else None
+    unread: Any = None  # decode_pair takes one frame's actions and keys itself
+    apply = partial(apply_guided, net.arch, net.sample, params, no_depth=hidden)
+    return Decoder(net.arch, net.sample, apply, unread, unread, hidden)
+
+
+def _decode(net: Network, params: Params, state: State, actions: Float[Array, " A"]) -> State:
+    """Decodes one clip's next frame; without the axis over clips."""
+    pair = {name: jnp.stack([grid[-1], grid[-1]])[None] for name, grid in state.tokens.items()}
+    rows = _window_rows(net.arch, jnp.stack([state.actions[-1], actions]), state.base, state.position - 1)[None]
+    keys = step_keys(net.sample, state.key, state.frame)[None]
+    frame, cache = _decoder(net, params).decode_pair(pair, rows, state.position, keys, state.cache)
+    return replace(
+        state,
+        tokens={name: jnp.append(grid[1:], frame.tokens[name], axis=0) for name, grid in state.tokens.items()},
+        actions=jnp.append(state.actions[1:], actions[None], axis=0),
+        cache=cache,
+        position=state.position + 1,
+        frame=state.frame + 1,
+    )
+
+
+def _move_window(net: Network, params: Params, state: State, full: Bool[Array, ""]) -> State:
+    """Moves one clip's window if it is full, and fills the cache with the frames that stay but the last."""
+    kept = kept_frames(net)
+    base, cache = state.actions[0], state.cache
+    if kept > 1:
+        tokens = {name: grid[None, :-1] for name, grid in state.tokens.items()}
+        rows = _window_rows(net.arch, state.actions[:-1], base, 0)[None]
+        mask = jnp.zeros((1, kept - 1, net.arch.grid**2), bool)
+        _, cache = _decoder(net, params).apply(tokens, mask, rows, 0, cache)
+    choose = partial(jax.tree.map, lambda new, old: jnp.where(full, new, old))
+    return replace(
+        state,
+        base=choose(base, state.base),
+        cache=choose(cache, state.cache),
+        position=choose(jnp.full_like(state.position, kept), state.position),
+    )
+
+
+def _window_rows(
+    arch: Architecture, rows: Float[Array, "T A"], base: Float[Array, " A"], start: Int[Array, ""] | int
+) -> Float[Array, "T A"]:
+    """Returns actions as in a clip that begins with the window, of frames from position ``start`` on."""
+    if arch.integrate_actions:
+        rows = rows - jnp.where(jnp.arange(rows.shape[-1]) >= rows.shape[-1] // 2, base, 0.0)
+    first = (start + jnp.arange(len(rows)) == 0)[:, None]
+    return jnp.where(first, 0.0, rows) if arch.positions == "learned" else rows

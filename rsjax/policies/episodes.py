@@ -1,0 +1,188 @@
+"""Episodes in a world model, each judged at every frame: what both environments consist of.
+
+Axes: B episodes, N of them, S×S pixels, A action dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Bool, Float, Float32
+
+from rsjax.clip import Video
+from rsjax.config import Config
+from rsjax.data.normalization import Normalization
+from rsjax.errors import UserError
+from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.trained import load
+from rsjax.policies.actions import OutOfRange, checked_actions
+from rsjax.policies.simulator import FAR, STEPS, UNIT, Observation
+from rsjax.policies.starts import Starts
+from rsjax.policies.verdicts import HISTORY, LABELS, Judge
+
+SPREAD = 5.0  # standard deviations around the mean to which actions of recordings are clipped
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of an environment.
+
+    Attributes:
+        data_dir: directory of simulated data sets, which has the first frames of a run on simulated clips.
+        store: the new path of the run's store of ingested clips, if it was moved.
+        split: the clips whose first frames episodes begin with.
+        max_steps: steps after which an episode is truncated; it may be longer than the model's window.
+        judge: decides reward and termination; None: nothing does, every reward is 0.
+        out_of_range: whether actions out of their space are clipped and counted ("clip"), or an error ("refuse").
+    """
+
+    data_dir: Path | str = "data"
+    store: Path | str | None = None
+    split: str = "test"
+    max_steps: int = STEPS
+    judge: Judge | None = None
+    out_of_range: OutOfRange = "clip"
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step gave, for all B episodes.
+
+    Attributes:
+        seen: the observations.
+        success: where the judge sees the task done.
+        over: which have had all their steps.
+        info: as :meth:`Episodes.info`, and "action": the actions after clipping.
+    """
+
+    seen: Observation
+    success: Bool[np.ndarray, " B"]
+    over: Bool[np.ndarray, " B"]
+    info: dict[str, np.ndarray]
+
+
+class Episodes:
+    """B episodes in the world model of a run, stepped together on the device and restarted one by one.
+
+    Args:
+        run: a run directory, or its trained model.
+        count: B; None for a single one, whose actions have no leading axis.
+        settings: those of the environment.
+
+    Attributes:
+        action_space: of one episode.
+        observation_space: likewise.
+
+    Raises:
+        UserError: the run is missing or unfinished, or its family of models cannot generate frame by frame.
+    """
+
+    def __init__(self, run: Path | str | TrainedModel, count: int | None, settings: Settings) -> None:
+        if settings.max_steps < 1:
+            raise UserError(f"max_steps is {settings.max_steps}; an episode has at least 1 step")
+        self._lead = () if count is None else (count,)
+        count = count or 1
+        trained = run if isinstance(run, TrainedModel) else load(run)
+        config, where = trained.config, Path("." if isinstance(run, TrainedModel) else run)
+        norm, size = trained.assets.normalization, config.clips.image_size
+        self._imagination = trained.model.imagine(trained.params, trained.assets, count)
+        self._depth = config.model.uses_depth and norm.depth_range is not None
+        store = Path(settings.store) if settings.store else None
+        self._starts = Starts(config, where, Path(settings.data_dir), store, settings.split, self._depth)
+        self._settings = settings
+        self._low, self._high, self._unit = action_range(config, norm)
+        self._recent = np.zeros((count, HISTORY, size, size, 3), np.uint8)
+        self._steps, self._clipped = np.zeros(count, int), np.zeros(count, int)
+        self._clip = np.full(count, -1)
+        self.action_space = spaces.Box(self._low, self._high)
+        shapes: dict[str, Any] = {"rgb": spaces.Box(0, 255, (size, size, 3), np.uint8)}
+        if self._depth:
+            shapes["depth"] = spaces.Box(0.0, max(FAR, norm.depth_range[1]), (size, size))  # type: ignore[index]
+        self.observation_space = spaces.Dict(shapes)
+
+    def restart(
+        self, which: Bool[np.ndarray, " B"], rng: Sequence[np.random.Generator], options: dict[str, Any]
+    ) -> Observation:
+        """Begins N episodes anew and returns their first observations, as the model sees them.
+
+        Args:
+            which: those episodes.
+            rng: chooses the clip and the draws of each of the N.
+            options: of the environments' ``reset``: "rgb" and "depth", or "clip"; "draw".
+
+        Raises:
+            StartError: the given frame does not fit, or the run's clips are missing.
+        """
+        starts = [self._starts.choose(each, options) for each in rng]
+        draws = [int(options.get("draw", each.integers(2**31))) for each in rng]
+        first = Video(
+            np.concatenate([start.video.rgb for start in starts]),
+            np.concatenate([start.video.depth for start in starts]) if self._depth else None,  # type: ignore[misc]
+        )
+        seen = self._imagination.restart(which, first, np.array(draws))
+        self._recent[which] = seen.rgb  # the first frame, repeated
+        self._steps[which] = self._clipped[which] = 0
+        self._clip[which] = [start.clip for start in starts]
+        return _observation(seen)
+
+    def step(self, actions: Any) -> Step:
+        """Generates the next frame of every episode.
+
+        Args:
+            actions: (B, A) in the recording's units; (A,) for a single episode.
+
+        Raises:
+            ActionError: they have another shape or a value that is not finite, or are refused as out of range.
+        """
+        shape = (*self._lead, *self._low.shape)
+        low, high = np.broadcast_to(self._low, shape), np.broadcast_to(self._high, shape)
+        done, outside = checked_actions(actions, low, high, self._settings.out_of_range, self._unit)
+        count = len(self._steps)
+        video = self._imagination.step(done.reshape(count, -1))
+        self._clipped += outside.reshape(count, -1).sum(1)
+        self._recent = np.concatenate([self._recent[:, 1:], video.rgb], axis=1)
+        self._steps += 1
+        verdict = self.verdict()
+        info = self.info(verdict) | {"action": done.reshape(count, -1)}
+        return Step(_observation(video), info["success"], self._steps >= self._settings.max_steps, info)
+
+    def verdict(self) -> Float[np.ndarray, "B 3"]:
+        """Returns the probability of each label at the present frames; zeros without a judge."""
+        judge = self._settings.judge
+        return np.zeros((len(self._steps), len(LABELS))) if judge is None else judge(self._recent)
+
+    def info(self, verdict: Float[np.ndarray, "B 3"]) -> dict[str, np.ndarray]:
+        """Returns facts of all episodes: label, its probabilities, success, numbers clipped so far, clip."""
+        judged = self._settings.judge is not None
+        labels = [LABELS[i] for i in verdict.argmax(-1)] if judged else ["unjudged"] * len(verdict)
+        return {
+            "success": np.array(labels) == LABELS[0],
+            "label": np.array(labels, object),
+            "verdict": verdict,
+            "clipped": self._clipped.copy(),
+            "clip": self._clip.copy(),
+        }
+
+
+def action_range(
+    config: Config, normalization: Normalization
+) -> tuple[Float32[np.ndarray, " A"], Float32[np.ndarray, " A"], str]:
+    """Returns the least and greatest actions, and what they are.
+
+    The simulator's are from -1 to 1; a recording's, of which a run knows mean and deviation, ``SPREAD`` deviations
+    around the mean.
+    """
+    width = config.clips.action_dim
+    if not config.data.key:
+        return np.full(width, -1, np.float32), np.full(width, 1, np.float32), UNIT
+    mean, std = np.array(normalization.action_mean), np.maximum(normalization.action_std, 1e-3)
+    low, high = mean - SPREAD * std, mean + SPREAD * std
+    return low.astype(np.float32), high.astype(np.float32), "in the recording's units, as the clips' actions"
+
+
+def _observation(video: Video) -> Observation:
+    seen = {"rgb": video.rgb[:, -1]}
+    return seen if video.depth is None else seen | {"depth": video.depth[:, -1]}

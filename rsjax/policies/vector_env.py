@@ -1,0 +1,84 @@
+"""Many episodes in a trained world model, batched on the device, as a Gymnasium vector environment."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from rsjax.models.trained import TrainedModel
+from rsjax.policies.episodes import Episodes, Settings
+from rsjax.policies.simulator import Observation
+
+
+class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """``num_envs`` environments like :class:`rsjax.policies.env.WorldModelEnv`, of which one program steps all.
+
+    An episode that ended begins anew in the next step, whose action it ignores (Gymnasium's NEXT_STEP mode). Facts in
+    ``info`` are arrays over the environments.
+
+    Args:
+        run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
+        num_envs: their number.
+        settings: fields of :class:`rsjax.policies.episodes.Settings`.
+
+    Raises:
+        UserError: the run is missing or unfinished, or its family of models cannot generate frame by frame.
+    """
+
+    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - Gymnasium's own type
+
+    def __init__(self, run: Path | str | TrainedModel, num_envs: int = 1, **settings: Any) -> None:
+        self._episodes = Episodes(run, num_envs, Settings(**settings))
+        self.num_envs = num_envs
+        self.single_action_space = self._episodes.action_space
+        self.single_observation_space = self._episodes.observation_space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._over = np.zeros(num_envs, bool)
+        self._rng: list[np.random.Generator] = []
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins all episodes; arguments as for one environment, and environment i takes the seed + i.
+
+        With a list of seeds, each takes its own. Options hold for all.
+        """
+        if seed is not None or not self._rng:
+            seeds = (
+                [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+            )
+            self._rng = [np.random.default_rng(each) for each in seeds]
+        self._over[:] = False
+        seen = self._episodes.restart(np.ones(self.num_envs, bool), self._rng, options or {})
+        return seen, _marked(self._episodes.info(self._episodes.verdict()))
+
+    def step(self, actions: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Generates the next frame of every episode; those that ended begin anew instead.
+
+        Args:
+            actions: (num_envs, A), in the recording's units.
+
+        Raises:
+            ActionError: they have another shape or a value that is not finite, or are refused as out of range.
+        """
+        if not self._rng:
+            raise gymnasium.error.ResetNeeded("reset the environments before their first step")
+        made, again = self._episodes.step(actions), self._over
+        seen, info, success, over = made.seen, made.info, made.success, made.over
+        if again.any():
+            first = self._episodes.restart(again, [self._rng[i] for i in np.flatnonzero(again)], {})
+            for name, values in first.items():
+                seen[name] = seen[name].copy()  # jax's own arrays cannot be written
+                seen[name][again] = values
+            info |= self._episodes.info(self._episodes.verdict())
+            success, over = success & ~again, over & ~again
+        self._over = success | over
+        return seen, success.astype(np.float64), success, over, _marked(info)
+
+
+def _marked(info: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Adds Gymnasium's masks of the environments that have a fact: all."""
+    return info | {f"_{name}": np.ones(len(values), bool) for name, values in info.items()}

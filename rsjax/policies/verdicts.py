@@ -1,0 +1,27 @@
+"""The interface of judges, which say from pictures whether a task is done.
+
+Axes: B videos, T frames, H×W pixels.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+LABELS = ("success", "fail", "uninterpretable")
+SUCCESS, FAIL, UNINTERPRETABLE = range(3)
+HISTORY = 4  # frames that judges of this package look at; fewer are completed by repeating the first one
+
+
+class Judge(Protocol):
+    """Judges videos by their last frames."""
+
+    def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
+        """Returns the probability of each of ``LABELS`` at the end of each video."""
+        ...
+
+
+def last_frames(frames: UInt8[np.ndarray, "B T H W 3"]) -> UInt8[np.ndarray, "B 4 H W 3"]:
+    """Returns the last ``HISTORY`` frames of videos, completed by repeating the first one."""
+    missing = max(0, HISTORY - frames.shape[1])
+    return np.concatenate([np.repeat(frames[:, :1], missing, axis=1), frames[:, -HISTORY:]], axis=1)

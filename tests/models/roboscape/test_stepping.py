@@ -1,0 +1,54 @@
+"""Frame by frame with actions that come in one at a time: the frames of a rollout."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rsjax.config import SampleConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.stepping import Network, advance, begin, restart
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
+
+SUMS = replace(DUAL, action_inputs=4, integrate_actions=True)
+GUIDED = replace(RGB, action_dropout=0.1, positions="rotary")
+FRAMES = 15
+
+
+@pytest.mark.parametrize(
+    ("model", "sample"),
+    [
+        (SUMS, SampleConfig(steps=2, temperature=1.0, window_stride=2)),
+        (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
+    ],
+    ids=["dual-sums", "rotary-guided"],
+)
+def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
+    model: Architecture, sample: SampleConfig
+) -> None:
+    params, (tokens, actions) = random_params(model), given(model, 1, FRAMES)
+    expected = rollout(model, sample, params, tokens, actions, KEY, cached=False)
+    net, late = Network(model, sample, True), 4
+    first = {name: jnp.asarray(grid.reshape(BATCH, -1)) for name, grid in tokens.items()}
+    keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(BATCH))
+    step = jax.jit(partial(advance, net))
+    state = restart(begin(net, BATCH), jnp.ones(BATCH, bool), first, keys)
+    made: dict[str, list[list[np.ndarray]]] = {name: [[], []] for name in first}
+    for number in range(1, FRAMES):
+        if number == late:  # the second clip starts over, in the middle of its window
+            state = restart(state, jnp.array([False, True]), first, keys)
+        rows = np.stack([actions[0, number], actions[1, number if number < late else number - late + 1]])
+        state = step(params, state, rows)
+        for name, grid in state.tokens.items():
+            for clip in range(BATCH):
+                made[name][clip].append(np.asarray(grid[clip, -1]))
+    for name, grid in expected.items():
+        truth = np.asarray(grid).reshape(BATCH, FRAMES, -1)
+        np.testing.assert_array_equal(made[name][0], truth[0, 1:], err_msg=name)
+        np.testing.assert_array_equal(made[name][1][: late - 1], truth[1, 1:late], err_msg=name)
+        np.testing.assert_array_equal(made[name][1][late - 1 :], truth[1, 1 : FRAMES - late + 1], err_msg=name)
+        assert np.ptp(truth[:, 1:]) > 0
