@@ -29,6 +29,7 @@ ORDER = [
     "pipeline",
     "policies",
     "ablation",
+    "paper",
     "bench",
     "describe",
     "convert",

@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -62,17 +62,7 @@ def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "
     runs = runs_of(grid, out, data)
     states: dict[str, State] = {}
     for number, name in enumerate(chosen, 1):
-        with lock(runs[name].lock_file) as free:
-            if not free:
-                states[name], text = "running", f"left to {holder(runs[name].lock_file)}, which runs it"
-            elif read_metrics(runs[name]) is not None:
-                states[name], text = "finished", "finished, skipped"
-            else:
-                text = f"in {runs[name].directory}"
-            stage(number, len(chosen), name, text)
-            if name not in states:
-                others = [run for run in runs.values() if run is not runs[name]]
-                states[name] = _run_cell(runs[name], others, out / "shared", command)
+        states[name] = run_cell(name, runs, out / "shared", (number, len(chosen)), command)
         write_tables(out, data)
     return states
 
@@ -80,6 +70,32 @@ def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "
 def runs_of(grid: Grid, out: Path, data: Path) -> dict[str, Run]:
     """Returns the run of every cell, by name."""
     return {name: Run(config, out / name, data) for name, config in grid.cells.items()}
+
+
+def run_cell(name: str, runs: Mapping[str, Run], shared: Path, place: tuple[int, int], command: str) -> State:
+    """Runs a cell unless it is finished or another process runs it. A failure is recorded in its ``error.json``.
+
+    Args:
+        name: of the cell among ``runs``, from which it may take what they have in common.
+        shared: the directory where shared stages are made and kept.
+        place: the cell's number and that of all, for the headline.
+
+    Returns:
+        Its state; "running" where another process runs it.
+
+    Raises:
+        Preempted: SIGTERM; the unfinished cell is saved.
+    """
+    run = runs[name]
+    with lock(run.lock_file) as free:
+        if not free:
+            stage(*place, name, f"left to {holder(run.lock_file)}, which runs it")
+            return "running"
+        if read_metrics(run) is not None:
+            stage(*place, name, "finished, skipped")
+            return "finished"
+        stage(*place, name, f"in {run.directory}")
+        return _run_cell(run, [other for other in runs.values() if other is not run], shared, command)
 
 
 def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> State:

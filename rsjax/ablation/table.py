@@ -73,7 +73,7 @@ class Row:
     @property
     def label(self) -> str:
         """``model.use_depth True, model.loss.use_keypoints False``."""
-        return ", ".join(f"{name} {value}" for name, value in self.values.items()) or "as configured"
+        return ", ".join(f"{name} {value}".strip() for name, value in self.values.items()) or "as configured"
 
     @property
     def reasons(self) -> dict[str, str]:

@@ -1,11 +1,11 @@
 """Reads and writes one stage of a curriculum as a word of a command line: ``simple:2``, ``difficult:3``.
 
 A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; ``+`` joins its parts. A part is
-``DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][@STORE]``: shell patterns joined by commas (``all`` matches everything), a
-weight, and the directory of another store. So ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two
-picking or placing clips of the run's own for each difficult clip of run b, and ``all/all/kitchen*:1`` the clips in
-kitchens. Names that contain one of ``: + @ = / ,`` cannot be written this way; in Python,
-:class:`CurriculumStageConfig` takes them.
+``DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][#CLIPS][@STORE]``: shell patterns joined by commas (``all`` matches
+everything), a weight, how many of the clips count (the first), and the directory of another store. So
+``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two picking or placing clips of the run's own for each
+difficult clip of run b, and ``all/all/kitchen*:1`` the clips in kitchens. Names that contain one of ``: + @ = / , #``
+cannot be written this way; in Python, :class:`CurriculumStageConfig` takes them.
 """
 
 import math
@@ -13,7 +13,7 @@ import math
 from rsjax.config.fields import ConfigError
 from rsjax.config.train import ComponentConfig, CurriculumStageConfig
 
-GRAMMAR = "DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][@STORE][+…]:EPOCHS[:restart]"
+GRAMMAR = "DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][#CLIPS][@STORE][+…]:EPOCHS[:restart]"
 EXAMPLE = "simple:2 or difficult:3"
 _COLUMNS = (("difficulties", "difficulty"), ("tasks", "task"), ("scenes", "scene"))  # field, and one of its words
 
@@ -45,6 +45,7 @@ def _parse_part(text: str, part: str) -> ComponentConfig:
     body, at, store = part.partition("@")
     if at and not store:
         raise _error(text, "nothing follows its @")
+    body, number_sign, clips = body.partition("#")
     labels, equals, weight = body.partition("=")
     words = labels.split("/")
     if len(words) > len(_COLUMNS):
@@ -54,6 +55,7 @@ def _parse_part(text: str, part: str) -> ComponentConfig:
         **patterns,
         store=store,
         weight=_number(text, "weight", weight) if equals else 1.0,
+        clips=_count(text, clips) if number_sign else 0,
     )
 
 
@@ -62,7 +64,8 @@ def _format_part(part: ComponentConfig) -> str:
     while len(words) > 1 and words[-1] == "*":
         words.pop()
     weight = "" if part.weight == 1 else f"={_plain(part.weight)}"
-    return f"{'/'.join(words)}{weight}{'@' if part.store else ''}{part.store}"
+    clips = f"#{part.clips}" if part.clips else ""
+    return f"{'/'.join(words)}{weight}{clips}{'@' if part.store else ''}{part.store}"
 
 
 def _patterns(text: str, name: str, joined: str) -> tuple[str, ...]:
@@ -80,6 +83,12 @@ def _number(text: str, name: str, value: str) -> float:
     if not (math.isfinite(number) and number > 0):
         raise _error(text, f"{name} {value!r} is not a number above 0")
     return number
+
+
+def _count(text: str, value: str) -> int:
+    if not (value.isascii() and value.isdecimal() and int(value)):
+        raise _error(text, f"{value!r} is no number of clips")
+    return int(value)
 
 
 def _plain(value: float) -> str:

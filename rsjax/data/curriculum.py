@@ -96,7 +96,7 @@ def check_stages(loop: LoopConfig, own: Store) -> None:
 
 
 def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
-    """Returns the numbers of the records that pass a component's patterns; None if every record does.
+    """Returns the numbers of the records that pass a component's patterns, the first ``part.clips``; None if all do.
 
     Raises:
         StoreError: none passes; the message lists the store's tasks and difficulties.
@@ -104,7 +104,7 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
     patterns = {"difficulty": part.difficulties, "task": part.tasks, "scene": part.scenes}
     patterns = {name: allowed for name, allowed in patterns.items() if "*" not in allowed}
     if not patterns:
-        return None
+        return np.arange(min(part.clips, len(store.source(SPLIT)))) if part.clips else None
     labels = store.labels(SPLIT)
     if missing := [name for name in patterns if name not in labels.words]:
         raise StoreError(
@@ -122,7 +122,7 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
             f"(--train.curriculum all:5 reads everything), or label the clips when you ingest them "
             f"(--difficulty, --scene)"
         )
-    return chosen
+    return chosen[: part.clips or None]
 
 
 def _resolve(

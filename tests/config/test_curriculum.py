@@ -30,6 +30,7 @@ PARTS = st.builds(
     scenes=st.lists(WORDS, min_size=1).map(tuple),
     store=st.sampled_from(["", "runs/b/tokens/store", "/data/a=b"]),
     weight=POSITIVE,
+    clips=st.integers(0, 1000),
 )
 STAGES = st.builds(CurriculumStageConfig, st.lists(PARTS, min_size=1).map(tuple), POSITIVE, st.booleans())
 
@@ -103,6 +104,8 @@ def test_full_size_presets_have_the_authors_curriculum_and_it_can_be_dropped() -
         ("simple=x:2", "weight 'x' is not a number above 0"),
         ("simple=-1:2", "weight '-1' is not a number above 0"),
         ("simple@:2", "nothing follows its @"),
+        ("simple#0:2", "'0' is no number of clips"),
+        ("simple#few:2", "'few' is no number of clips"),
         (":2", "a difficulty is empty; write all to match every difficulty"),
         ("simple/:2", "a task is empty"),
         ("simple/all/:2", "a scene is empty"),

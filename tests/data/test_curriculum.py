@@ -50,6 +50,16 @@ def test_a_filter_by_labels_is_a_filter_by_reading_every_record(
             choose(part, own)
 
 
+def test_a_number_of_clips_takes_the_first_that_pass(own: Store) -> None:
+    everything, simple = choose(ComponentConfig(clips=7), own), ComponentConfig(difficulties=("simple",))
+    assert everything is not None and everything.tolist() == list(range(7))
+    all_of_them, few = choose(simple, own), choose(replace(simple, clips=3), own)
+    assert all_of_them is not None and few is not None and few.tolist() == all_of_them[:3].tolist()
+    enough = choose(ComponentConfig(clips=COUNT + 5), own)
+    assert enough is not None and len(enough) == COUNT
+    assert plan(loop("all#8:3"), own, transform, own.path)[0].steps == 8 * 3 // 4
+
+
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
     for check in (
         lambda: check_stages(loop("hard/pick*:1"), own),

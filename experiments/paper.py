@@ -1,0 +1,66 @@
+"""Puts the paper's claims to the test in small. ``python -m experiments.paper --budget 3h``"""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.cli import main_errors, parse_options
+from rsjax.config import presets
+from rsjax.runtime import tune_process
+
+PROG = "python -m experiments.paper"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Trains and evaluates what the paper's claims need and is not there yet, and judges each claim.
+
+    The budget decides how large the trainings are and which of them are made; the same command goes on where it was
+    stopped. The report is written after each training.
+    """
+
+    budget: str = "3h"
+    """Time that everything may take, on 2 CPU cores: 30min, 3h, 12h, 1h30min …"""
+    only: tuple[str, ...] = ()
+    """Claims to test, by name or shell pattern (table1, departure-*). Default: all."""
+    dir: Path = Path("runs/paper")
+    """Directory of trainings and report; those of several budgets can share it."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    preset: str = "tiny"
+    """The preset that the trainings are variations of."""
+    dry_run: bool = False
+    """Print the trainings with their estimated minutes and states, and run nothing."""
+    report: bool = False
+    """Write the report of what has finished, and run nothing."""
+
+
+@main_errors()
+def main() -> None:
+    """Runs what has not finished, and prints the report's path; exits with 1 where a training failed."""
+    tune_process()
+    options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
+    preset = presets.get(options.preset)
+    # Loads JAX, so only after the arguments have been parsed.
+    from rsjax.paper import run
+    from rsjax.paper.budget import parse_duration, scale
+    from rsjax.paper.claim import chosen, claims
+    from rsjax.paper.plan import make_plan
+
+    known = claims()
+    wanted = chosen(options.only, known)
+    plan = make_plan(tuple(known.values()), wanted, scale(preset, parse_duration(options.budget)), options.data_dir)
+    command = shlex.join([*PROG.split(), *sys.argv[1:]])
+    run.print_plan(plan, options.dir, options.data_dir)
+    if options.dry_run:
+        return
+    states = {} if options.report else run.run_plan(plan, options.dir, options.data_dir, command)
+    page = run.write(plan, options.dir, options.data_dir, command)
+    print(f"report: {page.absolute()} (and .md, .json)")
+    if "failed" in states.values():
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The paper's claims, each trained for, measured and judged in small by ``python -m experiments.paper``."""

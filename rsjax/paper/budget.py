@@ -1,0 +1,161 @@
+"""How large the cells of a budget are, and how long they take.
+
+The constants are of ``tiny`` on 2 cores of an AMD EPYC, measured 2026-11-22. A budget determines the sizes through them
+alone, not through the machine at hand: so the same budget always means the same cells, and a command that is started
+again finds them.
+"""
+
+import re
+from dataclasses import dataclass, fields, replace
+from functools import cache
+
+from rsjax.config import Config, LoopConfig, TokenizerConfig, require
+from rsjax.config.leaves import with_values
+from rsjax.models.base import create_model
+from rsjax.tokenizers.flops import tokenizer_flops
+
+EPISODE = 0.41  # seconds to simulate an episode
+TOKENS = 1 / 35  # seconds to make a clip's tokens
+STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
+TOKENIZER_RATE = 7.1e10  # operations a second of the tokenizer's training
+START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
+EVALUATION, LOCALISER, ROLLOUT = 25.0, 0.04, 0.25  # seconds: of each evaluation, a localiser's step, a rollout
+
+COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # of a budget
+ROLLOUTS_SHARE, LOCALISER_SHARE = 0.2, 0.08  # of a cell
+# Trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with three seeds,
+# of which half are without depth), and how their number grows with the budget.
+CELLS, GROWTH = 12.0, 0.42
+LEAST_STEPS, LEAST_TOKENIZER_STEPS, LEAST_EPISODES, LEAST_CLIPS = 40, 100, 60, 2
+SEEDS = 3
+_UNITS = {"s": 1, "sec": 1, "min": 60, "m": 60, "h": 3600, "d": 86400}
+_TERM = re.compile(r"(\d+(?:\.\d+)?)\s*(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")\s*")
+HOUR = 3600.0
+
+
+def parse_duration(text: str) -> float:
+    """Returns the seconds of a duration such as ``30min``, ``3h`` or ``1h30min``.
+
+    Raises:
+        ConfigError: the text is no duration above 0.
+    """
+    found = list(_TERM.finditer(text))
+    seconds = sum(float(term[1]) * _UNITS[term[2]] for term in found)
+    whole = "".join(term[0] for term in found) == text.strip()
+    require(whole and seconds > 0, f"--budget {text}: not a duration; write 30min, 3h, 12h or 1h30min")
+    return seconds
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The sizes of all cells of a budget.
+
+    Attributes:
+        seconds: the budget.
+        base: the base preset at this size.
+        share: its trained seconds relative to the whole preset's; other presets' loops are cut to the same share.
+    """
+
+    seconds: float
+    base: Config
+    share: float
+
+
+def scale(preset: Config, seconds: float) -> Scale:
+    """Returns the preset with as many episodes, steps and scored clips as suit a budget, at most its own."""
+    sim, tokenizer, evaluation = preset.sim, preset.tokenizer_train, preset.eval
+    each = SPENT_IN_CELLS * seconds / (CELLS * (seconds / (HOUR / 2)) ** GROWTH)
+    episodes = min(sim.episodes, max(LEAST_EPISODES, _round(COLLECT_SHARE * seconds / EPISODE)))
+    rollouts, draws = ROLLOUTS_SHARE * each / ROLLOUT, evaluation.action_draws
+    draws = draws if rollouts >= evaluation.clips * (1 + 2 * draws) else 1
+    clips = max(LEAST_CLIPS, min(_round(rollouts / (1 + 2 * draws)), episodes // 6))
+    clips = min(evaluation.clips, sim.test_episodes, clips)
+    per_step = tokenizer_step_seconds(preset)
+    tokenizer_steps = min(tokenizer.steps, max(LEAST_TOKENIZER_STEPS, _round(TOKENIZER_SHARE * seconds / per_step)))
+    values = {
+        "sim.episodes": episodes,
+        "sim.test_episodes": clips,
+        "tokenizer_train.steps": tokenizer_steps,
+        "eval.clips": clips,
+        "eval.batch_size": min(evaluation.batch_size, clips),
+        "eval.action_draws": draws,
+        "eval.localiser_steps": min(evaluation.localiser_steps, max(1, _round(LOCALISER_SHARE * each / LOCALISER))),
+        "train.eval_every": 0,
+        "tokenizer_train.eval_every": 0,
+    }
+    base = with_values(preset, values)
+    steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
+    base = with_values(base, {"train.steps": min(preset.train.steps, max(LEAST_STEPS, _round(steps)))})
+    return Scale(seconds, base, trained_seconds(base) / trained_seconds(preset))
+
+
+def _round(number: float) -> int:
+    """Rounds to two digits, so that sizes are readable."""
+    return int(float(f"{max(number, 0):.2g}"))
+
+
+def cut(config: Config, share: float) -> Config:
+    """Returns the configuration with each of its training loops cut to a share of its steps, at least one."""
+    loops = {
+        field.name: replace(loop, steps=max(1, round(share * loop.steps)), eval_every=0)
+        for field in fields(config)
+        if isinstance(loop := getattr(config, field.name), LoopConfig)
+    }
+    return replace(config, **loops)  # type: ignore[arg-type]
+
+
+def train_flops(config: Config) -> int | None:
+    """Returns the operations of the world model's whole training; None for a family without counts."""
+    per_clip = create_model(config).flops(config.clips.frames).get("train")
+    return None if per_clip is None else config.train.steps * config.train.batch_size * per_clip
+
+
+def step_seconds(config: Config) -> float:
+    """Returns the seconds of a step of the world model; of a family without counts, 0."""
+    flops = train_flops(config)
+    return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
+
+
+def tokenizer_step_seconds(config: Config) -> float:
+    """Returns the seconds of a step of the tokenizer."""
+    loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
+    return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
+
+
+@cache
+def _image_flops(tokenizer: TokenizerConfig, image_size: int) -> int:
+    return sum(tokenizer_flops(tokenizer, image_size).values())
+
+
+def collect_seconds(config: Config) -> float:
+    """Returns the seconds of the simulation."""
+    return 0.0 if config.data.key else EPISODE * config.sim.episodes
+
+
+def tokenizer_seconds(config: Config) -> float:
+    """Returns the seconds of the tokenizer's training, and of making tokens."""
+    if not config.model.uses_tokenizer or config.model.own_autoencoder is not None:
+        return 0.0
+    return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * config.sim.episodes
+
+
+def trained_seconds(config: Config) -> float:
+    """Returns the seconds of all steps of tokenizer and world model."""
+    return config.tokenizer_train.steps * tokenizer_step_seconds(config) + config.train.steps * step_seconds(config)
+
+
+def evaluation_seconds(config: Config) -> float:
+    """Returns the seconds of the evaluation and of the report."""
+    rollouts = config.eval.clips * (1 + 2 * config.eval.action_draws)
+    return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
+
+
+def cell_seconds(config: Config, base: Config) -> float:
+    """Returns the seconds of a cell beyond what it shares.
+
+    A family with an autoencoder of its own, or without counts of operations, takes the time that it gets: the base
+    preset's.
+    """
+    per_step = step_seconds(config) if config.model.own_autoencoder is None else 0.0
+    training = config.train.steps * per_step if per_step else trained_seconds(base)
+    return START + training + evaluation_seconds(config)

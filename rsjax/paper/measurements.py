@@ -1,0 +1,73 @@
+"""Scores of a trained run beyond its own evaluation, which claims name: other clips, longer rollouts, other judges.
+
+A measurement is a function of a run that returns a score per clip by name. It runs once per run; the result lies in the
+run's directory.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from rsjax.config import require
+from rsjax.errors import UserError
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.files import FileError, read_json, write_json
+from rsjax.pipeline.run import Run
+from rsjax.progress import note
+
+Scores = Mapping[str, Sequence[float]]  # a number per clip, in the same order for all runs
+Measurement = Callable[[Run], Scores]
+FOLDER = "measured"
+
+_MEASUREMENTS: dict[str, Measurement] = {}
+
+
+def measurement(name: str) -> Callable[[Measurement], Measurement]:
+    """Registers a measurement under a name for :attr:`rsjax.paper.claim.Comparison.measurement`.
+
+    Raises:
+        ConfigError: another one has that name.
+    """
+
+    def register(function: Measurement) -> Measurement:
+        require(name not in _MEASUREMENTS, f"two measurements are named {name!r}; rename one of them")
+        _MEASUREMENTS[name] = function
+        return function
+
+    return register
+
+
+def measure(run: Run, name: str) -> None:
+    """Measures a finished run unless that was done; a failure is recorded and tried again by the next command."""
+    path = _path(run, name)
+    with suppress(FileError):
+        if "scores" in read_json(path):
+            return
+    result: dict[str, Any] = {}
+    try:
+        result["scores"] = {key: list(map(float, values)) for key, values in _MEASUREMENTS[name](run).items()}
+    except Exception as error:
+        line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        note(f"{name} failed: {line}")
+        result["error"] = " ".join(line.split())
+    write_json(path, result)
+
+
+def read_scores(run: Run, name: str) -> tuple[Scores, str]:
+    """Returns the scores per clip of a finished run, and why there are none.
+
+    Args:
+        name: of a measurement; empty: the run's own evaluation.
+    """
+    try:
+        if not name:
+            return evaluation.load(run.output("evaluation")).per_clip, ""
+        saved = read_json(_path(run, name))
+    except (UserError, OSError) as error:
+        return {}, f"no {name or 'evaluation'} yet" if isinstance(error, (FileError, OSError)) else str(error)
+    return saved.get("scores", {}), saved.get("error", "")
+
+
+def _path(run: Run, name: str) -> Path:
+    return run.directory / FOLDER / f"{name}.json"

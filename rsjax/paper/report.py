@@ -1,0 +1,182 @@
+"""The report on all claims: ``report.md``, ``report.html``, ``report.json`` and a figure for each claim."""
+
+import base64
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from rsjax.ablation.figure import draw
+from rsjax.ablation.table import Result, Row
+from rsjax.evaluation.registry import ABSENT, Metric, metrics
+from rsjax.evaluation.statistics import Estimate
+from rsjax.files import disk_guard, write_file, write_json
+from rsjax.paper import budget
+from rsjax.paper.judge import Judged, Outcome, Trained
+from rsjax.paper.plan import Plan
+from rsjax.progress import duration
+
+LEGEND = (
+    "Differences are paired by clip: mean (or median) over clips and seeds, with the 95 % interval from resampling "
+    "both. A verdict takes the wider of this interval and Welch's t over the seeds; p is Welch's. A claim holds if all "
+    "its comparisons do, and does not hold if any does not; otherwise the budget is too small to tell. With one seed "
+    "nothing is told."
+)
+
+
+def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: str) -> Path:
+    """Writes the files into a directory and returns the path of the page.
+
+    Raises:
+        FileError: the disk is full.
+    """
+    content = {"command": command, **_summary(plan), "legend": LEGEND, "claims": [_claim(each) for each in outcomes]}
+    folders = [jinja2.PackageLoader(package, ".") for package in ("rsjax.paper", "rsjax.report")]
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader(folders),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        autoescape=lambda name: bool(name) and "html" in str(name),
+    )
+    with disk_guard(out):
+        figures = {}
+        for outcome in outcomes:
+            if picture := _figure(outcome):
+                figures[outcome.claim.name] = base64.b64encode(picture).decode()
+                write_file(out / "figures" / f"{outcome.claim.name}.png", picture)
+        write_json(out / "report.json", content)
+        for name in ("report.md", "report.html"):
+            text = environment.get_template(f"{name}.j2").render(**content, figures=figures)
+            write_file(out / name, text.encode())
+    return out / "report.html"
+
+
+def _summary(plan: Plan) -> dict[str, Any]:
+    base = plan.scale.base
+    return {
+        "budget": duration(plan.scale.seconds),
+        "preset": base.name,
+        "sizes": {
+            "episodes": base.sim.episodes,
+            "test clips": base.eval.clips,
+            "steps of the tokenizer": base.tokenizer_train.steps,
+            "steps of the model": base.train.steps,
+            "draws of random actions": base.eval.action_draws,
+        },
+        "left_out": [cell.name for cell in plan.left_out],
+    }
+
+
+def _claim(outcome: Outcome) -> dict[str, Any]:
+    """Returns a claim's part of the report, JSON-ready; texts are as they are shown."""
+    claim, columns = outcome.claim, _columns(outcome)
+    return {
+        "name": claim.name,
+        "title": claim.title,
+        "statement": claim.statement,
+        "place": claim.place,
+        "notes": claim.notes,
+        "verdict": outcome.verdict,
+        "counts": outcome.counts,
+        "header": [column.heading for column in columns],
+        "arms": [_arm(arm, outcome, columns) for arm in outcome.arms],
+        "published": any(arm.published for arm in claim.arms),
+        "comparisons": [_comparison(each) for each in outcome.judged],
+        "missing": [_missing(result) for arm in outcome.arms for result in arm.results if result.state != "finished"],
+    }
+
+
+def _columns(outcome: Outcome) -> list[Metric]:
+    known = metrics()
+    return [known[name] for name in dict.fromkeys(each.metric for each in outcome.claim.comparisons) if name in known]
+
+
+def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str, Any]:
+    published = outcome.claim.arm(arm.name).published
+    config = arm.cells[0].config if arm.cells else None
+    seconds = [sum(_trained(result).values()) for result in arm.finished]
+    flops = budget.train_flops(config) if config else None
+    return {
+        "name": arm.name,
+        "absent": arm.absent,
+        "seeds": f"{len(arm.finished)} of {len(arm.cells)}",
+        "failed": sum(result.state == "failed" for result in arm.results),
+        "scores": [_spread(arm, column) for column in columns],
+        "published": [f"{published[c.name]:.{c.decimals}f}" if c.name in published else ABSENT for c in columns],
+        "values": {name: spread._asdict() for name, spread in arm.spreads.items()},
+        "steps": config.train.steps if config and not config.train.curriculum else None,
+        "tflop": None if flops is None else round(flops / 1e12, 1),
+        "minutes": round(sum(seconds) / len(seconds) / 60, 1) if seconds else None,
+        "runs": [str(result.run.directory) for result in arm.results],
+    }
+
+
+def _trained(result: Result) -> dict[str, float]:
+    return {stage: result.run.mark(stage).get("seconds", 0.0) for stage in ("tokenizer", "world_model")}
+
+
+def _spread(arm: Trained, column: Metric) -> str:
+    if column.name in arm.spreads:
+        return " ± ".join(f"{x:.{column.decimals}f}" for x in arm.spreads[column.name][:2] if x is not None)
+    return ABSENT
+
+
+def _comparison(judged: Judged) -> dict[str, Any]:
+    compared, metric = judged.comparison, judged.metric
+    digits = metric.decimals
+    own, other = compared.score or compared.metric, compared.than_score or compared.metric
+    sides = (compared.better, compared.than) if compared.better != compared.than else (own, other)
+    return {
+        "what": f"{sides[0]} − {sides[1]}",
+        "metric": metric.heading,
+        "where": compared.measurement,
+        "margin": compared.margin,
+        "difference": ABSENT if judged.difference is None else f"{judged.difference.value:+.{digits}f}",
+        "interval": _interval(judged.difference, digits),
+        "p": None if judged.test is None else f"{judged.test.p:.3f}",
+        "published": None if judged.published is None else f"{judged.published:+.{digits}f}",
+        "seeds": list(judged.seeds),
+        "clips": judged.clips,
+        "verdict": judged.verdict if judged.difference else "not measured",
+        "reason": judged.reason,
+        "values": _numbers(judged),
+    }
+
+
+def _numbers(judged: Judged) -> dict[str, float | None]:
+    """Returns the numbers of a comparison, as the texts beside them are rounded."""
+    interval, test = judged.difference or Estimate(math.nan, None, None), judged.test
+    welch = test.difference if test else Estimate(math.nan, None, None)
+    return {
+        "difference": interval.value if judged.difference else None,
+        "low": interval.low,
+        "high": interval.high,
+        "welch_low": welch.low,
+        "welch_high": welch.high,
+        "p": test.p if test else None,
+        "published": judged.published,
+    }
+
+
+def _interval(difference: Estimate | None, digits: int) -> str:
+    if difference is None or difference.low is None or difference.high is None:
+        return ABSENT
+    return f"{difference.low:+.{digits}f} … {difference.high:+.{digits}f}"
+
+
+def _missing(result: Result) -> str:
+    return f"{result.name}: {result.state} ({result.reason})"
+
+
+def _figure(outcome: Outcome) -> bytes | None:
+    """Draws the arms' scores with every seed; None before any arm has one."""
+    names = {column.name for column in _columns(outcome)}
+    rows = [
+        Row({"": arm.name}, arm.finished, {name: value for name, value in arm.spreads.items() if name in names})
+        for arm in outcome.arms
+        if arm.spreads
+    ]
+    return draw(rows, f"{outcome.claim.place}: {outcome.claim.title}") if rows else None

@@ -1,0 +1,148 @@
+"""Budgets and plans: how large the cells are, which are made, in what order."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.config import Config, ConfigError, presets
+from rsjax.paper import budget
+from rsjax.paper.budget import HOUR, parse_duration, scale, step_seconds
+from rsjax.paper.claim import Arm, Comparison, chosen, claims
+from rsjax.paper.plan import Plan, arm_config, make_plan
+from rsjax.pipeline.run import Run
+from tests.paper import toy
+
+DATA = Path("data")
+TINY = presets.tiny()
+KNOWN = tuple(claims().values())
+
+
+@pytest.fixture(scope="module")
+def three_hours() -> Plan:
+    return make_plan(KNOWN, KNOWN, scale(TINY, 3 * HOUR), DATA)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("30min", 1800), ("3h", 10800), ("1h30min", 5400), ("90 s", 90), ("0.5h", 1800), ("1d", 86400)],
+)
+def test_durations(text: str, seconds: float) -> None:
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "3", "h", "3hours", "0min", "-3h", "3h and more"])
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"--budget .*not a duration; write 30min"):
+        parse_duration(text)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(120, 2e5), st.floats(1, 10))
+def test_a_larger_budget_never_makes_anything_smaller_and_no_size_exceeds_the_presets(
+    seconds: float, by: float
+) -> None:
+    small, large = (_sizes(scale(TINY, each).base) for each in (seconds, by * seconds))
+    assert all(one <= other <= own for one, other, own in zip(small, large, _sizes(TINY), strict=True))
+
+
+def _sizes(config: Config) -> tuple[int, ...]:
+    return config.sim.episodes, config.tokenizer_train.steps, config.eval.action_draws
+
+
+def test_a_small_preset_keeps_its_own_sizes() -> None:
+    """So that a run of the preset is a cell."""
+    whole = Run(presets.debug(), Path(), DATA).keys()
+    assert Run(scale(presets.debug(), 3 * HOUR).base, Path(), DATA).keys() == whole
+
+
+@pytest.mark.parametrize("hours", [0.5, 3, 12])
+def test_the_estimates_keep_to_the_budget_and_the_tables_come_first(hours: float) -> None:
+    plan = make_plan(KNOWN, KNOWN, scale(TINY, hours * HOUR), DATA)
+    assert 0.75 * hours * HOUR < sum(cell.seconds for cell in plan.cells) <= 1.05 * hours * HOUR
+    tables = [any(claim in ("table1", "table2") for claim, _ in cell.uses) for cell in plan.cells]
+    assert tables[:12] == [True] * 12 and tables == sorted(tables, reverse=True)
+    assert [cell.config.train.seed for cell in plan.cells[:12]] == [0] * 4 + [1] * 4 + [2] * 4
+
+
+def test_no_configuration_is_there_twice_and_every_arm_has_its_seeds(three_hours: Plan) -> None:
+    cells = (*three_hours.cells, *three_hours.left_out)
+    keys = Counter(Run(cell.config, Path(), DATA).keys()["evaluation"] for cell in cells)
+    assert set(keys.values()) == {1}
+    assert len({cell.name for cell in cells}) == len(cells)
+    for claim in KNOWN:
+        for arm in claim.arms:
+            seeds = [cell.config.train.seed for cell in three_hours.of(claim.name, arm.name)]
+            assert seeds == ([] if (claim.name, arm.name) in three_hours.absent else [0, 1, 2])
+
+
+def test_the_cells_of_one_claim_are_those_of_all(three_hours: Plan) -> None:
+    some = make_plan(KNOWN, chosen(["table1", "departure-a*"], claims()), three_hours.scale, DATA)
+    assert [claim.name for claim in some.claims] == ["table1", "departure-actions"]
+    assert set(some.cells) < set(three_hours.cells)
+    assert {use for cell in some.cells for use in cell.uses} >= {("table1", "Genie"), ("departure-actions", "ours")}
+
+
+def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> None:
+    base = three_hours.scale.base
+    genie = arm_config(Arm("", model="genie", equal="seconds"), three_hours.scale, 0)
+    assert genie.train.steps > 1.5 * base.train.steps
+    assert genie.train.steps * step_seconds(genie) == pytest.approx(base.train.steps * step_seconds(base), rel=0.01)
+
+
+def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(three_hours: Plan) -> None:
+    """With as many clips of each difficulty as expected, every clip is drawn as often in both."""
+    plan, clips = three_hours, three_hours.scale.base.sim.episodes - three_hours.scale.base.sim.test_episodes
+    counts = {"simple": 0.55 * clips, "difficult": 0.45 * clips}
+    ordered, mixed = (
+        arm_config(Arm("", curriculum=("simple:2", "difficult:3"), mixed=on), plan.scale, 0).train
+        for on in (False, True)
+    )
+    drawn = {
+        s.components[0].difficulties[0]: s.epochs * counts[s.components[0].difficulties[0]] for s in ordered.curriculum
+    }
+    assert list(drawn) == ["simple", "difficult"]
+    assert drawn["simple"] / counts["simple"] == pytest.approx(2 / 3 * drawn["difficult"] / counts["difficult"])
+    assert sum(drawn.values()) == pytest.approx(ordered.steps * ordered.batch_size)
+    (stage,) = mixed.curriculum
+    assert stage.epochs * clips == pytest.approx(ordered.steps * ordered.batch_size)
+    weights = {part.difficulties[0]: part.weight for part in stage.components}
+    assert weights["simple"] / weights["difficult"] == pytest.approx(drawn["simple"] / drawn["difficult"])
+
+
+def test_a_share_of_the_data_is_read_for_as_many_steps(three_hours: Plan) -> None:
+    train = arm_config(Arm("", data=0.5), three_hours.scale, 0).train
+    (stage,) = train.curriculum
+    base = three_hours.scale.base
+    assert stage.components[0].clips == (base.sim.episodes - base.sim.test_episodes) // 2
+    assert stage.epochs * stage.components[0].clips == pytest.approx(base.train.steps * base.train.batch_size)
+
+
+def test_a_family_has_the_base_presets_clips_and_the_same_share_of_its_own_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    other = replace(presets.debug(), name="other_tiny", train=replace(TINY.train, steps=1000, eval_every=10))
+    monkeypatch.setitem(presets.PRESETS, "other_tiny", other)
+    at = scale(TINY, HOUR)
+    config = arm_config(Arm("", preset="other", equal="seconds"), at, 2)
+    assert (config.sim, config.eval, config.train.seed) == (at.base.sim, at.base.eval, 2)
+    assert config.train.steps == round(1000 * at.share) < 1000
+    assert config.train.eval_every == 0
+
+
+def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason() -> None:
+    claim = replace(toy.claim(), arms=(*toy.claim().arms, Arm("other", preset="other"), Arm("odd", {"model.x": 1})))
+    absent = toy.plan(claim).absent
+    assert absent["toy", "other"] == "there is no preset other_debug in this version"
+    assert "no such field" in absent["toy", "odd"]
+
+
+def test_claims_name_their_arms_and_are_chosen_by_name() -> None:
+    with pytest.raises(ConfigError, match="compares 'none', which is none of its arms"):
+        toy.claim("toy", Comparison("psnr", "with", "none"))
+    with pytest.raises(ConfigError, match=r"--only tabel1: no such claim; did you mean 'table1'\? \(claims: table2"):
+        chosen(["tabel1"], claims())
+    assert all(budget.SEEDS >= 3 for _ in KNOWN)

@@ -1,0 +1,198 @@
+"""Claims put to the test with toys: verdicts, failures, interruptions, measurements, the report."""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import paper
+from rsjax.ablation import sweep
+from rsjax.errors import Preempted
+from rsjax.evaluation.statistics import Verdict
+from rsjax.paper import measurements
+from rsjax.paper.claim import Comparison
+from rsjax.paper.judge import judge_all
+from rsjax.paper.measurements import measurement
+from rsjax.paper.plan import Plan
+from rsjax.paper.run import run_plan, runs_of, write
+from rsjax.pipeline import stages
+from rsjax.pipeline.run import Run
+from rsjax.runtime import HUGE_PAGES
+from tests.ablation.toy import made
+from tests.paper import toy
+from tests.pipeline.conftest import Commands, command, debug, shared
+
+__all__ = ["command", "debug", "shared"]
+
+
+@pytest.fixture(autouse=True)
+def stubs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy.stub_stages(monkeypatch, tmp_path)
+
+
+def run(plan: Plan, place: Path) -> dict[str, Any]:
+    run_plan(plan, place / "out", place / "data", "the command")
+    return report(place)
+
+
+def report(place: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((place / "out" / "report.json").read_text())
+    return content
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "holds"), (-0.5, "does not hold"), (0.0, "cannot tell")])
+def test_a_claim_is_judged_by_paired_differences_over_seeds_and_clips(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, verdict: Verdict
+) -> None:
+    """Clips differ by 3 dB, the arms by 0.5 dB or not at all: only paired differences can tell."""
+    toy.stub_stages(monkeypatch, tmp_path, gain)
+    (claim,) = run(toy.plan(toy.claim()), tmp_path)["claims"]
+    (compared,) = claim["comparisons"]
+    assert claim["verdict"] == compared["verdict"] == verdict
+    assert (compared["seeds"], compared["clips"]) == ([3, 3], toy.CLIPS)
+    numbers = compared["values"]
+    assert numbers["low"] < gain < numbers["high"] and numbers["difference"] == pytest.approx(gain, abs=0.05)
+    assert numbers["published"] == 0.5
+    with_, without = claim["arms"]
+    means = [arm["values"]["psnr"]["mean"] for arm in (with_, without)]
+    assert means[0] - means[1] == pytest.approx(numbers["difference"])
+
+
+def test_cells_of_several_claims_run_once_and_a_second_command_runs_none(tmp_path: Path) -> None:
+    plan = toy.plan(toy.claim("one"), toy.claim("two", rank=5))
+    first = run(plan, tmp_path)
+    trained = [line for line in made(tmp_path) if line.startswith("world_model")]
+    assert len(trained) == len(plan.cells) == 6
+    assert sum(line.startswith("tokenizer") for line in made(tmp_path)) == 1, "shared by all"
+    assert run(plan, tmp_path) == first
+    assert len(made(tmp_path)) == len(made(tmp_path))
+    assert [line for line in made(tmp_path) if line.startswith("world_model")] == trained
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
+    whole = stages.run_all
+
+    def fail(run: Run, command: str = "") -> None:
+        if run.directory.name == name:
+            raise error
+        whole(run, command=command)
+
+    monkeypatch.setattr(stages, "run_all", fail)
+
+
+def test_a_failed_cell_is_counted_and_named_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = toy.plan(toy.claim())
+    name = plan.cells[2].name
+    with monkeypatch.context() as patch:
+        failing(patch, name, ZeroDivisionError("by zero"))
+        (claim,) = run(plan, tmp_path)["claims"]
+    arm = next(arm for arm in claim["arms"] if arm["failed"])
+    assert (arm["seeds"], arm["failed"]) == ("2 of 3", 1)
+    assert claim["missing"] == [f"{name}: failed (ZeroDivisionError: by zero)"]
+    assert f"- {name}: failed (ZeroDivisionError: by zero)" in (tmp_path / "out" / "report.md").read_text()
+    assert run(plan, tmp_path)["claims"][0]["missing"] == []
+
+
+def test_an_interruption_leaves_a_whole_report_and_the_next_command_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = toy.plan(toy.claim())
+    with monkeypatch.context() as patch:
+        failing(patch, plan.cells[3].name, Preempted("SIGTERM"))
+        with pytest.raises(Preempted):
+            run(plan, tmp_path)
+    (claim,) = report(tmp_path)["claims"]
+    assert [arm["seeds"] for arm in claim["arms"]] == ["2 of 3", "1 of 3"]
+    assert claim["verdict"] == "cannot tell", "one seed of an arm says nothing about others"
+    assert claim["comparisons"][0]["values"]["difference"] == pytest.approx(0.5, abs=0.05)
+    before = len(made(tmp_path))
+    assert run(plan, tmp_path)["claims"][0]["verdict"] == "holds"
+    assert len(made(tmp_path)) - before == 3 * 3, "evaluation, report and model of the three cells that were left"
+
+
+def test_what_was_not_measured_says_why(tmp_path: Path) -> None:
+    claim = toy.claim("toy", Comparison("psnr", "with", "without"), Comparison("ssim", "with", "without"))
+    (claim_,) = run(toy.plan(claim), tmp_path)["claims"]
+    assert claim_["verdict"] == "holds", "of what could be measured"
+    assert [each["verdict"] for each in claim_["comparisons"]] == ["holds", "not measured"]
+    assert claim_["comparisons"][1]["reason"] == "with: a toy"
+    assert "not measured: with: a toy" in (tmp_path / "out" / "report.md").read_text()
+    assert "<small>with: a toy</small>" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.fixture
+def longer() -> Iterator[list[str]]:
+    """A measurement that fails at its first run; the list has the runs that it was called for."""
+    called: list[str] = []
+
+    @measurement("longer")
+    def longer(run: Run) -> dict[str, list[float]]:
+        called.append(run.directory.name)
+        if len(called) == 1:
+            raise ValueError("once")
+        return {"psnr": [1.0 + toy.keypoints(run.config), 2.0, 3.0]}
+
+    yield called
+    measurements._MEASUREMENTS.pop("longer")
+
+
+def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Path, longer: list[str]) -> None:
+    plan = toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="longer")))
+    (claim,) = run(plan, tmp_path)["claims"]
+    assert claim["comparisons"][0]["reason"] == "with: ValueError: once"
+    (claim,) = run(plan, tmp_path)["claims"]
+    assert claim["comparisons"][0]["values"]["difference"] == pytest.approx(1 / 3)
+    assert sorted(longer) == sorted([cell.name for cell in plan.cells] + [plan.cells[0].name])
+
+
+def test_budgets_share_a_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells of another size are others; each budget's report counts its own."""
+    plan = toy.plan(toy.claim())
+    run(plan, tmp_path)
+    shorter = toy.plan(toy.claim(), seconds=60)
+    assert {cell.name for cell in shorter.cells} < {cell.name for cell in plan.cells}, "debug is the smallest already"
+    write(shorter, tmp_path / "out", tmp_path / "data", "")
+    (outcome,) = judge_all(shorter, runs_of(shorter, tmp_path / "out", tmp_path / "data"))
+    assert [len(arm.finished) for arm in outcome.arms] == [3, 3], "also of cells that this budget would leave out"
+
+
+def main(*argv: object) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GLIBC_TUNABLES", HUGE_PAGES)
+        patch.setattr(sys, "argv", ["paper", *map(str, argv)])
+        paper.main()
+
+
+def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
+    debug: Path, tmp_path: Path, command: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--preset", "debug", "--budget", "3h", "--dir", tmp_path, "--data-dir", command.data)
+    main(*options, "--only", "table2", "--dry-run")
+    lines = capsys.readouterr().out.splitlines()
+    assert not list(tmp_path.iterdir())
+    name = lines[1].split()[3]
+    assert lines[1].split()[2] == "missing" and name.startswith("seed=0-")
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "cells" / name).symlink_to(debug)
+    main(*options, "--report")
+    claims = {claim["name"]: claim for claim in json.loads((tmp_path / "report.json").read_text())["claims"]}
+    metrics = json.loads((debug / "metrics.json").read_text())
+    for claim, arm in (("table2", "full"), ("table1", "RoboScape"), ("data-scaling", "all")):
+        (found,) = (each for each in claims[claim]["arms"] if each["name"] == arm)
+        assert found["seeds"] == "1 of 3"
+        assert found["values"]["psnr"]["mean"] == metrics["psnr"]
+    assert {claim["verdict"] for claim in claims.values()} == {"cannot tell"}
+    assert (tmp_path / "report.html").exists() and (tmp_path / "figures" / "table2.png").exists()
+
+
+def test_mistakes_are_one_line(command: Commands) -> None:
+    assert "not a duration" in command.refused("experiments.paper", "--budget", "long")
+    assert "unknown preset" in command.refused("experiments.paper", "--preset", "tinny")
+    assert "no such claim" in command.refused("experiments.paper", "--only", "table3")
+
+
+def test_the_sweep_of_an_ablation_still_runs_cells_itself() -> None:
+    assert sweep.run_cell.__module__ == sweep.run_sweep.__module__
