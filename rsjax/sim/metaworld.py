@@ -16,13 +16,13 @@ from rsjax.sim.scenery import SEEN, Scenery, Variation, aim
 CONTROL_HZ = 80
 CENTRE = (0.0, 0.66, 0.1)  # of the workspace, metres
 # Our own camera, which sees no sky: position and the point it looks at in metres, vertical field of view in degrees.
-NEAR = ("near", (0.62, 0.28, 0.92), (0.0, 0.66, 0.13), 42.0)
+NEAR = ("near", (0.96, 0.07, 1.36), (0.0, 0.66, 0.13), 28.0)
 OBJECT_WIDTH = 0.05  # metres; errors of the object's place are measured in it, a puck's or a handle's size
 STEPS = 10**9  # of an episode; Meta-World's own limit of 500 would be an error
 
 MODES = {"expert": 0.6, "interrupted": 0.2, "explore": 0.2}  # mode → probability
 NOISE_MEMORY = 0.95  # correlation of the action noise from one control step to the next
-REACH = ((-0.3, 0.45, 0.06), (0.3, 0.85, 0.35))  # metres, where aimless motion goes
+REACH = ((-0.3, 0.45, 0.06), (0.25, 0.85, 0.3))  # metres, where aimless motion goes
 GAIN = 10.0  # action per metre of error
 
 
