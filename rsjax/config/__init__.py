@@ -21,6 +21,7 @@ from rsjax.config.fields import (
     to_dict,
 )
 from rsjax.config.irasim import DiTConfig
+from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig, TopKConfig
 from rsjax.config.model import (
     FAMILIES,
     GenieConfig,
@@ -42,6 +43,7 @@ __all__ = [
     "FAMILIES",
     "ClipShape",
     "ComponentConfig",
+    "ConditionalVQConfig",
     "Config",
     "ConfigError",
     "CurriculumStageConfig",
@@ -50,6 +52,7 @@ __all__ = [
     "DiTConfig",
     "EvalConfig",
     "GenieConfig",
+    "IVideoGPTConfig",
     "LoopConfig",
     "LossConfig",
     "MaskConfig",
@@ -62,6 +65,7 @@ __all__ = [
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",
+    "TopKConfig",
     "TransformerConfig",
     "check_numbers",
     "content_key",

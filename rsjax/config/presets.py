@@ -16,8 +16,10 @@ from rsjax.config import (
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
+    ivideogpt_presets,
 )
 from rsjax.config.curriculum import parse_stage
+from rsjax.config.ivideogpt_presets import ivideogpt_64, ivideogpt_256
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.errors import did_you_mean
 
@@ -159,6 +161,11 @@ def genie_35m_actions() -> Config:
     return _full_size("genie_35m_actions", GenieConfig())
 
 
+def ivideogpt_tiny() -> Config:
+    """Returns iVideoGPT on the clips of :func:`tiny`, in about its time."""
+    return ivideogpt_presets.ivideogpt_tiny(tiny())
+
+
 def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
 
@@ -219,9 +226,9 @@ def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
     return presets
 
 
-PRESETS = collect(
-    debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l, genie_35m, genie_138m, genie_35m_actions
-)
+ROBOSCAPE = (debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l)
+BASELINES = (genie_35m, genie_138m, genie_35m_actions, ivideogpt_64, ivideogpt_256, ivideogpt_tiny)
+PRESETS = collect(*ROBOSCAPE, *BASELINES)
 
 
 def get(name: str) -> Config:

@@ -13,6 +13,7 @@ PROG = "python -m rsjax.convert"
 KINDS = {
     "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
     "genie": "1xgpt's Genie (STMaskGIT); reads the config.json beside IN",
+    "ivideogpt": "iVideoGPT's tokenizer or transformer, whichever IN holds",
     "lpips": "the perceptual distance: torchvision's backbone and the published heads",
 }
 
@@ -29,6 +30,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--weights", choices=("raw", "ema"), default="raw", help="ema: their moving average")
         if kind == "genie":
             command.add_argument("--heads", type=int, help="attention heads, if there is no config.json")
+        if kind == "ivideogpt":
+            command.add_argument("--heads", type=int, help="attention heads of the transformer, if not of 64 channels")
+            command.add_argument(
+                "--part", choices=("tokenizer", "world_model"), help="to export; default: all there is"
+            )
         if kind == "lpips":
             command.add_argument("--heads-file", type=Path, help="the published heads, if IN is only the backbone")
     return top
@@ -40,12 +46,14 @@ def main(argv: Sequence[str]) -> None:
     refuse_repeated(argv)
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.convert import commands
+    from rsjax.convert import commands, ivideogpt
 
     if options.kind == "tokenizer":
         lines = commands.convert_tokenizer(options.source, options.out, options.weights)
     elif options.kind == "genie":
         lines = commands.convert_genie(options.source, options.out, options.heads)
+    elif options.kind == "ivideogpt":
+        lines = ivideogpt.convert(options.source, options.out, options.heads, options.part)
     else:
         lines = commands.convert_lpips([path for path in (options.source, options.heads_file) if path], options.out)
     print(*lines, sep="\n")

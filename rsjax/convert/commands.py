@@ -9,7 +9,7 @@ from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write
 from rsjax.convert.table import to_tensors
 from rsjax.files import parse_json, read_json, write_json
 
-_REPLACES = "; it replaces the one that was there"
+REPLACES = "; it replaces the one that was there"
 METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported tokenizer
 
 
@@ -20,7 +20,7 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
     """
     if source.is_dir():
-        replaces = _check_file(out)
+        replaces = check_file(out)
         config, params = directory.load_tokenizer(source)
         tensors = to_tensors(params, tokenizer.table(config))
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
@@ -28,7 +28,7 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
     tensors, metadata, names = read_tensors(source)
     own = _exported_config(source, metadata)
     config, params, ignored = tokenizer.from_public(source, tensors, weights, own, names)
-    replaces = _REPLACES * directory.save(out, config, params)
+    replaces = REPLACES * directory.save(out, config, params)
     used = len(tensors) - ignored.total()
     lines = [f"ignored: {count} tensors of {group}" for group, count in sorted(ignored.items())]
     return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *lines]
@@ -41,7 +41,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
         UserError: as :func:`convert_tokenizer`.
     """
     if source.is_dir():
-        replaces = _check_file(out)
+        replaces = check_file(out)
         config, params = directory.load_world_model(source)
         tensors = to_tensors(params, genie.table(config))
         beside, settings = out.parent / genie.CONFIG, genie.settings_of(config)
@@ -55,7 +55,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
     tensors, _, names = read_tensors(source)
     settings = genie.read_settings(source)
     config, params = genie.from_public(source, tensors, settings, heads, names)
-    replaces = _REPLACES * directory.save(out, config, params)
+    replaces = REPLACES * directory.save(out, config, params)
     lines = [f"{out}: a world model of {len(tensors)} tensors, {config}{replaces}"]
     if settings.get("use_mup") is None:
         lines.append(f"no use_mup in a {genie.CONFIG} beside {source.name}: converted as a model without muP")
@@ -68,7 +68,7 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
     Raises:
         UserError: as :func:`convert_tokenizer`.
     """
-    replaces = _check_file(out)
+    replaces = check_file(out)
     merged: Tensors = {}
     names: dict[str, str] = {}
     for source in sources:
@@ -82,11 +82,11 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
     return [f"{out}: LPIPS with {net}, {len(weights)} tensors; {len(merged) - len(weights)} ignored{replaces}"]
 
 
-def _check_file(out: Path) -> str:
+def check_file(out: Path) -> str:
     """Checks the name of the file to write; returns what to add to the message about it."""
     if out.suffix != SAFE:
         raise ConvertError(f"{out}: the output is a {SAFE} file; name OUT accordingly")
-    return _REPLACES * out.exists()
+    return REPLACES * out.exists()
 
 
 def _exported_config(source: Path, metadata: dict[str, str]) -> TokenizerConfig | None:

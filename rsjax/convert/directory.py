@@ -4,19 +4,24 @@ A directory holds a tokenizer, a world model or both; training starts from it (`
 """
 
 from pathlib import Path
+from typing import Literal, TypeVar
 
 import jax
 
-from rsjax.config import TokenizerConfig, to_dict
+from rsjax.config import ModelConfig, TokenizerConfig, to_dict
 from rsjax.convert.files import ConvertError
 from rsjax.files import disk_guard, read_json, write_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.models.saved import Inputs, read_model, saved_inputs
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.training import read_tokenizer_config
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights, save_weights
+
+M = TypeVar("M", bound=ModelConfig)
+Part = Literal["tokenizer", "world_model"]
 
 SECTIONS: dict[type, tuple[str, str]] = {  # section of config.json, and directory of the weights
     TokenizerConfig: ("tokenizer", "tokenizer/weights"),
@@ -46,6 +51,45 @@ def save(directory: Path, config: TokenizerConfig | Architecture, params: Params
         save_weights(directory / place, params)
         write_json(path, settings | {section: to_dict(config)})
     return replaces
+
+
+def save_part(directory: Path, part: Part, model: ModelConfig, inputs: Inputs, params: Params) -> bool:
+    """Writes the autoencoder or the world model of a family with both; the directory's other part is kept.
+
+    Args:
+        model: the family's settings, those of the other part in the directory among them (:func:`saved_part`).
+        inputs: what the networks were made for.
+
+    Returns:
+        Whether the directory had such a part, which it replaced.
+
+    Raises:
+        ConvertError: the directory is a run's, or holds networks of another kind.
+        FileError: the disk is full.
+    """
+    path = directory / "config.json"
+    settings = read_json(path) if path.exists() else {}
+    if settings.keys() - {"model", "inputs"}:
+        raise ConvertError(f"{directory}: is a run directory or holds other networks; choose another one")
+    with disk_guard(directory):
+        place = directory / part / "weights"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if replaces := place.exists():
+            path.unlink(missing_ok=True)  # stopped in between, no settings are beside another network's weights
+        save_weights(place, params)
+        write_json(path, {"model": to_dict(model), "inputs": inputs._asdict()})
+    return replaces
+
+
+def saved_part(directory: Path, kind: type[M], part: Part) -> tuple[M, Inputs] | None:
+    """Returns settings and inputs of a part that :func:`save_part` wrote or a run trained; None if there is none.
+
+    Raises:
+        UserError: the settings are damaged, or of another family.
+    """
+    if not (directory / part / "weights").exists() or not (directory / "config.json").exists():
+        return None
+    return read_model(directory, kind, part), saved_inputs(directory)
 
 
 def load_tokenizer(directory: Path) -> tuple[TokenizerConfig, Params]:

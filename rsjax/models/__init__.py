@@ -2,6 +2,7 @@
 
 from rsjax.models.base import Assets, WorldModel, create_model, implements
 from rsjax.models.genie import Genie
+from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.roboscape.model import RoboScape
 
-__all__ = ["Assets", "Genie", "RoboScape", "WorldModel", "create_model", "implements"]
+__all__ = ["Assets", "Genie", "IVideoGPT", "RoboScape", "WorldModel", "create_model", "implements"]

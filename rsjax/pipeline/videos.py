@@ -146,6 +146,10 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
     settings = getattr(trained.config.model, "sample", None)
     if settings is None:
         raise UserError(f"a model of family {trained.config.model.family!r} has no settings of sampling")
+    known = [field.name for field in dataclasses.fields(settings)]
+    if unknown := sample.keys() - known:
+        names = f"{', '.join(sorted(unknown))}; it has {', '.join(known)}"
+        raise UserError(f"a model of family {trained.config.model.family!r} has no setting {names}")
     model = dataclasses.replace(trained.config.model, sample=dataclasses.replace(settings, **sample))  # type: ignore[call-arg]
     config = dataclasses.replace(trained.config, model=model)
     return dataclasses.replace(trained, config=config, model=create_model(config))

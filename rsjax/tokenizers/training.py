@@ -79,13 +79,7 @@ class TokenizerTraining(Autoencoder[Images]):
         """
         extra: dict[str, Any] = {}
         if "perceptual" in self.loss_weights:
-            weights = load_lpips(self.train.lpips_weights)
-            require(
-                self.image_size >= min_size(weights),
-                f"clips have images of {self.image_size} pixels; the LPIPS network of {self.train.lpips_weights} "
-                f"needs at least {min_size(weights)}, or tokenizer_train.perceptual_weight 0",
-            )
-            extra["lpips"] = jax.tree.map(jnp.array, weights)
+            extra["lpips"] = lpips_weights(self.train, self.image_size)
         if "lecam" in self.loss_weights:
             extra["lecam"] = initial_averages()
         return extra or None
@@ -180,6 +174,22 @@ class TokenizerTraining(Autoencoder[Images]):
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
         """Returns the parameters that training begins with: the saved tokenizer, and a fresh discriminator."""
         return fresh | {"generator": saved} if "generator" in fresh else saved
+
+
+def lpips_weights(train: TokenizerTrainConfig, image_size: int) -> dict[str, Any]:
+    """Returns the weights of the LPIPS term.
+
+    Raises:
+        LpipsError: the file ``train.lpips_weights`` is missing or damaged.
+        ConfigError: images are too small for the LPIPS network.
+    """
+    weights = load_lpips(train.lpips_weights)
+    require(
+        image_size >= min_size(weights),
+        f"clips have images of {image_size} pixels; the LPIPS network of {train.lpips_weights} "
+        f"needs at least {min_size(weights)}, or tokenizer_train.perceptual_weight 0",
+    )
+    return jax.tree.map(jnp.array, weights)
 
 
 def read_tokenizer_config(directory: Path) -> TokenizerConfig:

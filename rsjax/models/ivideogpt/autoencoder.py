@@ -1,0 +1,176 @@
+"""Trains iVideoGPT's tokenizer, and encodes and decodes videos with the trained one.
+
+The public code adds a discriminator at 256² pixels after 250,000 steps, and crops and recolours clips; both are absent.
+
+Axes: B clips, T frames of which the first c are context, F = T - c, g×g cells, n tokens of a later frame.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import Array, Bool, Float, Key
+
+from rsjax.clip import Video
+from rsjax.config import ConditionalVQConfig, Config, IVideoGPTConfig, TokenizerTrainConfig, require
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.errors import UserError
+from rsjax.models.ivideogpt.networks import ConditionalVQ, Reconstruction
+from rsjax.models.saved import check_alike, read_model, saved_inputs
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.lpips import lpips
+from rsjax.tokenizers.training import lpips_weights
+from rsjax.trainable import Extra, Params, StepContext, Term
+
+Clips = Float[Array, "B T H W 3"]
+
+FRAMES = 128  # most frames per pass, to bound memory
+
+
+@dataclass(frozen=True)
+class ConditionalVQTraining(Autoencoder[Clips]):
+    """Learns to reconstruct the first frames of a clip and some later ones. A batch is frames 0–255."""
+
+    config: ConditionalVQConfig
+    train: TokenizerTrainConfig
+    image_size: int
+
+    def __post_init__(self) -> None:
+        require(
+            self.train.frames_per_clip > self.config.context_frames,
+            f"tokenizer_train.frames_per_clip is {self.train.frames_per_clip}; the tokenizer learns from "
+            f"model.autoencoder.context_frames {self.config.context_frames} and at least one later frame",
+        )
+        require(
+            not self.train.adversarial_weight,
+            "tokenizer_train.adversarial_weight is above 0, but iVideoGPT's tokenizer has no discriminator here; set 0",
+        )
+
+    @classmethod
+    def create(cls, config: Config) -> "ConditionalVQTraining":
+        """Returns the training of a configuration's autoencoder."""
+        assert isinstance(config.model, IVideoGPTConfig)
+        return cls(config.model.autoencoder, config.tokenizer_train, config.clips.image_size)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        names = ("l1", "l2", "perceptual") if self.train.lpips_weights else ("l1", "l2")
+        weights = {name: getattr(self.train, f"{name}_weight") for name in (*names, "commitment")}
+        return {name: x for name, x in weights.items() if x} | {"codebook": self.config.codebook_weight}
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return ConditionalVQ(self.config).init_params(key, self.image_size)
+
+    def init_extra(self) -> Extra:
+        return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
+
+    def loss_terms(self, params: Params, batch: Clips, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns the terms; those of pixels are the sum of a mean over context and one over later frames."""
+        frames, first = jnp.asarray(batch, jnp.float32) / 255, self.config.context_frames
+        rngs = {"dropout": key}
+        made = cast(Reconstruction, ConditionalVQ(self.config).apply({"params": params}, frames, train=True, rngs=rngs))
+        pairs = ((frames[:, :first], made.context), (frames[:, first:], made.future))
+
+        def total(distance: Callable[[Array, Array], Array]) -> Array:
+            return jnp.mean(distance(*pairs[0])) + jnp.mean(distance(*pairs[1]))
+
+        terms = {
+            "l1": total(lambda one, other: jnp.abs(one - other)),
+            "l2": total(lambda one, other: jnp.square(one - other)),
+            "codebook": made.codebook,
+            "commitment": made.commitment,
+        }
+        if "perceptual" in self.loss_weights:
+            weights = cast(dict[str, Any], context.extra)["lpips"]
+            terms["perceptual"] = total(lambda one, other: lpips(weights, 2 * one - 1, 2 * other - 1))
+        count = jnp.float32(batch.shape[0])
+        return {name: (terms[name] * count, count) for name in self.loss_weights}
+
+    def transform(self) -> Transform:
+        return partial(_draw, self.config.context_frames, self.train.frames_per_clip, self.train.flip)
+
+    def batch(self, arrays: Arrays) -> np.ndarray:
+        return arrays["frames"]
+
+    def codec(self, params: Params, normalization: Normalization) -> "ConditionalCodec":
+        return ConditionalCodec(self.config, params)
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        """Returns the shapes of saved weights, of as many context frames as this network's or of more.
+
+        Raises:
+            UserError: they are missing or of another network; the message names the differing fields.
+        """
+        saved = read_model(directory, IVideoGPTConfig, "tokenizer").autoencoder
+        free = {"dropout", "codebook_scale", "codebook_weight"}
+        free |= {"context_frames"} if saved.context_frames >= self.config.context_frames else set()
+        check_alike(directory, saved, self.config, free, "model.autoencoder")
+        if (size := saved_inputs(directory).image_size) != self.image_size:
+            raise UserError(f"{directory}: its tokenizer is for images of {size} pixels, these have {self.image_size}")
+        return ConditionalVQTraining(saved, TokenizerTrainConfig(frames_per_clip=99), self.image_size).shapes()
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        """Returns the saved parameters; of positions of more context frames the last ones, as in the public code."""
+        own, params = flatten_dict(fresh), flatten_dict(saved)
+        return unflatten_dict({path: x[-own[path].shape[0] :] if x.ndim else x for path, x in params.items()})
+
+
+def _draw(context: int, count: int, flip: bool, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns ``frames``: the first ``context`` frames of a clip and drawn later ones in order, ``count`` in all."""
+    rgb = record["rgb"]
+    later = np.arange(context, len(rgb))
+    drawn = np.sort(rng.choice(later, count - context, replace=count - context > len(later)))
+    frames = rgb[np.concatenate([np.arange(context), drawn])]
+    return {"frames": np.ascontiguousarray(frames[:, :, ::-1]) if flip and rng.random() < 0.5 else frames}
+
+
+@dataclass(frozen=True)
+class ConditionalCodec:
+    """The trained tokenizer that takes and returns numpy arrays."""
+
+    config: ConditionalVQConfig
+    params: Params
+
+    def encode(self, video: Video) -> dict[str, np.ndarray]:
+        """Returns tokens: "context" of the first c frames, (B, c, g, g), and "future" of the others, (B, F, n).
+
+        If the video has fewer than c frames, its first is repeated in front.
+        """
+        lacking = max(0, self.config.context_frames - video.rgb.shape[1])
+        frames = np.concatenate([np.repeat(video.rgb[:, :1], lacking, 1), video.rgb], axis=1)
+        alone = frames.shape[1] == self.config.context_frames
+        context, future = self._chunked("encode", np.repeat(frames, [*[1] * (frames.shape[1] - 1), 1 + alone], 1))
+        return {"context": context, "future": future[:, : future.shape[1] - alone]}
+
+    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
+        """Decodes tokens to frames; there is no depth."""
+        context, future = (np.asarray(tokens[name]) for name in ("context", "future"))
+        alone = future.shape[1] == 0  # without later frames a stand-in is decoded
+        future = np.zeros((len(future), 1, future.shape[2]), np.int32) if alone else future
+        (frames,) = self._chunked("decode", context, future)
+        return Video(np.round(frames[:, : frames.shape[1] - alone]).astype(np.uint8))
+
+    def _chunked(self, method: Literal["encode", "decode"], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Applies the network to some clips at a time, as many as a power of two."""
+        total, frames = len(arrays[0]), sum(x.shape[1] for x in arrays)
+        size = min(2 ** (total - 1).bit_length(), 2 ** (max(1, FRAMES // frames).bit_length() - 1))
+        parts = []
+        for start in range(0, total, size):
+            chunk = [x[start : start + size] for x in arrays]
+            padded = [np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) for x in chunk]
+            made = _apply(self.config, method, self.params, *padded)
+            parts.append([np.asarray(x)[: len(chunk[0])] for x in (made if isinstance(made, tuple) else (made,))])
+        return tuple(np.concatenate(same) for same in zip(*parts, strict=True))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _apply(config: ConditionalVQConfig, method: str, params: Params, *arrays: Array) -> Any:
+    return ConditionalVQ(config).apply({"params": params}, *arrays, method=method)

@@ -1,0 +1,168 @@
+"""The LLaMA of iVideoGPT, with actions added at the slots and a cache of keys and values for sampling.
+
+Axes: B clips, L tokens, C width, h heads, e = C/h head width, F later frames, A action inputs, V vocabulary.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from rsjax.config import ClipShape, IVideoGPTConfig
+from rsjax.models.ivideogpt.sequence import Layout
+from rsjax.models.roboscape.attention import Dense, KeyValues, attend_parts, put_frames, rotate
+from rsjax.trainable import Params
+
+NORMAL = nn.initializers.normal(0.02)
+Hidden = Float[Array, "B L C"]
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """All settings of the network.
+
+    Attributes:
+        config: the family's settings.
+        layout: of its sequences.
+        action_inputs: numbers that are added at a slot; 0: none are.
+    """
+
+    config: IVideoGPTConfig
+    layout: Layout
+    action_inputs: int
+
+    @classmethod
+    def create(cls, config: IVideoGPTConfig, clips: ClipShape) -> "Architecture":
+        """Returns the network for clips of this shape."""
+        inputs = clips.action_dim * (1 + config.integrate_actions) * config.use_actions
+        return cls(config, Layout.create(config, clips.image_size), inputs)
+
+
+class Block(nn.Module):
+    """x += Attention(norm x); x += SwiGLU(norm x). Norms are RMSNorms, linear layers have no bias."""
+
+    config: IVideoGPTConfig
+
+    @nn.compact
+    def __call__(
+        self, x: Hidden, scanned: tuple[KeyValues | None, Int[Array, ""]], first: Any, keys: Key[Array, " B"] | None
+    ) -> tuple[Hidden, KeyValues | None]:
+        """Returns the output and, with a cache, the tokens' own keys and values.
+
+        Args:
+            scanned: the cache of this block, and its number.
+            first: position of the first token.
+            keys: of the dropout of each clip; None: no dropout.
+        """
+        cfg, (cache, number) = self.config, scanned
+        dense = partial(Dense, bf16=cfg.compute_dtype == "bfloat16", use_bias=False, kernel_init=NORMAL)
+        norm, positions = partial(nn.RMSNorm, epsilon=1e-6), first + jnp.arange(x.shape[1])
+        h = norm(name="input_layernorm")(x)
+        q, k, v = (
+            dense(cfg.width, name=f"{name}_proj")(h).reshape(*h.shape[:2], cfg.heads, cfg.width // cfg.heads)
+            for name in "qkv"
+        )
+        q, k = (rotate(y[:, :, None], positions)[:, :, 0] for y in (q, k))
+        q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))  # B h L e
+        new = KeyValues(k, v)
+        causal = positions[:, None] >= positions[None, :]
+        if cache is None:
+            out = _attend(q, new, causal, None if keys is None else folded(keys, jnp.full(len(keys), number)), cfg)
+        else:
+            earlier = jnp.broadcast_to(jnp.arange(cache.k.shape[-2]) < first, (x.shape[1], cache.k.shape[-2]))
+            out = attend_parts(q, [(cache, earlier), (new, causal)])
+        x = x + dense(cfg.width, name="o_proj")(out.swapaxes(1, 2).reshape(x.shape))
+        h = norm(name="post_attention_layernorm")(x)
+        gated = nn.silu(dense(cfg.mlp_width, name="gate_proj")(h)) * dense(cfg.mlp_width, name="up_proj")(h)
+        return x + dense(cfg.width, name="down_proj")(gated), None if cache is None else new
+
+
+def folded(keys: Key[Array, " B"], numbers: Int[Array, " B"]) -> Key[Array, " B"]:
+    """Returns a key for each clip's key and number."""
+    return jax.vmap(jax.random.fold_in)(keys, numbers)
+
+
+def _attend(
+    q: Float[Array, "B h L e"],
+    kv: KeyValues,
+    causal: Bool[Array, "L L"],
+    keys: Key[Array, " B"] | None,
+    config: IVideoGPTConfig,
+) -> Float[Array, "B h L e"]:
+    """Returns softmax(q·kᵀ/√e)·v in the past; on an accelerator with bf16 operands if linear layers have them."""
+    bf16 = config.compute_dtype == "bfloat16" and jax.default_backend() != "cpu"
+    q, k, v = (x.astype(jnp.bfloat16 if bf16 else x.dtype) for x in (q, kv.k, kv.v))
+    scores = jnp.einsum("bhqe,bhke->bhqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+    weights = jax.nn.softmax(jnp.where(causal, scores, jnp.finfo(jnp.float32).min), axis=-1)
+    if keys is not None:
+        keep = jax.vmap(lambda key: jax.random.bernoulli(key, 1 - config.dropout, weights.shape[1:]))(keys)
+        weights = jnp.where(keep, weights / (1 - config.dropout), 0.0)
+    return jnp.einsum("bhqk,bhke->bhqe", weights.astype(v.dtype), v, preferred_element_type=jnp.float32)
+
+
+class LLaMA(nn.Module):
+    """Sequences of :mod:`rsjax.models.ivideogpt.sequence` and actions to the logits of the next number."""
+
+    architecture: Architecture
+
+    @nn.compact
+    def __call__(
+        self,
+        tokens: Int[Array, "B L"],
+        actions: Float[Array, "B F A"] | None,
+        first: Any = 0,
+        cache: KeyValues | None = None,
+        keys: Key[Array, " B"] | None = None,
+        skip: int = 0,
+    ) -> tuple[Float[Array, "B M V"], KeyValues | None]:
+        """Returns logits of what follows each token after the first ``skip``, float32, and the cache.
+
+        Args:
+            actions: of the later frames, in order; not read by a model without actions.
+            first: position of the first token; may be traced.
+            cache: from :func:`empty_cache` or an earlier call; tokens before ``first`` are read from it.
+            keys: of the dropout of each clip; None: no dropout.
+
+        Returns:
+            The logits, and the cache with these tokens written in (None without a cache).
+        """
+        arch, cfg, layout = self.architecture, self.architecture.config, self.architecture.layout
+        x = nn.Embed(layout.vocabulary, cfg.width, embedding_init=NORMAL, name="embed_tokens")(tokens)
+        if arch.action_inputs:
+            if actions is None:
+                raise ValueError(f"the model reads actions ({arch.action_inputs} numbers a frame), and got none")
+            zeros = nn.initializers.zeros
+            added = nn.Dense(cfg.width, kernel_init=zeros, bias_init=zeros, name="action_linear")(actions)
+            frame, place = jnp.divmod(first + jnp.arange(tokens.shape[1]) - layout.first_slot, layout.per_frame)
+            x = x + jnp.where(((frame >= 0) & (place == 0))[:, None], added[:, jnp.maximum(frame, 0)], 0.0)
+        block = nn.remat(Block, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Block
+        blocks = nn.scan(
+            block,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+            in_axes=(0, nn.broadcast, nn.broadcast),
+            length=cfg.blocks,
+            unroll=min(cfg.unroll, cfg.blocks),
+        )
+        new: Any
+        x, new = blocks(cfg, name="blocks")(x, (cache, jnp.arange(cfg.blocks)), first, keys)
+        x = nn.RMSNorm(epsilon=1e-6, name="norm")(x[:, skip:])
+        head = Dense(layout.vocabulary, cfg.compute_dtype == "bfloat16", False, NORMAL, name="lm_head")
+        return head(x), None if cache is None else put_frames(cache, new, first, ring=False)
+
+    def init_params(self, key: Array) -> Params:
+        """Returns fresh parameters; blocks are stacked along a leading axis."""
+        return self.init(key, jnp.zeros((1, 1), jnp.int32), jnp.zeros((1, 1, self.architecture.action_inputs)))[
+            "params"
+        ]
+
+
+def empty_cache(arch: Architecture, clips: int, length: int) -> KeyValues:
+    """Returns keys and values of ``length`` positions for every block: zeros, never read before they are written."""
+    cfg = arch.config
+    zeros = jnp.zeros((cfg.blocks, clips, cfg.heads, length, cfg.width // cfg.heads), cfg.sample.cache_dtype)
+    return KeyValues(zeros, zeros)

@@ -1,0 +1,214 @@
+"""The conditional VQ tokenizer of iVideoGPT: context frames in all their tokens, later frames in few.
+
+A later frame is encoded and decoded with cross-attention to the features of the context, so its tokens only have to say
+what has changed. Submodules are named after the public checkpoints' keys.
+
+Axes: B clips, c context frames, F later frames, N = B·c or B·F images, H×W pixels, g×g cells, n tokens of a later
+frame, C channels.
+"""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from rsjax.config import ConditionalVQConfig
+from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
+from rsjax.tokenizers.vae_blocks import Downsample, Map, ResBlock, SelfAttention, Upsample, conv3, group_norm
+
+Features = list[Float[Array, "B c h w C"]]  # of the context after each level
+
+
+class CrossAttention(nn.Module):
+    """Lets every cell of a later frame attend to all cells of its clip's context frames."""
+
+    config: ConditionalVQConfig
+
+    @nn.compact
+    def __call__(self, z: Map, context: Float[Array, "B c h w C"], train: bool) -> Map:
+        cfg, (clips, frames, h, w, width) = self.config, context.shape
+        # Context frames are stacked along the height before the norm, as in the public code.
+        kv = group_norm(cfg.norm_groups, 1e-5, "kv_norm")(context.reshape(clips, frames * h, w, width))
+        kv = kv.reshape(clips, -1, width) + self.param("kv_pos_emb", nn.initializers.zeros, (frames * h * w, width))
+        q = group_norm(cfg.norm_groups, 1e-5, "q_norm")(z).reshape(clips, -1, h * w, width)
+        q = q + self.param("q_pos_emb", nn.initializers.zeros, (h * w, width))
+        kernel = self.param("in_proj_kernel", nn.initializers.xavier_uniform(), (width, 3 * width))
+        bias = self.param("in_proj_bias", nn.initializers.zeros, (3 * width,))
+        heads = lambda x: x.reshape(*x.shape[:-1], cfg.heads, width // cfg.heads)  # noqa: E731
+        q = heads(q @ kernel[:, :width] + bias[:width])
+        k, v = map(heads, jnp.split(kv @ kernel[:, width:] + bias[width:], 2, axis=-1))
+        scores = jnp.einsum("bfqhe,bkhe->bfhqk", q, k) * q.shape[-1] ** -0.5
+        drop = nn.Dropout(cfg.dropout, deterministic=not train)
+        out = jnp.einsum("bfhqk,bkhe->bfqhe", drop(jax.nn.softmax(scores, axis=-1)), v).reshape(*q.shape[:3], width)
+        return nn.silu(z + drop(nn.Dense(width, name="out_proj")(out)).reshape(z.shape))
+
+
+class Encoder(nn.Module):
+    """Maps images in [0, 1] to latents; with ``context`` features, those of later frames."""
+
+    config: ConditionalVQConfig
+
+    @nn.compact
+    def __call__(
+        self, images: Float[Array, "N H W 3"], context: Features | None = None, train: bool = False
+    ) -> tuple[Map, list[Map]]:
+        """Returns the latents (N, g, g, latent), and the features after the first convolution and each level."""
+        cfg = self.config
+        x = conv3(cfg.widths[0], "conv_in")(space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images)
+        features, crossed = [x], 0
+        for level, width in enumerate(cfg.widths):
+            for i in range(cfg.res_blocks):
+                x = ResBlock(width, cfg.norm_groups, name=f"down_{level}_block_{i}")(x)
+            if level < len(cfg.widths) - 1:
+                x = Downsample(name=f"down_{level}_downsample")(x)
+            if context is not None and x.shape[-2] <= cfg.attention_size:
+                x = CrossAttention(cfg, name=f"cross_{crossed}")(x, context[level + 1], train)
+                crossed += 1
+            features.append(x)
+        x = _mid(cfg, x, context is not None)
+        return conv3(cfg.latent, "conv_out")(nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))), features
+
+
+class Decoder(nn.Module):
+    """Maps latents to images in about [0, 1] (not clipped); with ``context`` features, those of later frames."""
+
+    config: ConditionalVQConfig
+
+    @nn.compact
+    def __call__(
+        self, latents: Map, context: Features | None = None, train: bool = False
+    ) -> tuple[Float[Array, "N H W 3"], list[Map]]:
+        """Returns images, and the features after the first convolution, the middle and each level."""
+        cfg = self.config
+        features = [conv3(cfg.widths[-1], "conv_in")(latents)]
+        x = _mid(cfg, features[0], context is not None)
+        if context is not None:
+            x = CrossAttention(cfg, name="cross_0")(x, context[1], train)
+        features.append(x)
+        for level, width in enumerate(reversed(cfg.widths)):
+            for i in range(cfg.res_blocks + 1):
+                x = ResBlock(width, cfg.norm_groups, name=f"up_{level}_block_{i}")(x)
+            if level < len(cfg.widths) - 1:
+                x = Upsample(name=f"up_{level}_upsample")(x)
+            if context is not None and x.shape[-2] <= cfg.attention_size:
+                x = CrossAttention(cfg, name=f"cross_{level + 1}")(x, context[level + 2], train)
+            features.append(x)
+        x = nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))
+        x = conv3(3 * cfg.patch_size**2, "conv_out")(x)
+        return (depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x), features
+
+
+def _mid(config: ConditionalVQConfig, x: Map, attention: bool) -> Map:
+    x = ResBlock(x.shape[-1], config.norm_groups, name="mid_block_0")(x)
+    if attention:
+        x = SelfAttention(config.norm_groups, name="mid_attention")(x)
+    return ResBlock(x.shape[-1], config.norm_groups, name="mid_block_1")(x)
+
+
+class Codebook(nn.Module):
+    """Vector quantisation: the nearest of a learned set of vectors."""
+
+    config: ConditionalVQConfig
+
+    def setup(self) -> None:
+        cfg = self.config
+        scale = cfg.codebook_scale or 1 / cfg.codes
+        draw = nn.initializers.uniform(2 * scale)
+        self.embedding = self.param("embedding", lambda *args: draw(*args) - scale, (cfg.codes, cfg.latent))
+
+    def nearest(self, z: Float[Array, "*N D"]) -> Int[Array, "*N"]:
+        """Returns the number of the nearest vector."""
+        distances = jnp.sum(jnp.square(self.embedding), -1) - 2 * z @ self.embedding.T  # + |z|², the same for all
+        return jnp.argmin(distances, axis=-1).astype(jnp.int32)
+
+    def __call__(self, z: Float[Array, "*N D"]) -> tuple[Float[Array, "*N D"], Float[Array, ""], Float[Array, ""]]:
+        """Returns the nearest vectors with the straight-through gradient, and the losses of codebook and commitment."""
+        near = self.lookup(self.nearest(z))
+        codebook = jnp.mean(jnp.square(near - jax.lax.stop_gradient(z)))
+        commitment = jnp.mean(jnp.square(jax.lax.stop_gradient(near) - z))
+        return z + jax.lax.stop_gradient(near - z), codebook, commitment
+
+    def lookup(self, tokens: Int[Array, "*N"]) -> Float[Array, "*N D"]:
+        """Returns the vectors of these numbers; a number beyond the codebook counts as its last."""
+        return self.embedding[jnp.clip(tokens, 0, self.config.codes - 1)]
+
+
+class Reconstruction(NamedTuple):
+    """What training compares: images in about [0, 1], and the losses of both codebooks."""
+
+    context: Float[Array, "B c H W 3"]
+    future: Float[Array, "B F H W 3"]
+    codebook: Float[Array, ""]
+    commitment: Float[Array, ""]
+
+
+class ConditionalVQ(nn.Module):
+    """Both encoders, codebooks and decoders; ``apply`` takes ``method`` "encode", "decode" or neither."""
+
+    config: ConditionalVQConfig
+
+    def setup(self) -> None:
+        cfg = self.config
+        self.encoder, self.cond_encoder = Encoder(cfg), Encoder(cfg)
+        self.decoder, self.cond_decoder = Decoder(cfg), Decoder(cfg)
+        self.quant_conv, self.post_quant_conv = (nn.Conv(cfg.latent, (1, 1)) for _ in range(2))
+        self.quant_linear = nn.Dense(cfg.latent)
+        self.post_quant_linear = nn.Dense(cfg.latent * cfg.future_patch**2)
+        self.quantize, self.dynamics_quantize = Codebook(cfg), Codebook(cfg)
+
+    def __call__(self, frames: Float[Array, "B T H W 3"], train: bool = False) -> Reconstruction:
+        """Encodes and decodes clips in [0, 1], differentiable through the codebooks."""
+        context, future = self._latents(frames, train)
+        context, *of_context = self.quantize(context)
+        future, *of_future = self.dynamics_quantize(future)
+        images = self._images(context, future, train)
+        codebook, commitment = (one + other for one, other in zip(of_context, of_future, strict=True))
+        return Reconstruction(images[0], images[1], codebook, commitment)
+
+    def encode(self, frames: Float[Array, "B T H W 3"]) -> tuple[Int[Array, "B c g g"], Int[Array, "B F n"]]:
+        """Returns the tokens of the first c frames and of the later ones, of images 0–255."""
+        context, future = self._latents(jnp.asarray(frames, jnp.float32) / 255, False)
+        return self.quantize.nearest(context), self.dynamics_quantize.nearest(future)
+
+    def decode(self, context: Int[Array, "B c g g"], future: Int[Array, "B F n"]) -> Float[Array, "B T H W 3"]:
+        """Decodes tokens to images 0–255 (float32, clipped, not rounded)."""
+        images = self._images(self.quantize.lookup(context), self.dynamics_quantize.lookup(future), False)
+        return jnp.clip(jnp.concatenate(images, axis=1), 0.0, 1.0) * 255
+
+    def _latents(
+        self, frames: Float[Array, "B T H W 3"], train: bool
+    ) -> tuple[Float[Array, "B c g g D"], Float[Array, "B F n D"]]:
+        cfg = self.config
+        context, future = jnp.split(frames, [cfg.context_frames], axis=1)
+        h, features = self.encoder(_flat(context))
+        d, _ = self.cond_encoder(_flat(future), _by_clip(features, context), train)
+        d = space_to_depth(d, cfg.future_patch)
+        d = self.quant_linear(d.reshape(*future.shape[:2], -1, d.shape[-1]))
+        h = self.quant_conv(h)
+        return h.reshape(*context.shape[:2], *h.shape[1:]), d
+
+    def _images(
+        self, context: Float[Array, "B c g g D"], future: Float[Array, "B F n D"], train: bool
+    ) -> tuple[Float[Array, "B c H W 3"], Float[Array, "B F H W 3"]]:
+        cfg = self.config
+        patches = context.shape[2] // cfg.future_patch
+        first, features = self.decoder(self.post_quant_conv(_flat(context)))
+        d = self.post_quant_linear(future)
+        d = depth_to_space(d.reshape(-1, patches, patches, d.shape[-1]), cfg.future_patch)
+        later, _ = self.cond_decoder(d, _by_clip(features, context), train)
+        return first.reshape(*context.shape[:2], *first.shape[1:]), later.reshape(*future.shape[:2], *later.shape[1:])
+
+    def init_params(self, key: Array, image_size: int) -> dict[str, Array]:
+        """Returns fresh parameters for images of this size, on which the learned positions depend."""
+        frames = jnp.zeros((1, self.config.context_frames + 1, image_size, image_size, 3))
+        return self.init(key, frames)["params"]
+
+
+def _flat(x: Float[Array, "B F ..."]) -> Float[Array, "N ..."]:
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _by_clip(features: list[Map], context: Float[Array, "B c ..."]) -> Features:
+    return [x.reshape(*context.shape[:2], *x.shape[1:]) for x in features]

@@ -1,0 +1,118 @@
+"""Samples later frames token by token, and rollouts longer than a sequence.
+
+A pass of the network takes one token, but that of a frame's last token also takes the next frame's slot. A rollout
+beyond ``positions`` goes on in a new sequence, whose context are the last frames as they were decoded.
+
+Axes: B clips, T frames (the first P are the prompt), c context frames, F later frames, A action inputs, V vocabulary.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import TopKConfig
+from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
+from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
+from rsjax.models.roboscape.attention import KeyValues
+from rsjax.trainable import Params
+
+
+def generate(
+    arch: Architecture,
+    codec: ConditionalCodec,
+    params: Params,
+    prompt: UInt8[np.ndarray, "B P H W 3"],
+    actions: Float[np.ndarray, "B T A"],
+    index: Int[np.ndarray, " B"],
+) -> UInt8[np.ndarray, "B T H W 3"]:
+    """Returns all frames, the first P as the tokenizer reconstructs them.
+
+    Args:
+        actions: inputs of the network; row t led into frame t. T may exceed what a sequence holds.
+        index: each clip's number, which decides its random draws.
+    """
+    layout, past = arch.layout, prompt.shape[1]
+    lacking = max(0, layout.context - past)  # a prompt shorter than the context begins with its first frame repeated
+    frames = np.concatenate([np.repeat(prompt[:, :1], lacking, axis=1), prompt], axis=1)
+    rows = np.concatenate([np.repeat(actions[:, :1], lacking, axis=1), actions], axis=1)
+    count = rows.shape[1] if rows.shape[1] <= layout.most_frames else layout.most_frames  # frames of a sequence
+    given = frames.shape[1] if frames.shape[1] < count else layout.context
+    begin = frames.shape[1] - given
+    made = [codec.decode(codec.encode(Video(frames))).rgb[:, : begin + given]]
+    window = frames[:, begin:]
+    keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), index)
+    while begin + given < rows.shape[1]:
+        tokens = codec.encode(Video(window))
+        used = rows[:, begin : begin + count].copy()  # shorter in the last sequence, whose surplus is cut
+        if arch.config.integrate_actions:  # sums begin with the sequence, as in training
+            used[..., used.shape[-1] // 2 :] -= used[:, :1, used.shape[-1] // 2 :]
+        used = np.pad(used, ((0, 0), (0, count - used.shape[1]), (0, 0)))[:, layout.context :]
+        sequence = layout.join(tokens["context"], tokens["future"])
+        drawn = sample(arch, params, sequence, used, folded(keys, jnp.full(len(index), begin)))
+        whole = codec.decode({"context": tokens["context"], "future": layout.future(np.asarray(drawn))}).rgb
+        made.append(whole[:, given:])
+        begin, given = begin + count - layout.context, layout.context
+        window = whole[:, -layout.context :]
+    return np.concatenate(made, axis=1)[:, lacking : rows.shape[1]]
+
+
+@partial(jax.jit, static_argnums=0)
+def sample(
+    arch: Architecture,
+    params: Params,
+    given: Int[Array, "B L"],
+    actions: Float[Array, "B F A"],
+    keys: Key[Array, " B"],
+) -> Int[Array, "B N"]:
+    """Returns a sequence's part after the context, of F later frames, from the sequence of the given frames.
+
+    Args:
+        given: context and perhaps later frames.
+        actions: of all later frames.
+        keys: of each clip's draws.
+    """
+    layout, (clips, begin) = arch.layout, given.shape
+    network, later = LLaMA(arch), actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
+    end = layout.length(layout.context + actions.shape[1])
+
+    def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:
+        logits, new = network.apply({"params": params}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
+        return new, logits[:, 0]
+
+    def draw(logits: Float[Array, "B V"], place: Array) -> Int[Array, " B"]:
+        return pick(arch.config.sample, logits, folded(keys, jnp.full(clips, place)))
+
+    def token(carry: tuple[KeyValues, Array], place: Array) -> tuple[tuple[KeyValues, Array], Array]:
+        cache, logits = carry
+        drawn = draw(logits, place)
+        return forward(cache, drawn[:, None], place), drawn
+
+    def frame(carry: tuple[KeyValues, Array], first: Array) -> tuple[tuple[KeyValues, Array], Array]:
+        """Draws the tokens of a frame whose slot is at position ``first``."""
+        places = first + 1 + jnp.arange(layout.tokens)
+        (cache, logits), drawn = jax.lax.scan(token, carry, places[:-1])
+        last = draw(logits, places[-1])
+        pair = jnp.stack([last, jnp.full_like(last, layout.slot)], axis=1)
+        return forward(cache, pair, places[-1]), jnp.concatenate([pair[None, :, 1], drawn, last[None]])
+
+    # One position more, since the last frame is also followed by a slot.
+    cache = empty_cache(arch, clips, end + 1)
+    slot = jnp.full((clips, 1), layout.slot, given.dtype)
+    start = forward(cache, jnp.concatenate([given, slot], axis=1), 0)
+    slots = begin + layout.per_frame * jnp.arange(later)
+    _, drawn = jax.lax.scan(frame, start, slots)
+    return jnp.concatenate([given[:, layout.first_slot :], drawn.transpose(2, 0, 1).reshape(clips, -1)], axis=1)
+
+
+def pick(settings: TopKConfig, logits: Float[Array, "B V"], keys: Key[Array, " B"]) -> Int[Array, " B"]:
+    """Draws a number for each clip from its ``top_k`` most probable ones; at temperature 0 takes the most probable."""
+    if settings.temperature == 0:
+        return jnp.argmax(logits, axis=-1).astype(jnp.int32)
+    if 0 < settings.top_k < logits.shape[-1]:
+        least = jax.lax.top_k(logits, settings.top_k)[0][:, -1:]
+        logits = jnp.where(logits < least, -jnp.inf, logits)
+    return jax.vmap(jax.random.categorical)(keys, logits / settings.temperature).astype(jnp.int32)

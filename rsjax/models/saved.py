@@ -1,0 +1,64 @@
+"""Reads the settings of a family's networks in a run directory, or in one made by ``python -m rsjax.convert``."""
+
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from rsjax.config import Config, ConfigError, ModelConfig, from_dict
+from rsjax.config.fields import differences
+from rsjax.errors import UserError
+from rsjax.files import read_json
+
+M = TypeVar("M", bound=ModelConfig)
+
+
+def read_model(directory: Path, kind: type[M], part: str) -> M:
+    """Returns the model's settings of a directory.
+
+    Args:
+        kind: the family's settings.
+        part: whose weights there must be, "tokenizer" or "world_model".
+
+    Raises:
+        UserError: the weights or their settings are missing, damaged, of another version or of another family.
+    """
+    path = directory / "config.json"
+    settings = read_json(path, cure="make it with python -m rsjax.convert")
+    if "model" not in settings or not (directory / part / "weights").exists():
+        raise UserError(f"{directory}: holds no {part}/weights of a model {kind.family!r} with settings in config.json")
+    try:
+        saved = from_dict(ModelConfig, settings["model"])
+    except (ConfigError, TypeError) as error:
+        raise UserError(f"{path}: the model's settings cannot be read ({error}); make it again") from error
+    if not isinstance(saved, kind):
+        raise UserError(f"{path}: holds a model of family {saved.family!r}; this one is of family {kind.family!r}")
+    return saved
+
+
+def check_alike(directory: Path, saved: Any, own: Any, free: set[str], section: str) -> None:
+    """Raises :class:`UserError` if two settings differ in fields outside ``free``; the message names them."""
+    if differing := differences(saved, own, free):
+        raise UserError(f"{directory}: holds another network ({differing}); set these fields of {section} alike")
+
+
+class Inputs(NamedTuple):
+    """What networks were made for: pixels per side of an image, and numbers in a frame's action (0: unknown)."""
+
+    image_size: int
+    action_dim: int
+
+
+def saved_inputs(directory: Path) -> Inputs:
+    """Returns what the networks of a directory were made for.
+
+    Raises:
+        UserError: the settings are missing, damaged or of another version.
+    """
+    path = directory / "config.json"
+    settings = read_json(path, cure="make it with python -m rsjax.convert")
+    try:
+        if "inputs" in settings:  # of python -m rsjax.convert
+            return Inputs(**{name: int(value) for name, value in settings["inputs"].items()})
+        clips = from_dict(Config, settings).clips
+        return Inputs(clips.image_size, clips.action_dim)
+    except (ConfigError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{path}: the model's settings cannot be read ({error}); make it again") from error
