@@ -29,6 +29,7 @@ ORDER = [
     "pipeline",
     "policies",
     "ablation",
+    "compare",
     "paper",
     "bench",
     "describe",

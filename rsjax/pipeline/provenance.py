@@ -60,7 +60,7 @@ def record_start(run: Run, command: str) -> list[str]:
         "keys": run.keys(),
         "code": code_version(Path(rsjax.__file__).resolve().parents[1]),
         "packages": dict(sorted((each.metadata["Name"], each.version) for each in importlib.metadata.distributions())),
-        "machine": _machine(),
+        "machine": machine(),
         "data": data_fingerprints(run),
     }
     starts = read_starts(run.directory)
@@ -93,10 +93,11 @@ def data_fingerprints(run: Run) -> dict[str, Any]:
     stores |= {
         p.store: Path(p.store) for loop in loops for stage in loop.curriculum for p in stage.components if p.store
     }
-    return {name: _fingerprint(path) for name, path in stores.items() if (path / MANIFEST).is_file()}
+    return {name: data_fingerprint(path) for name, path in stores.items() if (path / MANIFEST).is_file()}
 
 
-def _fingerprint(path: Path) -> dict[str, Any]:
+def data_fingerprint(path: Path) -> dict[str, Any]:
+    """Returns path, content key, manifest hash and split sizes of a store; less of a damaged one."""
     known: dict[str, Any] = {"path": str(path.absolute())}
     # Damage is reported by the stage that reads it.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -134,7 +135,8 @@ def _git(root: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _machine() -> dict[str, Any]:
+def machine() -> dict[str, Any]:
+    """Returns host, system, Python and devices."""
     devices = jax.local_devices()
     return {
         "host": socket.gethostname(),

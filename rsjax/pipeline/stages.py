@@ -10,12 +10,13 @@ from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_autoencoder, create_model
+from rsjax.pipeline.evaluations import evaluate_own
 from rsjax.pipeline.limits import check_batch, check_episodes
 from rsjax.pipeline.provenance import record_data, record_start
 from rsjax.pipeline.run import TRAINED, Run, link
 from rsjax.pipeline.setup import note_curriculum, starting, tokenizer_setup, world_model_setup
 from rsjax.pipeline.summary import write_summary
-from rsjax.pipeline.trained import load, load_tokenizer
+from rsjax.pipeline.trained import load_tokenizer
 from rsjax.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.sim.collect import collect
@@ -183,5 +184,4 @@ def train_world_model(run: Run, resume: bool) -> None:
 def evaluate(run: Run) -> None:
     """Stage 5: computes the scores, and the arrays of the report."""
     with disk_guard(run.directory):
-        result = evaluation.evaluate(load(run.directory), run.open_clips())
-        evaluation.save(run.output("evaluation"), result)
+        evaluation.save(run.output("evaluation"), evaluate_own(run))

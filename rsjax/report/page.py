@@ -84,13 +84,7 @@ def write_report(path: Path, report: Report) -> None:
         ValueError: a log without numbers.
         OSError: the disk is full or the directory is not writable.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rsjax.report", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
+    environment = template_environment()
     environment.filters["duration"] = duration
     shown = [metric for metric in metrics().values() if metric.column]
     places = [metrics()[name] for name in _PLACES]
@@ -111,6 +105,18 @@ def write_report(path: Path, report: Report) -> None:
         settings=_settings(report.config),
     )
     write_file(path, html.encode())
+
+
+def template_environment(package: str = "rsjax.report") -> jinja2.Environment:
+    """Returns the environment of a package's templates, which may include those of this one, such as the style."""
+    loaders = [jinja2.PackageLoader(name, ".") for name in dict.fromkeys((package, "rsjax.report"))]
+    return jinja2.Environment(
+        loader=jinja2.ChoiceLoader(loaders),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
 
 
 def _columns(shown: Iterable[Metric]) -> list[Column]:

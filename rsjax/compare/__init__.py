@@ -1,0 +1,1 @@
+"""Puts evaluations of several runs side by side: seeds, paired intervals, tests, published numbers, film strips."""

@@ -1,0 +1,144 @@
+"""A comparison as one self-contained HTML page: tables, curves over the frames, film strips of the same clips."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from rsjax.compare.table import DIFFERENCES, Comparison, difference_rows, header, legend, score_rows
+from rsjax.errors import UserError
+from rsjax.evaluation.frame_curves import Curves
+from rsjax.evaluation.registry import Footnotes, Metric
+from rsjax.evaluation.results import read_frames
+from rsjax.files import write_file
+from rsjax.progress import note
+from rsjax.report.curves import Chart, charts_svg
+from rsjax.report.figures import ClipFigure, filmstrip
+from rsjax.report.page import template_environment
+from rsjax.report.video import webp_uri
+
+STRIPS = 3  # clips of either end, worst and best
+LABEL = 18  # letters in a line of a film strip's labels
+COLORS = ("#3b7dd8", "#d9480f", "#3f9a63", "#8f5bd1", "#b8860b", "#c2417c", "#1b8a9c", "#6b7280")
+
+
+@dataclass(frozen=True)
+class ComparedClip(ClipFigure):
+    """A clip with the frames of every entry.
+
+    Attributes:
+        others: label and frames of each row below the truth.
+    """
+
+    others: tuple[tuple[str, UInt8[np.ndarray, "T H W 3"]], ...] = ()
+
+    def rows(self) -> list[tuple[str, UInt8[np.ndarray, "T H W 3"]]]:
+        """Returns the truth and the rows of all entries."""
+        return [("truth", self.truth), *self.others]
+
+
+def write_page(path: Path, comparison: Comparison, command: str) -> None:
+    """Writes the page atomically.
+
+    Args:
+        command: the command that repeats it.
+    """
+    notes, shown = Footnotes(), strips(comparison)
+    html = (
+        template_environment("rsjax.compare")
+        .get_template("compare.html.j2")
+        .render(
+            title=comparison.title,
+            origin=comparison.protocol.get("origin", ""),
+            header=header(comparison),
+            published=len(comparison.papers),
+            scores=score_rows(comparison, notes),
+            difference_header=DIFFERENCES,
+            differences=difference_rows(comparison),
+            legend=legend(comparison),
+            notes=notes.texts,
+            curves=Markup(_curves(comparison)),
+            strips=[(clip.title, webp_uri(filmstrip(clip))) for clip in shown],
+            command=command,
+        )
+    )
+    write_file(path, html.encode())
+
+
+def strips(comparison: Comparison) -> list[ComparedClip]:
+    """Returns the worst and the best clips by the reference's PSNR, of those whose frames were kept; worst first."""
+    try:
+        kept = [read_frames(group.folders[0]) for group in comparison.groups]
+    except UserError as error:
+        note(f"no film strips: {error}")
+        return []
+    score = np.mean([each.per_clip["psnr"] for each in comparison.reference.group.results], axis=0)
+    rows, first = kept[0]["rows"], comparison.groups[0].results[0]
+    order = np.argsort(score[rows], kind="stable")
+    count = min(STRIPS, len(order) // 2)
+    chosen = [(f"worst {i + 1}", place) for i, place in enumerate(order[:count])]
+    chosen += [(f"best {count - i}", place) for i, place in enumerate(order[len(order) - count :])]
+    prompt = comparison.protocol["prompt_frames"]
+    out = []
+    for rank, place in chosen:
+        truth, number = kept[0]["truth"][place], first.clips[rows[place]]["number"]
+        others = [
+            (_label(g.name), frames["prediction"][place]) for g, frames in zip(comparison.groups, kept, strict=True)
+        ]
+        others.append(("first frame\nrepeated", np.repeat(truth[prompt - 1 : prompt], len(truth), axis=0)))
+        others += _reconstructions(comparison, kept, place)
+        title = f"clip {number}, {rank} of {len(rows)} by {comparison.reference.name}: {score[rows[place]]:.2f} dB"
+        out.append(ComparedClip(title, truth, None, prompt_frames=prompt, others=tuple(others)))
+    return out
+
+
+def _reconstructions(
+    comparison: Comparison, kept: Sequence[dict[str, np.ndarray]], place: int
+) -> list[tuple[str, np.ndarray]]:
+    """Returns the reconstruction by each tokenizer that differs from those before it."""
+    found: list[tuple[str, np.ndarray]] = []
+    for group, frames in zip(comparison.groups, kept, strict=True):
+        if "reconstruction" in frames:
+            video = frames["reconstruction"][place]
+            if not any(np.array_equal(video, other) for _, other in found):
+                found.append((_label(f"tokenizer, {group.name}"), video))
+    return found if len(found) != 1 else [("tokenizer's\nreconstruction", found[0][1])]
+
+
+def _label(name: str) -> str:
+    return "\n".join(textwrap.wrap(name, LABEL, max_lines=2, placeholder="…"))
+
+
+def _curves(comparison: Comparison) -> str:
+    """Draws each metric's curve over the predicted frames, a line for each entry, the mean over its seeds."""
+    charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
+    return charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
+
+
+def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    lines = []
+    for entry in comparison.entries:
+        curves: list[Curves] = [result.curves for result in entry.group.results]
+        name = f"{metric.name}{entry.suffix}"
+        if all(name in each for each in curves):
+            points = np.mean([np.array(each[name], float) for each in curves], axis=0)
+            lines.append((entry.name, np.array(curves[0]["frame"], float), points))
+    return lines
+
+
+def _chart(comparison: Comparison, metric: Metric) -> Chart:
+    def draw(axes: Axes) -> None:
+        for number, (label, frames, points) in enumerate(_lines(comparison, metric)):
+            color, marker = COLORS[number % len(COLORS)], "o" if len(frames) == 1 else None
+            axes.plot(frames, points, color=color, marker=marker, linewidth=1.3, label=label)
+        axes.set_title(metric.heading, fontsize=9, loc="left")
+        axes.set_xlabel("frame", fontsize=8)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+
+    return draw

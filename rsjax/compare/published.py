@@ -1,0 +1,63 @@
+"""Published numbers of RoboScape (arXiv 2506.23135): Tables 1 and 2, and the authors' answers to reviewers.
+
+They are of other data (AgiBot-World), resolution and clips, so they stand beside ours and no test compares them.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+SOURCE = "arXiv 2506.23135, on AgiBot-World: other clips, other resolution; not comparable with the columns to the left"
+COLUMNS = ("lpips", "psnr", "depth_absrel", "depth_delta1", "depth_delta2", "delta_psnr")
+_PHYSICS = ("physics_iq_spatial", "physics_iq_spatiotemporal", "physics_iq_weighted", "physics_iq_mse")
+_TABLE: dict[str, tuple[float | None, ...]] = {
+    "IRASim": (0.6674, 11.5698, 0.6252, 0.5013, 0.7020, 0.0269),
+    "iVideoGPT": (0.4963, 16.1236, 0.7586, 0.3480, 0.5795, 0.1144),
+    "Genie": (0.1683, 19.7571, 0.4425, 0.5435, 0.7736, 1.9871),
+    "CogVideoX": (0.2180, 17.5222, 0.5243, 0.6046, 0.7599, None),
+    "RoboScape": (0.1259, 21.8533, 0.3600, 0.6214, 0.8307, 3.3435),
+    "RoboScape w/o depth": (0.1249, 21.9465, 0.3921, 0.5788, 0.8277, 3.4863),
+    "RoboScape w/o keypoints": (0.1264, 21.7087, 0.3417, 0.6497, 0.8673, 2.9462),
+    "RoboScape w/o both": (0.1299, 21.4873, 0.3565, 0.6248, 0.8129, 1.9871),
+}
+_PHYSICS_IQ = {
+    "IRASim": (0.2431, 0.1255, 0.2081, 0.0655),
+    "Genie": (0.6429, 0.3420, 0.6082, 0.0397),
+    "CogVideoX": (0.6523, 0.2058, 0.4675, 0.0943),
+    "RoboScape": (0.7573, 0.4454, 0.7023, 0.0184),
+}
+_UNSEEN = {
+    "Genie": {"psnr": 21.65, "depth_absrel": 0.326, "delta_psnr": 0.69},
+    "RoboScape": {"psnr": 23.40, "depth_absrel": 0.255, "delta_psnr": 2.83},
+}
+_FAMILIES = {"roboscape": "RoboScape", "genie": "Genie", "ivideogpt": "iVideoGPT", "irasim": "IRASim"}
+_FAMILIES |= {"cogvideox": "CogVideoX"}
+
+
+def published_name(model: Mapping[str, Any]) -> str | None:
+    """Returns the row of the paper's tables that a model of this family and these settings stands for, if any."""
+    name, settings = _FAMILIES.get(model["family"]), model.get("settings", {})
+    if name != "RoboScape":
+        return name
+    depth, keypoints = settings.get("use_depth", True), settings.get("loss", {}).get("use_keypoints", True)
+    missing = {(False, True): " w/o depth", (True, False): " w/o keypoints", (False, False): " w/o both"}
+    return name + missing.get((depth, keypoints), "")
+
+
+def published(name: str, protocol: str) -> dict[str, float]:
+    """Returns the published scores of one row by metric, "lpips" and "depth_absrel" without net or alignment."""
+    if protocol == "unseen":
+        return dict(_UNSEEN.get(name, {}))
+    if protocol not in ("paper", "run"):
+        return {}
+    table = zip(COLUMNS, _TABLE[name], strict=True)
+    physics = zip(_PHYSICS, _PHYSICS_IQ.get(name, ()), strict=False)
+    return {metric: value for metric, value in (*table, *physics) if value is not None}
+
+
+def score_of(scores: Mapping[str, float], metric: str, depth_suffix: str) -> float | None:
+    """Returns the published score that belongs beside one of our metrics; the paper names neither net nor alignment."""
+    if metric.startswith("lpips_"):
+        return scores.get("lpips")
+    if metric.startswith("depth_"):
+        return scores.get(metric.removesuffix(depth_suffix)) if metric.endswith(depth_suffix) else None
+    return scores.get(metric)

@@ -1,0 +1,167 @@
+"""The numbers of a comparison: means over seeds, intervals over seeds and clips, differences and what they show.
+
+Axes: S seeds, B clips.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.ablation.table import Spread, spread
+from rsjax.compare.groups import Group
+from rsjax.config import require
+from rsjax.errors import did_you_mean
+from rsjax.evaluation.registry import Metric, metrics
+from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
+
+BASELINES = {"_repeat_first": "first frame repeated", "_tokenizer": "tokenizer's reconstruction"}
+BEST = "_incl_ctx"  # ends the names of scores of the best of several samples
+Finding = Literal["better", "worse", "cannot tell", "same"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A column of the comparison: a group's prediction, or a baseline of one.
+
+    Attributes:
+        suffix: of the names of its scores: "" for the prediction, otherwise one of :data:`BASELINES`.
+    """
+
+    name: str
+    group: Group
+    suffix: str = ""
+
+    def seeds(self, metric: Metric) -> list[float]:
+        """Returns each seed's score over all clips; empty where a result has none."""
+        name = f"{metric.name}{self.suffix}"
+        values = [result.metrics.get(name) for result in self.group.results]
+        known = [float(value) for value in values if value is not None and math.isfinite(value)]
+        return known if len(known) == len(values) else []
+
+    def per_clip(self, metric: Metric) -> Float[np.ndarray, "S B"] | None:
+        """Returns the clips' scores; None where a result has none."""
+        rows = [result.per_clip.get(f"{metric.name}{self.suffix}", []) for result in self.group.results]
+        return np.array(rows) if rows[0] and len({len(row) for row in rows}) == 1 else None
+
+    def reason(self, metric: Metric) -> str:
+        """Returns why there is no score; "" if that is not recorded."""
+        return next((each.reasons[metric.name] for each in self.group.results if metric.name in each.reasons), "")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An entry's score of a metric.
+
+    Attributes:
+        spread: mean and standard deviation over seeds; None without a score.
+        interval: of the mean over seeds and clips; None for a score of the whole set.
+        reason: why there is no score.
+    """
+
+    spread: Spread | None
+    interval: Estimate | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An entry's score less the reference's.
+
+    Attributes:
+        interval: over seeds and clips, paired; None where clips have no scores of their own.
+        welch: over seeds; None with fewer than two seeds each.
+        finding: "better" or "worse" only if every interval there is says so; "same": all clips score alike.
+    """
+
+    interval: Estimate | None
+    welch: Welch | None
+    finding: Finding
+
+
+def entries_of(groups: Sequence[Group]) -> list[Entry]:
+    """Returns the groups' predictions, and both baselines: once if they score alike for all groups."""
+    entries = [Entry(group.name, group) for group in groups]
+    psnr = metrics()["psnr"]
+    for suffix, name in BASELINES.items():
+        found: list[Entry] = []
+        for group in groups:
+            entry = Entry(name, group, suffix)
+            if entry.seeds(psnr) and not any(set(entry.seeds(psnr)) == set(other.seeds(psnr)) for other in found):
+                found.append(entry)
+        entries += found if len(found) == 1 else [replace(each, name=f"{name}, {each.group.name}") for each in found]
+    return entries
+
+
+def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
+    """Returns the metrics to compare: those of tables and the protocol's depth scores, or those that fit patterns.
+
+    Raises:
+        ConfigError: no metric of the results fits a pattern.
+    """
+    results = [result for group in groups for result in group.results]
+    names = dict.fromkeys(name for result in results for name in result.metrics)
+    depth = {f"depth_{each}{_depth_suffix(groups)}" for each in ("absrel", "delta1", "delta2")}
+    found = [
+        replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
+    ]
+    found += [_best_of(name) for name in names if name.endswith(BEST)]
+    if not only:
+        other_depth = {each.name for each in found if each.name.startswith("depth_")} - depth
+        return [each for each in found if each.column and each.name not in other_depth]
+    known = [each.name for each in found]
+    for pattern in only:
+        fits = any(fnmatchcase(name, pattern) for name in known)
+        require(
+            fits, f"--only {pattern}: no metric of these results{did_you_mean(pattern, known)} ({', '.join(known)})"
+        )
+    return [each for each in found if any(fnmatchcase(each.name, pattern) for pattern in only)]
+
+
+def _depth_suffix(groups: Sequence[Group]) -> str:
+    protocol = groups[0].results[0].protocol
+    alignment, source = protocol["depth_alignment"], protocol["depth_source"]
+    return "" if alignment == "none" else f"_{alignment}_{source}"
+
+
+def _best_of(name: str) -> Metric:
+    """Returns the metric of a score such as ``psnr_best100_incl_ctx``."""
+    base, _, samples = name.removesuffix(BEST).rpartition("_best")
+    metric = metrics()[base]
+    return replace(metric, name=name, title=f"{metric.title}, best of {samples}, prompt included", statistic="mean")
+
+
+def cell(entry: Entry, metric: Metric) -> Cell:
+    """Returns an entry's score of a metric."""
+    seeds, clips = entry.seeds(metric), entry.per_clip(metric)
+    if not seeds:
+        return Cell(None, None, entry.reason(metric))
+    interval = None if clips is None else paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
+    return Cell(spread(seeds), interval, "")
+
+
+def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | None:
+    """Compares an entry with the reference; None where one of them has no score."""
+    seeds, others = entry.seeds(metric), reference.seeds(metric)
+    if not seeds or not others:
+        return None
+    clips, base = entry.per_clip(metric), reference.per_clip(metric)
+    paired = clips is not None and base is not None and clips.shape[1] == base.shape[1]
+    interval = paired_bootstrap(clips, base, statistic=metric.statistic) if paired else None  # type: ignore[arg-type]
+    test = None if entry.suffix or reference.suffix else welch(np.array(seeds), np.array(others))
+    return Difference(interval, test, _finding(interval, test, metric))
+
+
+def _finding(interval: Estimate | None, test: Welch | None, metric: Metric) -> Finding:
+    intervals = [each for each in (interval, test.difference if test else None) if each is not None]
+    if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
+        return "same"
+    verdicts = {verdict(each, metric.better) for each in intervals}
+    if len(verdicts) != 1:
+        return "cannot tell"
+    found: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse", "cannot tell": "cannot tell"}
+    return found[verdicts.pop()]

@@ -1,0 +1,264 @@
+"""Evaluates run directories by protocols. Each result is a folder, ``RUN/evaluations/LABEL``, with ``result.json``."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rsjax
+from rsjax.config import Config, EvalConfig, SimConfig, content_key, to_dict
+from rsjax.data.store import Store, StoreError, open_store
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.protocols import Protocol, find, label, of_run
+from rsjax.evaluation.results import NAME, fingerprint, read_result, result_of, write_result
+from rsjax.files import FileError, disk_guard, lock
+from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.own_data import relocated
+from rsjax.pipeline.provenance import code_version, data_fingerprint, machine
+from rsjax.pipeline.run import RECIPE, Run
+from rsjax.pipeline.trained import load, load_config
+from rsjax.pipeline.videos import resampled
+from rsjax.progress import Progress, note
+from rsjax.sim.collect import Report, collect, collection_key
+from rsjax.sim.unseen import collect_unseen
+from rsjax.training.distributed import barrier, is_lead, on_lead
+
+FOLDER = "evaluations"
+NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "loss_clips", "batch_size", "report_clips")
+LONGER_SEED = 1_000_000  # added to a run's seed, for longer episodes that are none of its own
+LONGER_TRAIN = 2  # episodes of their train split, which nothing uses
+
+
+@dataclass(frozen=True)
+class Request:
+    """How to evaluate.
+
+    Attributes:
+        protocol: its name.
+        changes: fields of the protocol to change.
+        settings: fields of :class:`rsjax.config.EvalConfig` to change, such as paths of weights.
+        data: a store with the clips to score; None: the run's own.
+        splits: of that store; empty: the protocol's.
+        store: the new path of the run's store of ingested clips, if it was moved.
+        overwrite: evaluate again what is up to date.
+    """
+
+    protocol: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    data: Path | None = None
+    splits: tuple[str, ...] = ()
+    store: Path | None = None
+    overwrite: bool = False
+
+
+def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
+    """Evaluates one run, each split by itself; what is up to date is skipped. All processes call it together.
+
+    Args:
+        data: the directory of simulated data sets.
+
+    Yields:
+        The folder of each result.
+
+    Raises:
+        UserError: the run, its data, a split or a file of weights is missing; the clips do not fit the protocol.
+    """
+    config = load_config(directory)
+    config = relocated(config, request.store) if request.store else config
+    config = replace(config, eval=replace(config.eval, **request.settings))
+    evaluation.check_files(config.eval)
+    standard = find(request.protocol, config)
+    protocol = replace(standard, **request.changes)
+    trained = _sampling(replace(load(directory), config=config), protocol)
+    run = Run(config, directory, data)
+    store = run.open_clips()
+    held_out = open_store(request.data) if request.data else _held_out(run, store, protocol)
+    for split in _splits(held_out, request.splits or protocol.splits):
+        parts = [label(protocol, standard), *([split] if split != "test" else [])]
+        name = ",".join([*parts, *([f"data={held_out.manifest.get('key')}"] if request.data else [])])
+        chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
+        folder = directory / FOLDER / name
+        evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
+        yield folder
+
+
+def evaluate_own(run: Run) -> Evaluation:
+    """Evaluates a run by its own configuration, as its evaluation stage does; the lead process calls it alone."""
+    trained, store = load(run.directory), run.open_clips()
+    held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
+    folder = run.directory / "evaluation"
+    return _evaluate(folder, held_out.protocol.name, trained, run, store, held_out)
+
+
+def evaluate_into(
+    folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut, overwrite: bool
+) -> None:
+    """Evaluates into a folder unless its result is up to date. Several processes share the work."""
+    fresh = not overwrite and _key_of(folder) == _key(trained, store, held_out)
+    if fresh:
+        if is_lead():
+            note(f"{folder}: up to date, skipped (--overwrite evaluates again)")
+        barrier("evaluation")
+        return
+    parts = _parts(folder, _key(trained, store, held_out))
+    if jax.process_count() > 1:
+        with disk_guard(parts):
+            plan = evaluation.plan(trained, store, held_out, parts)
+            plan.make(jax.process_index(), jax.process_count())
+        barrier("generation")
+
+    def finish() -> None:
+        with lock(folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here"):
+            _evaluate(folder, name, trained, run, store, held_out)
+
+    on_lead("evaluation", finish)
+
+
+def _evaluate(folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> Evaluation:
+    key = _key(trained, store, held_out)
+    parts = _parts(folder, key)
+    with disk_guard(folder):
+        for old in folder.glob("parts-*"):
+            if old != parts:  # of a configuration that was never finished
+                shutil.rmtree(old, ignore_errors=True)
+        found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts)
+        about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
+        about |= _described(trained, run, store, held_out)
+        write_result(folder, result_of(found, **about), found.kept)
+        shutil.rmtree(parts, ignore_errors=True)
+    return found
+
+
+def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
+    """Returns protocol, sampling, data, model and machine for the file."""
+    config, clips = trained.config, held_out.clips
+    data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
+    return {
+        "protocol": held_out.protocol.described(),
+        "sampling": _sample_settings(config),
+        "settings": _settings(config.eval),
+        "data": data | {"split": held_out.split, "frames": clips.rgb.shape[1], "image_size": clips.rgb.shape[2]},
+        "model": {
+            "run": str(run.directory),
+            "preset": config.name,
+            "family": config.model.family,
+            "settings": to_dict(config.model),
+            "seed": config.train.seed,
+            "parameters": sum(x.size for x in jax.tree.leaves(trained.params)),
+            "weights_sha256": _weights(trained),
+            "trained_on": store.manifest.get("key"),
+        },
+        "made": {"time": datetime.now(UTC).isoformat(timespec="seconds"), "machine": machine()},
+    }
+
+
+def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
+    """Returns a hash of all that decides the scores, except the code."""
+    data = [
+        (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, held_out.store)
+    ]
+    protocol = json.dumps([held_out.protocol.described(), _sample_settings(trained.config), data, held_out.split])
+    return content_key(RECIPE, "evaluation", protocol, _weights(trained), trained.config.eval)
+
+
+def _weights(trained: TrainedModel) -> str:
+    return fingerprint((trained.params, trained.assets.tokenizer))
+
+
+def _key_of(folder: Path) -> str:
+    try:
+        return read_result(folder).key if (folder / NAME).exists() else ""
+    except FileError:
+        return ""
+
+
+def _parts(folder: Path, key: str) -> Path:
+    return folder / f"parts-{key}"
+
+
+def _settings(settings: EvalConfig) -> dict[str, Any]:
+    """Returns what the metrics depend on: files by their content."""
+    values = {name: value for name, value in to_dict(settings).items() if name not in NOT_OF_METRICS}
+    files = {name: Path(value) for name, value in values.items() if name.endswith("_weights") and value}
+    return values | {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
+
+
+def _sample_settings(config: Config) -> dict[str, Any]:
+    settings = getattr(config.model, "sample", None)
+    return to_dict(settings) if is_dataclass(settings) else {}
+
+
+def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
+    """Returns the model with the protocol's settings of sampling, as far as its family has them."""
+    settings = getattr(trained.config.model, "sample", None)
+    known = {each.name for each in fields(settings)} if is_dataclass(settings) else set()
+    if missing := ", ".join(sorted(protocol.sampling.keys() - known)):
+        note(
+            f"a model of family {trained.config.model.family!r} has no {missing}, which {protocol.name} fixes; left out"
+        )
+    return resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})
+
+
+def _splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
+    """Returns the store's splits of these names; those that end in ``*`` stand for all that begin so."""
+    found = [split for split in store.splits if any(fnmatchcase(split, pattern) for pattern in wanted)]
+    for pattern in wanted:
+        if not any(fnmatchcase(split, pattern) for split in store.splits):
+            raise StoreError(
+                f"{store.path}: no split {pattern!r}; it has {', '.join(store.splits)}: choose with --split, or name "
+                f"another store with --data"
+            )
+    return found
+
+
+def _held_out(run: Run, store: Store, protocol: Protocol) -> Store:
+    """Returns the run's store, or one of longer episodes or unseen scenes, which are simulated if need be."""
+    sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
+    if run.config.data.key:
+        return store
+    if not any(fnmatchcase(split, pattern) for split in store.splits for pattern in protocol.splits):
+        count = min(protocol.clips, sim.test_episodes)
+        return _simulated(
+            f"scenes never seen, {count} episodes of each kind",
+            lambda report: collect_unseen(sim, store, count, report),
+        )
+    if needed <= sim.frames:
+        return store
+    longer = longer_episodes(sim, needed, protocol.clips)
+    path = run.data_directory / f"{sim.env}-{collection_key(longer)}"
+
+    def make(report: Report) -> Store:
+        collect(longer, path, report)
+        return open_store(path)
+
+    return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
+
+
+def _simulated(what: str, make: Callable[[Report], Store]) -> Store:
+    """Returns a store that the lead process makes, unless it exists, and the others then find."""
+    with Progress(f"simulating {what}", 0, "episodes") as progress:
+
+        def report(done: int, total: int) -> None:
+            progress.total = total
+            progress.update(done)
+
+        def work() -> None:
+            make(report)
+
+        on_lead("simulation", work)
+        return make(report)
+
+
+def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:
+    """Returns the configuration of held-out episodes that are longer than a run's: of another seed, all for testing."""
+    seed = (sim.seed + LONGER_SEED) % 2**32
+    return replace(sim, frames=frames, seed=seed, episodes=clips + LONGER_TRAIN, test_episodes=clips)

@@ -1,0 +1,172 @@
+import csv
+import io
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsjax.compare.groups import parse_group, read_groups
+from rsjax.compare.page import strips, write_page
+from rsjax.compare.published import published_name
+from rsjax.compare.table import as_csv, as_json, as_markdown, compare
+from rsjax.config import ConfigError
+from rsjax.errors import UserError
+from rsjax.evaluation.results import Result
+from rsjax.evaluation.statistics import bootstrap, welch
+from tests.compare import toy
+
+Make = Callable[..., str]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Writes runs and returns their group as the command takes it."""
+
+    def make(name: str, *results: Result) -> str:
+        paths = [toy.run(tmp_path / f"{name},seed={i}", each) for i, each in enumerate(results)]
+        return f"{name}={','.join(map(str, paths))}"
+
+    return make
+
+
+def test_one_seed_each_is_paired_by_clip(make: Make) -> None:
+    a, b = toy.result(0.0), toy.result(0.4)
+    found = compare(read_groups([make("a", a), make("b", b)], None))
+    difference = found.differences["psnr"][1]
+    assert difference is not None
+    expected = bootstrap(np.array(b.per_clip["psnr"]) - np.array(a.per_clip["psnr"]))
+    assert difference.interval is not None
+    assert difference.interval.value == pytest.approx(expected.value)
+    assert difference.interval.low == pytest.approx(expected.low)
+    assert (difference.finding, difference.welch) == ("better", None)
+    # Clips differ by far more than models do, so only pairing shows it.
+    cells = [cell.interval for cell in found.cells["psnr"][:2]]
+    assert cells[0] and cells[1] and cells[0].high is not None and cells[1].low is not None
+    assert cells[0].high > cells[1].low
+    assert [entry.name for entry in found.entries] == ["a", "b", "first frame repeated", "tokenizer's reconstruction"]
+    findings = [each.finding if each else None for each in found.differences["psnr"]]
+    assert findings == [None, "better", "worse", "better"]
+
+
+def test_better_is_only_said_where_seeds_bear_it_out(make: Make) -> None:
+    a = [toy.result(gain, seed) for seed, gain in enumerate((-1.0, 0.0, 1.0))]
+    b = [toy.result(gain, seed) for seed, gain in enumerate((0.5, 1.0, 1.5))]
+    c = [toy.result(gain, seed) for seed, gain in enumerate((3.9, 4.0, 4.1))]
+    found = compare(read_groups([make("a", *a), make("b", *b), make("c", *c)], "paper"))
+    _, weak, strong, *_ = found.differences["psnr"]
+    assert weak and strong and weak.welch and strong.welch
+    seeds = np.array([[each.metrics["psnr"] for each in group] for group in (a, b)], float)
+    expected = welch(seeds[1], seeds[0])
+    assert expected
+    assert weak.welch.p == pytest.approx(expected.p)
+    assert weak.welch.p > 0.05
+    assert (weak.finding, strong.finding) == ("cannot tell", "better")
+    assert found.cells["psnr"][0].spread == pytest.approx((np.mean(seeds[0]), np.std(seeds[0], ddof=1), 3))
+    other = compare(read_groups([make("a", *a), make("c", *c)], "paper"), against="c")
+    assert [each.finding if each else None for each in other.differences["psnr"]][:2] == ["worse", None]
+    same = found.differences["depth_absrel_median_branch"][1]
+    assert same and same.finding == "same"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"data": {"split": "unseen_task"}}, "data.split is test in the first, unseen_task in the other"),
+        ({"data": {"key": "other"}}, "data.key is toy in the first, other in the other"),
+        ({"data": {"image_size": 32}}, "data.image_size is 16 in the first, 32 in the other"),
+        ({"protocol": {"horizon": 48, "temperature": 1.0}}, "protocol.temperature is None in the first, 1.0 in"),
+        ({"clips": [{"number": 0, "sha256": "0"}]}, "the scored clips differ in their content"),
+    ],
+)
+def test_unlike_evaluations_are_refused_by_field(make: Make, changes: dict, says: str) -> None:
+    plain = toy.result(0.0)
+    merged = {
+        name: getattr(plain, name) | value if isinstance(value, dict) else value for name, value in changes.items()
+    }
+    with pytest.raises(UserError, match=f"were not evaluated alike: .*{re.escape(says)}"):
+        read_groups([make("a", plain), make("b", replace(plain, **merged))], None)
+
+
+def test_files_have_published_numbers_apart_and_reasons(make: Make, tmp_path: Path) -> None:
+    genie = toy.result(1.0, model={"run": "g", "family": "genie", "trained_on": "less"})
+    found = compare(read_groups([make("ours", toy.result(0.0)), make("theirs", genie)], None))
+    text = as_markdown(found)
+    assert "published: RoboScape" in text
+    assert "published: Genie" in text
+    assert re.search(r"PSNR, dB ↑ .*\| 21.8533 +\| 19.7571 ", text)
+    assert re.search(r"depth AbsRel, branch, median ↓ .*\| 0.36 +\| 0.4425 ", text)
+    assert re.search(r"LPIPS.* ↓ +\| –¹ ", text)
+    assert "¹ no weights" in text
+    assert "model.trained_on is toy in the first, less in the other" in text
+    rows = list(csv.DictReader(io.StringIO(as_csv(found))))
+    kinds = {row["entry"]: row["kind"] for row in rows}
+    assert kinds == {
+        **dict.fromkeys(("ours", "theirs"), "group"),
+        **dict.fromkeys(("first frame repeated", "tokenizer's reconstruction"), "baseline"),
+        **dict.fromkeys(("RoboScape", "Genie"), "published"),
+    }
+    assert json.loads(json.dumps(as_json(found)))["groups"]["theirs"][0]["model"]["trained_on"] == "less"
+    write_page(tmp_path / "page.html", found, "the command")
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("data:image/webp") == len(strips(found)) == 6
+    assert "published" in page
+    assert 'class="met">better' in page
+
+
+def test_strips_show_the_same_clips_from_the_worst_to_the_best(make: Make) -> None:
+    found = compare(read_groups([make("a", toy.result(0.0)), make("b", toy.result(1.0))], None))
+    psnr = np.array(found.groups[0].results[0].per_clip["psnr"])[toy.ROWS]
+    order = np.argsort(psnr)
+    for clip, place in zip(strips(found), order, strict=True):
+        assert clip.title.startswith(f"clip {2 * toy.ROWS[place]}, ")
+        labels, rows = zip(*clip.rows(), strict=True)
+        assert labels == ("truth", "a", "b", "first frame\nrepeated", "tokenizer's\nreconstruction")
+        np.testing.assert_array_equal(rows[1], 255 - toy.TRUTH[place])
+        np.testing.assert_array_equal(rows[3][-1], toy.TRUTH[place, 0])
+
+
+def test_metrics_are_chosen_by_pattern(make: Make) -> None:
+    groups = read_groups([make("a", toy.result(0.0))], None)
+    assert [each.name for each in compare(groups, ["ps*", "fvd"]).metrics] == ["psnr", "fvd"]
+    with pytest.raises(ConfigError, match="--only psnrr: no metric of these results; did you mean 'psnr'"):
+        compare(groups, ["psnrr"])
+    with pytest.raises(ConfigError, match="--against b: no such group"):
+        compare(groups, against="b")
+
+
+def test_groups_are_paths_lists_or_patterns_with_commas_in_names(tmp_path: Path) -> None:
+    for name in ("x=1,seed=0", "x=1,seed=1", "plain"):
+        (tmp_path / name).mkdir()
+    first, second = tmp_path / "x=1,seed=0", tmp_path / "x=1,seed=1"
+    assert parse_group(str(first)) == (first.name, (first,))
+    assert parse_group(f"full={first},{tmp_path / 'plain'},{second}") == ("full", (first, tmp_path / "plain", second))
+    assert parse_group(f"full={tmp_path}/x=1,*") == ("full", (first, second))
+    for text, says in (
+        ("nowhere", "no run directory; write RUN"),
+        (f"a={tmp_path}/plain,{tmp_path}/none", "no run directory '.*none'"),
+        (f"a={first},{first}", "is named twice"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            parse_group(text)
+
+
+def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"no result of protocol papr; did you mean 'paper'.*experiments.evaluate"):
+        read_groups([make("a", toy.result(0.0))], "papr")
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(UserError, match="no protocol has evaluated all of them; python -m experiments.evaluate"):
+        read_groups([str(tmp_path / "bare")], None)
+    toy.run(tmp_path / "a,seed=0", replace(toy.result(0.0), label="horizon48"))
+    with pytest.raises(UserError, match="results of horizon48, paper; choose with --protocol"):
+        read_groups([f"a={tmp_path}/a,seed=0"], None)
+
+
+def test_rows_of_the_paper() -> None:
+    settings = {"use_depth": False, "loss": {"use_keypoints": True}}
+    assert published_name({"family": "roboscape", "settings": settings}) == "RoboScape w/o depth"
+    assert published_name({"family": "irasim"}) == "IRASim"
+    assert published_name({"family": "mine"}) is None
