@@ -32,7 +32,7 @@ def _scored(metric: Metric, scenes: Mapping[str, Scene]) -> Iterator[tuple[str, 
         if not scene.alternatives.keys() >= set(metric.needs):
             continue  # as of baselines, which have no videos under other actions
         with suppress(Unavailable):
-            yield suffix, metric.per_frame(scene)
+            yield suffix, scene.shared(metric.per_frame)
 
 
 def _curve(name: str, metric: Metric, per_frame: PerFrame) -> Curves:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rsjax.clip import Video
-from rsjax.data.clips import Clips
+from rsjax.data.clips import Clips, spread
 from rsjax.data.codec import Record, decode, encode
 from rsjax.evaluation.protocols import Protocol
 from rsjax.files import write_file
@@ -23,6 +23,7 @@ from rsjax.progress import Progress
 
 OWN = "own"  # the kind of videos under the clips' own actions
 SAMPLE = "sample"  # the kind of further samples under them, of which only scores are kept
+TOKEN_CLIPS = 20  # clips whose tokens are scored under teacher forcing
 
 
 @dataclass(frozen=True)
@@ -163,10 +164,15 @@ class Generation:
 
 
 def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
-    """Predicts every frame's tokens of all clips from the true frames before it; None if the model cannot."""
-    size, count, video, parts = trained.config.eval.batch_size, len(clips.rgb), clips.video, list[TeacherForced]()
+    """Predicts every frame's tokens from the true frames before it; None if the model cannot.
+
+    Of ``TOKEN_CLIPS`` clips, spread evenly, which have thousands of tokens each; of all in a teacher-forced protocol.
+    """
+    size, video, parts = trained.config.eval.batch_size, clips.video, list[TeacherForced]()
+    numbers = spread(clips.rgb, len(clips.rgb) if protocol.teacher_forced else TOKEN_CLIPS)
+    count = len(numbers)
     for start in range(0, count, size):
-        rows = np.minimum(np.arange(start, start + size), count - 1)
+        rows = np.take(numbers, np.arange(start, start + size), mode="clip")
         inputs = (trained.params, trained.assets, video[rows], clips.actions[rows])
         part = trained.model.teacher_forced(*inputs, protocol.prompt_frames)
         if part is None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -68,9 +69,18 @@ def bootstrap(
         raise ValueError(f"an interval needs one finite number per clip, not {values}")
     if len(values) == 1:
         return Estimate(float(values[0]), None, None)
+    if statistic == "mean":
+        return _estimate(values.mean(), _share_of_clips(len(values), resamples, seed) @ values, level)
     drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    summarise = _SUMMARIES[statistic]
-    return _estimate(summarise(values), summarise(values[drawn], axis=1), level)
+    return _estimate(np.median(values), np.median(values[drawn], axis=1), level)
+
+
+@lru_cache(maxsize=2)  # of scores, and of the points of curves
+def _share_of_clips(clips: int, resamples: int, seed: int) -> Float[np.ndarray, "R B"]:
+    """Returns how often each clip was drawn in each resample, as shares that add up to 1."""
+    drawn = np.random.default_rng(seed).integers(clips, size=(resamples, clips))
+    cells = (drawn + clips * np.arange(resamples)[:, None]).ravel()
+    return np.bincount(cells, minlength=clips * resamples).reshape(resamples, clips) / clips
 
 
 def paired_bootstrap(

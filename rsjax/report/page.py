@@ -88,6 +88,7 @@ def write_report(path: Path, report: Report) -> None:
     environment.filters["duration"] = duration
     shown = [metric for metric in metrics().values() if metric.column]
     places = [metrics()[name] for name in _PLACES]
+    further = [metric for metric in metrics().values() if not (metric.column or metric.name.startswith("depth_"))]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
@@ -95,10 +96,11 @@ def write_report(path: Path, report: Report) -> None:
         clips=[_clip_pictures(clip) for clip in report.clips],
         scores=_table(report, notes, _SCORE_ROWS, _columns(metric for metric in shown if metric not in places)),
         depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
+        further=_table(report, notes, _SCORE_ROWS, _columns(further)),
         control=_table(report, notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
         places=_table(report, Footnotes(), _PLACE_ROWS, _columns(places)),
         place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
-        frame_curves=Markup(frame_curves_svg(report.curves, shown)),
+        frame_curves=Markup(frame_curves_svg(report.curves, [*shown, *further])),
         notes=notes.texts,
         verdicts=judge(report.metrics) if report.show_targets else [],
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},

@@ -129,7 +129,8 @@ def test_shown_clips_are_typical_ones_and_the_worst_by_their_own_psnr(
 def test_scores_of_single_clips_and_frames_have_the_scores_as_their_means(result: Evaluation) -> None:
     frames = TRUTH["rgb"].shape[1]
     assert result.curves["frame"] == list(range(2, frames + 1))
-    for name in ("psnr", "ssim_repeat_first", "psnr_tokenizer", "depth_absrel", "depth_absrel_repeat_first"):
+    names = ("psnr", "ssim_repeat_first", "psnr_tokenizer", "depth_absrel", "depth_absrel_repeat_first")
+    for name in (*names, "token_cross_entropy", "physics_iq_mse"):
         assert len(result.per_clip[name]) == toy.TEST
         assert np.mean(result.per_clip[name]) == pytest.approx(result.metrics[name], rel=1e-5)
         assert len(result.curves[name]) == frames - 1

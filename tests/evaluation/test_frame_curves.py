@@ -1,5 +1,7 @@
 """Curves over frames, of a metric that is registered here alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,4 +57,6 @@ def test_what_cannot_be_scored_and_baselines_without_other_actions_have_no_curve
     metric("absent", "absent", better="lower", per_frame=per_frame)(lambda scene: VALUES[:, 0])
     delta = metric("delta", "delta", better="higher", needs=("other",), per_frame=lambda scene: VALUES)
     delta(lambda scene: VALUES[:, 0])
-    assert frame_curves(scenes("", "_tokenizer")).keys() == {"frame", "delta", "delta_low", "delta_high"}
+    both = scenes("", "_tokenizer")
+    both[""] = replace(both[""], alternatives={"other": [both[""].truth]})
+    assert frame_curves(both).keys() == {"frame", "delta", "delta_low", "delta_high"}

@@ -16,6 +16,8 @@ _METRICS = {
     "ssim": 0.8714,
     "delta_psnr": 6.75,
     "delta_psnr_uniform_t4": 4.125,
+    "physics_iq_mse": 0.0123,
+    "physics_iq_mse_tokenizer": 0.0045,
     "depth_absrel": 0.0213,
     "depth_absrel_repeat_first": 0.0555,
     "cube_error_widths": 0.251,
@@ -111,6 +113,8 @@ def test_tables_show_each_number_in_its_row(full_page):
     assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "0.0213", "6.75"] in page.cells
     assert ["first frame repeated", "19.80", "–", "0.0555", "–"] in page.cells
     assert ["tokenizer's reconstruction", "28.70", "–", "–", "–"] in page.cells
+    assert ["test clips", "Physics-IQ MSE ↓"] in page.cells
+    assert ["tokenizer's reconstruction", "0.0045"] in page.cells
     assert ["uniform random actions", "4.12"] in page.cells
     assert ["last frame", "cube's place, widths ↓", "gripper's place, widths ↓", "lifted or not ↑"] in page.cells
     assert ["prediction", "0.251", "0.312", "0.930"] in page.cells

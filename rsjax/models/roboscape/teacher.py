@@ -6,6 +6,7 @@ the slots before its own. Clips that are longer than the positions are scored wi
 Axes: B clips, T frames, H×W = S cells, A action dimensions.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -52,7 +53,7 @@ def score_tokens(
     for base in dict.fromkeys(starts[past:]):
         window = {name: _window(grid, base, size) for name, grid in tokens.items()}
         rows = window_actions(arch, _window(actions, 0, frames + size), base, base, size)
-        scores = _score_window(arch, params, window, rows, no_depth)
+        scores = _score_window(replace(arch, unroll=1), params, window, rows, no_depth)
         scored = [t - base for t in range(past, frames) if starts[t] == base]
         parts.append(jax.tree.map(lambda x, scored=scored: np.asarray(x)[:, scored], scores))
     joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
@@ -79,7 +80,7 @@ def _score_window(
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
 
-    def score(t: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+    def score(t: Array) -> tuple[Scores, Scores]:
         frame = {name: jax.lax.dynamic_slice_in_dim(grid, t, 1, axis=1) for name, grid in tokens.items()}
         action = jax.lax.dynamic_slice_in_dim(actions, t, 1, axis=1)
         logits, _ = transformer(frame, ~visible[:, :1], action, t, cache)
@@ -89,6 +90,7 @@ def _score_window(
         }
         nats = {name: lfq.token_cross_entropy(x, frame[name], arch.code_bits) for name, x in logits.items()}
         right = {name: (grid == frame[name]).astype(jnp.float32) for name, grid in likeliest.items()}
-        return jax.tree.map(lambda x: x.mean((1, 2, 3)), (nats, right))
+        means: tuple[Scores, Scores] = jax.tree.map(lambda x: x.mean((1, 2, 3)), (nats, right))
+        return means
 
-    return jax.tree.map(lambda x: x.T, jax.lax.map(score, jnp.arange(frames)))
+    return jax.vmap(score, out_axes=1)(jnp.arange(frames))
