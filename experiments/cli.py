@@ -139,6 +139,11 @@ def parse_options(argv: Sequence[str], prog: str, description: str, options: Opt
     return _parse({"options": options}, argv, prog, description).options
 
 
+def part(options: Any, kind: type[Options]) -> Options:
+    """Returns the settings of one class that a command's options inherit from."""
+    return kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})  # type: ignore[arg-type]
+
+
 def _adding(options: Any) -> list[str]:
     """Returns the names of the options that may be repeated, as their values add up."""
     hints = get_type_hints(type(options), include_extras=True)

@@ -76,7 +76,8 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
             - ``provenance``: further JSON-ready values.
 
             Only ``rgb`` and ``actions`` have to be there.
-        test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split.
+        test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split. With 0 that
+            is empty, and training a world model on the store refuses.
 
     Returns:
         The store, opened.

@@ -38,8 +38,8 @@ class _Episode:
 def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], test_share: float = 0.1) -> Store:
     """Writes a store of clips, as :func:`rsjax.write_store` documents it."""
     path = Path(path)
-    if not 0 < test_share < 1:
-        raise StoreError(f"test_share is {test_share}; it is a share of the episodes, above 0 and below 1")
+    if not 0 <= test_share < 1:
+        raise StoreError(f"test_share is {test_share}; it is a share of the episodes, from 0 to below 1")
     if path.exists() and not (path / MANIFEST).exists():
         raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
     episodes: dict[str, _Episode] = {}

@@ -1,0 +1,144 @@
+"""Judges policies in world models: does success there follow success in the true simulator (Fig. 5)?"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config.policy import PolicyConfig
+from rsjax.evaluation.statistics import Estimate, wilson
+from rsjax.files import write_file, write_json
+from rsjax.policies.agreement import agreement
+from rsjax.policies.demos import Demos
+from rsjax.policies.figures import scatter, side_by_side
+from rsjax.policies.learning import interval_text, percent
+from rsjax.policies.policy import Policy, load_policy
+from rsjax.policies.rollouts import FirstFrame, World
+from rsjax.policies.simulator import Episode
+from rsjax.policies.training import train_policy
+from rsjax.policies.trials import FPS, Trials, first_frames, save_arrays, try_policy
+from rsjax.progress import stage
+from rsjax.report.video import write_mp4
+
+SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training at which policies are kept, beside the last one
+
+
+def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int = 8) -> dict[str, Policy]:
+    """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name."""
+    steps = config.train.steps
+    shares = np.interp(np.linspace(0, 1, count - 1), np.linspace(0, 1, len(SHARES)), SHARES)
+    stops = sorted({max(1, round(share * steps)) for share in shares} - {steps})
+    last = train_policy(config, demos, directory, name="policy", stops=stops)
+    return {f"step-{stop}": load_policy(directory / f"at-{stop}") for stop in stops} | {f"step-{steps}": last}
+
+
+def compare(
+    policies: Mapping[str, Policy],
+    simulator: World,
+    models: Mapping[str, Callable[[], World]],
+    trials: Trials,
+    out: Path,
+) -> dict[str, Any]:
+    """Tries each policy from the same first frames in the simulator and in each world model, unless that is done.
+
+    Args:
+        policies: by name.
+        simulator: the true one.
+        models: makes the world of each run, by the run's name.
+        out: for ``results.json``, ``results.md``, ``scatter.png`` and videos (left: simulator, right: world model).
+
+    Returns:
+        The content of ``results.json``.
+    """
+    frames = first_frames(simulator, trials.seeds, out / "starts.npz")
+    true: dict[str, list[bool]] = {}
+    for name, policy in policies.items():
+        true[name] = _tried(policy, simulator, trials.seeds, trials, out / "simulator" / name, f"{name} in simulator")
+    rows: list[dict[str, Any]] = []
+    for number, (run, make) in enumerate(models.items(), 1):
+        stage(number, len(models), run, "rolling policies out in this world model")
+        world, imagined = make(), {}
+        for name, policy in policies.items():
+            folder = out / run / name
+            imagined[name] = _tried(policy, world, frames, trials, folder, f"{name} in {run}")
+            _videos(out, run, name, trials)
+        rows.append(_row(run, true, imagined))
+        _write(out, rows, trials)
+    return {"trials": asdict(trials), "runs": rows}
+
+
+def _tried(
+    policy: Policy,
+    world: World,
+    starts: Sequence[int] | Sequence[FirstFrame],
+    trials: Trials,
+    folder: Path,
+    name: str,
+) -> list[bool]:
+    def see(number: int, episode: Episode) -> None:
+        if number < trials.videos:
+            save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
+
+    return try_policy(policy, world, starts, trials, folder, name, see).success
+
+
+def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
+    """Writes simulator and world model side by side for the first episodes."""
+    for number in range(min(trials.videos, trials.episodes)):
+        files = [out / world / name / f"episode-{number:02d}.npz" for world in ("simulator", run)]
+        if all(file.exists() for file in files):
+            sides = [np.load(file)["rgb"] for file in files]
+            write_mp4(out / "videos" / f"{run}-{name}-{number:02d}.mp4", side_by_side(sides), FPS, 4)
+
+
+def _row(run: str, true: Mapping[str, list[bool]], imagined: Mapping[str, list[bool]]) -> dict[str, Any]:
+    x, y = (np.array([np.mean(results[name]) for name in true]) for results in (true, imagined))
+    found = asdict(agreement(x, y)) if len(true) > 1 else {}
+    policies = {name: {"simulator": true[name], "world_model": imagined[name]} for name in true}
+    same = float(np.mean([np.mean(np.array(true[name]) == imagined[name]) for name in true]))
+    return {"run": run, "policies": policies, "same_outcome": same, **found}
+
+
+def _write(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
+    write_json(out / "results.json", {"trials": asdict(trials), "runs": list(rows)})
+    write_file(out / "results.md", table(rows).encode())
+    points = {row["run"]: _shares(row) for row in rows}
+    titles = {row["run"]: _title(row) for row in rows}
+    write_file(out / "scatter.png", scatter(points, titles))
+
+
+def _shares(row: Mapping[str, Any]) -> tuple[list[Estimate], list[Estimate]]:
+    sides = [[each[world] for each in row["policies"].values()] for world in ("simulator", "world_model")]
+    true, imagined = [[wilson(sum(one), len(one)) for one in side] for side in sides]
+    return true, imagined
+
+
+def _title(row: Mapping[str, Any]) -> str:
+    if "pearson" not in row:
+        return ""
+    r = Estimate(**row["pearson"])
+    bounds = "" if r.low is None or r.high is None else f" [{r.low:.2f}, {r.high:.2f}]"
+    return f"r = {r.value:.2f}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the results in Markdown."""
+    lines = ["| run | Pearson r | 95 % | R² of the line | R² of y = x | Spearman | MMRV | bias | same outcome |"]
+    lines.append("|---|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        if "pearson" in row:
+            r = Estimate(**row["pearson"])
+            bounds = "" if r.low is None or r.high is None else f"{r.low:.2f} … {r.high:.2f}"
+            numbers = " | ".join(f"{row[name]:.3f}" for name in ("r2_line", "r2_identity", "spearman", "mmrv"))
+            same = f"{100 * row['same_outcome']:.0f} %"
+            lines.append(f"| {row['run']} | {r.value:.3f} | {bounds} | {numbers} | {row['bias']:+.3f} | {same} |")
+    lines += ["", "| policy | in | success | 95 % |", "|---|---|---|---|"]
+    for number, row in enumerate(rows):
+        for world in ("simulator", "world_model") if not number else ("world_model",):
+            place = "the simulator" if world == "simulator" else row["run"]
+            for name, each in row["policies"].items():
+                share = wilson(sum(each[world]), len(each[world]))
+                lines.append(f"| {name} | {place} | {percent(share)} | {interval_text(share)} |")
+    return "\n".join([*lines, ""])

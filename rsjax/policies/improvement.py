@@ -1,0 +1,185 @@
+"""Improves a policy in imagination: it acts in the world model, and learns from what the judge calls a success."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config.policy import PolicyConfig
+from rsjax.data.codec import Record, decode, encode
+from rsjax.errors import UserError
+from rsjax.evaluation.statistics import Estimate, paired_bootstrap, verdict, wilson
+from rsjax.files import write_file, write_json
+from rsjax.policies.demos import Demos
+from rsjax.policies.figures import success_curves
+from rsjax.policies.learning import interval_text, percent
+from rsjax.policies.policy import Policy
+from rsjax.policies.rollouts import FirstFrame, World, run_together
+from rsjax.policies.training import train_policy
+from rsjax.policies.trials import Trials, try_policy
+from rsjax.progress import Progress, note, stage
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """How a policy is improved.
+
+    Attributes:
+        rounds: of imagining and fine-tuning.
+        imagined: episodes in the world model in each round.
+        max_steps: frames of each.
+        steps: of fine-tuning in each round.
+        share: of old demonstrations among those that are learnt from, 0 to below 1.
+        learning_rate: of fine-tuning, as a share of the training's.
+    """
+
+    rounds: int = 2
+    imagined: int = 200
+    max_steps: int = 30
+    steps: int = 500
+    share: float = 0.5
+    learning_rate: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("rounds", "imagined", "max_steps", "steps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        if not 0 <= self.share < 1:
+            raise UserError(f"--share is {self.share}; it is a share of old demonstrations, 0 to below 1")
+
+
+def improve(
+    policy: Policy,
+    demos: Demos,
+    starts: Sequence[FirstFrame],
+    model: World,
+    simulator: World,
+    settings: Improvement,
+    trials: Trials,
+    out: Path,
+) -> dict[str, Any]:
+    """Improves a policy, and beside it trains a control for as many steps on its old demonstrations alone.
+
+    Args:
+        policy: to begin with.
+        demos: those that it was trained on.
+        starts: first frames for imagined episodes; each round goes on where the one before ended.
+        model: the world model.
+        simulator: the true one, in which success is measured before and after each round.
+        out: for policies, imagined successes, ``results.json``, ``results.md`` and ``success.png``.
+
+    Returns:
+        The content of ``results.json``. An interrupted call resumes.
+    """
+    rows: list[dict[str, Any]] = []
+    arms = {"imagined": policy, "control": policy}
+    before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before").success
+    for number in range(1, settings.rounds + 1):
+        stage(
+            number, settings.rounds, f"round {number}", f"{settings.imagined} imagined episodes, {settings.steps} steps"
+        )
+        made = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}")
+        row: dict[str, Any] = {"round": number, "episodes": settings.imagined, "kept": len(made), "demos": len(demos)}
+        for arm, old in arms.items():
+            learns = mixed(demos, made, settings.share, number) if arm == "imagined" and made else demos
+            folder = out / f"round-{number}" / arm
+            config = _tuning(old.model.config, settings)
+            arms[arm] = train_policy(config, learns, folder, name=f"round {number} {arm}", seed=number, start=old)
+            row[arm] = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}").success
+        if not made:
+            note("the judge called no imagined episode a success: this round learns from the old demonstrations")
+        rows.append(row)
+        results = {"settings": asdict(settings), "trials": asdict(trials), "before": before, "rounds": rows}
+        results["differences"] = differences(results)
+        write_json(out / "results.json", results)
+        write_file(out / "results.md", table(results).encode())
+        write_file(out / "success.png", success_curves(_series(results), "rounds"))
+    return results
+
+
+def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
+    optimizer = config.train.optimizer
+    rate = settings.learning_rate * optimizer.learning_rate
+    optimizer = replace(optimizer, learning_rate=rate, warmup_steps=min(optimizer.warmup_steps, settings.steps // 10))
+    return replace(config, train=replace(config.train, steps=settings.steps, optimizer=optimizer))
+
+
+def imagine(
+    policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
+) -> list[Record]:
+    """Returns the episodes that the judge calls successes, as demonstrations; each group of them is kept in a file."""
+    begins = (number - 1) * settings.imagined
+    # A start that is used again has other draws.
+    chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
+    made: list[Record] = []
+    folder.mkdir(parents=True, exist_ok=True)
+    with Progress(f"round {number}: imagining", len(chosen), "episodes") as progress:
+        for first in range(0, len(chosen), model.count):
+            group, file = chosen[first : first + model.count], folder / f"imagined-{first:05d}.clips"
+            if not file.exists():
+                actor = policy.actor(begins + first)
+                episodes = run_together(model, actor, group, settings.max_steps)
+                good = [
+                    {"rgb": one.rgb, "actions": one.actions}
+                    for one in episodes
+                    if one.success.any() and len(one.rgb) > 1
+                ]
+                write_file(file, encode({"clips": [encode(one) for one in good]}))
+            made += [decode(payload) for payload in decode(file.read_bytes())["clips"]]
+            progress.update(first + len(group), kept=len(made))
+    return made
+
+
+def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demos:
+    """Returns imagined successes with so many of the old demonstrations, at random, that these are ``share`` of all."""
+    wanted = round(share / (1 - share) * len(made))
+    rng = np.random.default_rng(seed)
+    chosen = np.concatenate(
+        [rng.permutation(len(demos)) for _ in range(-(-wanted // len(demos)))] or [np.zeros(0, int)]
+    )
+    return Demos((*made, *(demos.records[int(place)] for place in chosen[:wanted])), demos.controls)
+
+
+def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Returns what the last round gained, against before and against the control; episodes are paired by start."""
+    last = {name: np.array([results["rounds"][-1][name]], float) for name in ("imagined", "control")}
+    last["before"] = np.array([results["before"]], float)
+    found = []
+    for one, other in (("imagined", "before"), ("imagined", "control"), ("control", "before")):
+        gap = paired_bootstrap(last[one], last[other])
+        found.append({"compares": [one, other], **asdict(gap), "verdict": verdict(gap)})
+    return found
+
+
+def table(results: dict[str, Any]) -> str:
+    """Returns the results in Markdown."""
+    lines = [
+        "| round | imagined | judged a success | policy | success in the simulator | 95 % |",
+        "|---|---|---|---|---|---|",
+    ]
+    share = _share(results["before"])
+    lines.append(f"| 0 | | | before | {percent(share)} | {interval_text(share)} |")
+    for row in results["rounds"]:
+        for arm in ("imagined", "control"):
+            share, counts = _share(row[arm]), f"{row['episodes']} | {row['kept']}" if arm == "imagined" else " | "
+            lines.append(f"| {row['round']} | {counts} | {arm} | {percent(share)} | {interval_text(share)} |")
+    lines += ["", "| last round | difference | 95 % | better? |", "|---|---|---|---|"]
+    for gap in results["differences"]:
+        estimate = Estimate(gap["value"], gap["low"], gap["high"])
+        names = " - ".join(gap["compares"])
+        lines.append(f"| {names} | {percent(estimate)} | {interval_text(estimate)} | {gap['verdict']} |")
+    return "\n".join([*lines, ""])
+
+
+def _share(success: Sequence[bool]) -> Estimate:
+    return wilson(sum(success), len(success))
+
+
+def _series(results: dict[str, Any]) -> dict[str, list[tuple[float, Estimate]]]:
+    begin = (0.0, _share(results["before"]))
+    return {
+        arm: [begin, *[(float(row["round"]), _share(row[arm])) for row in results["rounds"]]]
+        for arm in ("imagined", "control")
+    }

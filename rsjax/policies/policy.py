@@ -1,0 +1,124 @@
+"""A trained Diffusion Policy: acts in many episodes at once, and is kept in a directory.
+
+Axes: B episodes, O observed frames, S×S pixels, H controls of a plan, D numbers of a control, A = k·D of an action.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from rsjax.config import ConfigError, LoopConfig, from_dict, to_dict
+from rsjax.config.policy import PolicyConfig
+from rsjax.errors import UserError
+from rsjax.files import read_json, write_json
+from rsjax.policies.diffusion_policy import DiffusionPolicy, Range
+from rsjax.trainable import Params
+from rsjax.training.checkpoint import load_weights, save_weights
+
+FILE = "policy.json"
+WEIGHTS = "weights"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy with its parameters and the range of its controls."""
+
+    model: DiffusionPolicy
+    params: Params
+    range: Range
+
+    @property
+    def action_dim(self) -> int:
+        """A, numbers of an action of a clip."""
+        return self.model.controls * self.model.width
+
+    def actor(self, seed: int = 0) -> "Actor":
+        """Returns what acts in new episodes; its draws follow from the seed."""
+        return Actor(self, seed)
+
+    def save(self, directory: Path) -> None:
+        """Writes what :func:`load_policy` reads."""
+        model = self.model
+        values: dict[str, Any] = {"image_size": model.image_size, "controls": model.controls, "width": model.width}
+        values |= {"config": to_dict(model.config), "range": to_dict(self.range)}
+        write_json(directory / FILE, values)
+        save_weights(directory / WEIGHTS, self.params)
+
+
+def load_policy(directory: Path) -> Policy:
+    """Reads a policy.
+
+    Raises:
+        UserError: it is missing, damaged or of another version.
+    """
+    path = directory / FILE
+    if not path.exists():
+        raise UserError(f"{path}: missing, so {directory} holds no policy; experiments.policy_learning trains some")
+    try:
+        values = read_json(path, cure="train the policy again")
+        config, span = from_dict(PolicyConfig, values["config"]), from_dict(Range, values["range"])
+        model = DiffusionPolicy(config, *(int(values[name]) for name in ("image_size", "controls", "width")))
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: no policy of this version of rsjax ({error}); train it again") from error
+    return Policy(model, load_weights(directory / WEIGHTS, jax.eval_shape(model.init, jax.random.key(0))), span)
+
+
+class Actor:
+    """Acts in B episodes that began together: frames in, a clip's action for each out.
+
+    It plans when the controls of the last plan that are to be executed are used up.
+    """
+
+    def __init__(self, policy: Policy, seed: int) -> None:
+        # Without settings of training, so that policies that were trained for other steps share one program.
+        self._model = replace(policy.model, config=replace(policy.model.config, train=LoopConfig()))
+        self._policy, self._key = policy, jax.random.key(seed)
+        self._seen: list[np.ndarray] = []
+        self._plan: np.ndarray | None = None
+        self._done = 0  # frames
+
+    def __call__(self, frames: UInt8[np.ndarray, "B S S 3"]) -> Float32[np.ndarray, "B A"]:
+        """Returns the action that leads out of these frames.
+
+        Raises:
+            UserError: the frames have another size than the policy's.
+        """
+        model, size = self._model, self._model.image_size
+        if np.shape(frames)[1:] != (size, size, 3):
+            raise UserError(
+                f"the policy sees frames (B, {size}, {size}, 3), not {np.shape(frames)}; it is another run's"
+            )
+        observed = model.config.observations
+        self._seen = [*(self._seen or [frames] * (observed - 1)), frames][-observed:]
+        place = self._done % (model.config.execute // model.controls)
+        if place == 0:
+            key = jax.random.fold_in(self._key, self._done)
+            plan = _plan(model, self._policy.params, np.stack(self._seen, 1), key)
+            self._plan = self._policy.range.unscale(np.asarray(plan))
+        self._done += 1
+        assert self._plan is not None
+        controls = self._plan[:, place * model.controls : (place + 1) * model.controls]
+        return controls.reshape(len(frames), -1)
+
+
+@partial(jax.jit, static_argnums=0)  # one program for all policies of a size
+def _plan(model: DiffusionPolicy, params: Params, frames: Any, key: Any) -> Any:
+    return model.plan(params, frames, key)
+
+
+def common_size(policies: Iterable[Policy]) -> int:
+    """Returns the image size of policies that are compared.
+
+    Raises:
+        UserError: they differ.
+    """
+    sizes = {policy.model.image_size for policy in policies}
+    if len(sizes) != 1:
+        raise UserError(f"the policies see frames of {sorted(sizes)} pixels; compare policies of one size")
+    return sizes.pop()

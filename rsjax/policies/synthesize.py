@@ -1,0 +1,250 @@
+"""Makes synthetic demonstrations: videos that a world model generates from the first frames and actions of a data set.
+
+Axes: B clips, T frames, S×S pixels, A action dimensions.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from rsjax.config import content_key
+from rsjax.data.build import write_clips
+from rsjax.data.clips import Clips, frame_rate, readable
+from rsjax.data.codec import Record, decode, encode
+from rsjax.data.store import MANIFEST, Store
+from rsjax.errors import UserError
+from rsjax.export.lerobot import LeRobotOptions, export_lerobot
+from rsjax.files import disk_guard, making, read_json, write_atomically, write_json
+from rsjax.models.trained import TrainedModel
+from rsjax.policies.demos import Only, controls_of
+from rsjax.policies.verdicts import SUCCESS, Judge, last_frames
+
+MARK = "synthesis.json"
+CLIPS = "clips"  # folder of the store
+VERSIONS: tuple[Literal["v3.0", "v2.1"], ...] = ("v3.0", "v2.1")
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """Which demonstrations to make.
+
+    Attributes:
+        demos: how many. More than there are clips use clips again, with other noise and other draws of the model.
+        noise: standard deviation of the noise on actions, in each number's own standard deviation in the data set.
+            Numbers of a clip that are commands with two values at most, such as a gripper's, stay as they are.
+        split: of the clips whose first frames and actions are used.
+        only: success uses those that end in success, where the data set says which do.
+        seed: of the choice of clips, the noise and the model's draws.
+        batch: clips that are generated together.
+    """
+
+    demos: int = 200
+    noise: float = 0.0
+    split: str = "train"
+    only: Only = "success"
+    seed: int = 0
+    batch: int = 10
+
+    def __post_init__(self) -> None:
+        if self.demos < 1 or self.batch < 1 or not 0 <= self.noise < float("inf"):
+            raise UserError(f"--demos {self.demos}, --batch {self.batch}, --noise {self.noise}: 1, 1 and 0 at least")
+
+
+def synthesize(
+    trained: TrainedModel,
+    store: Store,
+    out: Path,
+    options: Synthesis,
+    limits: tuple[Float[np.ndarray, " A"], Float[np.ndarray, " A"]],
+    *,
+    judge: Judge | None = None,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Makes ``out/clips``, a store, and ``out/lerobot-v3.0`` and ``out/lerobot-v2.1``. An interrupted call resumes.
+
+    Args:
+        trained: the world model.
+        store: the data set.
+        limits: the least and greatest actions; what is beyond is clipped and counted.
+        judge: says which frames show success; None: the store does not say.
+        report: called with (demonstrations done, demonstrations in all).
+
+    Returns:
+        The content of ``out/synthesis.json``: ``demos``, ``clipped`` (numbers of actions), ``success`` (how many the
+        judge calls one at their end, None without), the options and the sources.
+
+    Raises:
+        UserError: the data set has no clip to begin with, does not fit the model, or ``out`` holds other clips.
+    """
+    key = content_key(3, str(trained.config), str(store.manifest.get("key")), str(asdict(options)), bool(judge))
+    if (out / MARK).exists():
+        mark = read_json(out / MARK, cure=f"delete {out}")
+        if mark.get("key") != key:
+            raise UserError(f"{out}: holds demonstrations of other settings; choose another --out, or delete it")
+        return mark
+    partial = out / "partial"
+    with disk_guard(out), making(out, wait=False):
+        if not (partial / key).exists():
+            shutil.rmtree(partial, ignore_errors=True)
+            (partial / key).mkdir(parents=True)
+        _generate(trained, store, partial / key, options, limits, judge, report)
+        clips = write_clips(out / CLIPS, _records(partial / key, options.demos), test_share=0.0)
+        for version in VERSIONS:
+            place = out / f"lerobot-{version}"
+            if place.exists():  # of an attempt that ended before its mark
+                shutil.rmtree(place)
+            export_lerobot(clips, place, LeRobotOptions(version))
+        mark = {"key": key, **asdict(options), **_summary(clips, judge is not None)}
+        write_json(out / MARK, mark)
+        shutil.rmtree(partial)
+    return mark
+
+
+def _generate(
+    trained: TrainedModel,
+    store: Store,
+    folder: Path,
+    options: Synthesis,
+    limits: tuple[Float[np.ndarray, " A"], Float[np.ndarray, " A"]],
+    judge: Judge | None,
+    report: Callable[[int, int], None],
+) -> None:
+    """Leaves each demonstration in a file of its own, those that exist excepted."""
+    source, chosen = store.source(options.split), choose_clips(store, options)
+    spread = np.asarray(trained.assets.normalization.action_std)
+    for first in range(0, options.demos, options.batch):
+        numbers = range(first, min(first + options.batch, options.demos))
+        if not all(_file(folder, number).exists() for number in numbers):
+            clips = [source[chosen[number % len(chosen)]] for number in numbers]
+            if clips[0]["actions"].shape[1] != len(spread):
+                width = clips[0]["actions"].shape[1]
+                raise UserError(f"{store.path}: actions of {width} numbers, the model takes {len(spread)}")
+            rng = [np.random.default_rng([options.seed, number]) for number in numbers]
+            noisy = [
+                perturb(clip["actions"], options.noise * spread, *limits, each)
+                for clip, each in zip(clips, rng, strict=True)
+            ]
+            for number, record in zip(
+                numbers, _generated(trained, store, clips, noisy, numbers, options, judge), strict=True
+            ):
+                write_atomically(_file(folder, number), encode(record))
+        report(numbers[-1] + 1, options.demos)
+
+
+def _generated(
+    trained: TrainedModel,
+    store: Store,
+    clips: list[Record],
+    noisy: list[tuple[Float32[np.ndarray, "T A"], int]],
+    numbers: range,
+    options: Synthesis,
+    judge: Judge | None,
+) -> Iterator[Record]:
+    """Yields what :func:`rsjax.write_store` takes of each clip that the model generates."""
+    count = trained.config.prompt_frames
+    prompt = Clips.stacked(clips, list(numbers)).video.frames(0, count)
+    full = options.batch - len(clips)  # a last batch is filled up: one program serves all
+    rows = np.concatenate([np.arange(len(clips)), np.zeros(full, int)])
+    actions = np.stack([actions for actions, _ in noisy])
+    index = np.array(numbers)[rows] + options.seed % 2**11 * 2**20
+    video = trained.model.generate(trained.params, trained.assets, prompt[rows], actions[rows], index=index)
+    success = None if judge is None else judged(video.rgb[: len(clips)], judge)
+    for row, (clip, number, (taken, clipped)) in enumerate(zip(clips, numbers, noisy, strict=True)):
+        made = {
+            "rgb": np.asarray(video.rgb[row]),
+            "actions": taken,
+            "task": clip["task"],
+            "episode": f"generated-{number}",
+        }
+        if video.depth is not None and not np.isnan(video.depth[row]).any():
+            made["depth"] = np.maximum(np.asarray(video.depth[row], np.float32), 1e-3)
+        if success is not None:
+            made["success"] = success[row]
+        if rate := frame_rate(clip, store.manifest):
+            made["fps"] = rate
+        origin = clip["provenance"]
+        made["provenance"] = {
+            "source": "generated",
+            "family": trained.config.model.family,
+            "from": {"key": str(store.manifest.get("key")), "split": options.split, "episode": origin.get("episode")},
+            "noise": options.noise,
+            "seed": options.seed,
+            "clipped": clipped,
+            "camera": str(origin.get("camera") or "image"),
+            "control_steps": controls_of(clip, store.manifest),
+        }
+        yield made
+
+
+def choose_clips(store: Store, options: Synthesis) -> list[int]:
+    """Returns the numbers of the clips to begin with, in an order that depends on the seed; at most ``demos``.
+
+    Raises:
+        UserError: there is none.
+    """
+    source = store.source(options.split)
+    labelled = options.only == "success" and store.manifest.get("success_share") is not None
+    order = np.random.default_rng(options.seed).permutation(len(source)).tolist()
+    chosen = []
+    for number, clip in readable(source, order):
+        if not labelled or clip["success"][-1]:
+            chosen.append(number)
+        if len(chosen) == options.demos:
+            break
+    if not chosen:
+        raise UserError(
+            f"{store.path}: no clip of its {options.split} split ends in success; --only all uses every clip"
+        )
+    return chosen
+
+
+def perturb(
+    actions: Float[np.ndarray, "T A"],
+    spread: Float[np.ndarray, " A"],
+    low: Float[np.ndarray, " A"],
+    high: Float[np.ndarray, " A"],
+    rng: np.random.Generator,
+) -> tuple[Float32[np.ndarray, "T A"], int]:
+    """Returns actions with Gaussian noise, clipped to their range, and how many numbers were clipped; row 0 stays zero.
+
+    Args:
+        spread: the noise's standard deviation; numbers with two values at most in these actions get none.
+    """
+    commands = np.array([len(np.unique(column)) <= 2 for column in actions[1:].T])
+    noise = rng.standard_normal(actions.shape) * np.where(commands, 0, spread)
+    noisy = (actions + noise).astype(np.float32)
+    noisy[0] = 0
+    taken = np.clip(noisy, low, high).astype(np.float32)
+    taken[0] = 0
+    return taken, int((taken[1:] != noisy[1:]).sum())
+
+
+def judged(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Bool[np.ndarray, "B T"]:
+    """Returns whether the judge sees success at each frame."""
+    labels = [judge(last_frames(rgb[:, : frame + 1])).argmax(-1) for frame in range(rgb.shape[1])]
+    return np.stack(labels, 1) == SUCCESS
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / f"{number:06d}.clip"
+
+
+def _records(folder: Path, count: int) -> Iterator[Record]:
+    return (decode(_file(folder, number).read_bytes()) for number in range(count))
+
+
+def _summary(clips: Store, scored: bool) -> dict[str, Any]:
+    made = [clip for _, clip in readable(clips.source("train"))]
+    origins = [clip["provenance"] for clip in made]
+    return {
+        "clipped": sum(origin["clipped"] for origin in origins),
+        "success": sum(bool(clip["success"][-1]) for clip in made) if scored else None,
+        "sources": len({str(origin["from"]["episode"]) for origin in origins}),
+        "from": origins[0]["from"]["key"],
+        "manifest": str(clips.path / MANIFEST),
+    }

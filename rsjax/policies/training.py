@@ -1,0 +1,100 @@
+"""Trains a Diffusion Policy, with the train step, loop and checkpoints of everything else."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import LoopConfig, content_key
+from rsjax.config.policy import PolicyConfig
+from rsjax.data.loader import Loader, batches
+from rsjax.errors import UserError
+from rsjax.files import read_json, write_json
+from rsjax.policies.demos import Demos
+from rsjax.policies.diffusion_policy import DiffusionPolicy, Range, Windows
+from rsjax.policies.policy import Policy, load_policy
+from rsjax.training.loop import Monitor, fit
+
+MARK = "training.json"
+
+
+def train_policy(
+    config: PolicyConfig,
+    demos: Demos,
+    directory: Path,
+    *,
+    name: str = "policy",
+    seed: int = 0,
+    stops: Sequence[int] = (),
+    start: Policy | None = None,
+) -> Policy:
+    """Trains a policy on demonstrations, resuming where an earlier call was interrupted.
+
+    Args:
+        config: the policy's settings; ``config.train.steps`` are those of this training.
+        demos: what it learns from.
+        directory: of checkpoints, logs and, in the end, the policy itself.
+        name: for the progress line.
+        seed: of the parameters, the order of the data and all draws.
+        stops: steps after which the policy so far is kept too, in ``directory/at-STEP``.
+        start: a policy to go on from, with its range of controls.
+
+    Raises:
+        UserError: the directory holds a training on other data or of other settings.
+    """
+    model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
+    span = start.range if start else demos.range
+    loop = replace(config.train, seed=seed)
+    key = content_key(
+        replace(config, train=loop), *map(_content, demos.records[:1]), len(demos), str(span), bool(start)
+    )
+    _check(directory, key)
+    if (directory / "policy.json").exists():
+        return load_policy(directory)
+    for stop in (*sorted(set(stops)), loop.steps):
+        at = directory / f"at-{stop}"
+        if stop < loop.steps and (at / "policy.json").exists():
+            continue
+        policy = Policy(model, _fit(model, loop, demos, span, directory, name, stop, start), span)
+        policy.save(directory if stop >= loop.steps else at)
+    return policy
+
+
+def _fit(
+    model: DiffusionPolicy,
+    loop: LoopConfig,
+    demos: Demos,
+    span: Range,
+    directory: Path,
+    name: str,
+    stop: int,
+    start: Policy | None,
+) -> Any:
+    def loader(state: dict[str, Any] | None) -> Loader:
+        return batches(demos, Windows(model, span), loop.batch_size, loop.seed, state=state)
+
+    begin: Callable[[Any], Any] | None = (
+        (lambda fresh: jax.tree.map(np.array, start.params)) if start else None
+    )  # a copy, as steps donate theirs
+    monitor = Monitor(("samples", loop.batch_size))
+    options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "monitor": monitor}
+    return fit(model, loop, loader, directory, **options).weights
+
+
+def _batch(arrays: dict[str, Any]) -> dict[str, Any]:
+    return {name: arrays[name] for name in ("frames", "controls", "index")}
+
+
+def _content(record: dict[str, Any]) -> str:
+    return f"{record['rgb'].sum(dtype=int)} {record['actions'].sum():.6f}"
+
+
+def _check(directory: Path, key: str) -> None:
+    mark = directory / MARK
+    if not mark.exists():
+        write_json(mark, {"key": key})
+    elif read_json(mark, cure=f"delete {directory}").get("key") != key:
+        raise UserError(f"{directory}: holds a policy of other settings or data; choose another directory or delete it")

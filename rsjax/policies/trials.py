@@ -1,0 +1,145 @@
+"""Trials of policies: which of the same starts each succeeds from, kept so that an interrupted series resumes."""
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config import SimConfig
+from rsjax.errors import UserError
+from rsjax.evaluation.statistics import Estimate, wilson
+from rsjax.files import read_json, write_file, write_json
+from rsjax.policies.policy import Policy
+from rsjax.policies.rollouts import FIRST_SEED, FirstFrame, Simulated, World, run_all
+from rsjax.policies.simulator import Episode, LiftEnv
+from rsjax.progress import Progress
+from rsjax.report.video import write_mp4
+
+FPS = 5.0  # of the videos
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The same episodes for every policy.
+
+    Attributes:
+        episodes: how many, from fixed seeds.
+        max_steps: frames after which one counts as a failure.
+        together: episodes that run at a time.
+        videos: how many episodes are kept as videos.
+    """
+
+    episodes: int = 50
+    max_steps: int = 30
+    together: int = 5
+    videos: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "max_steps", "together"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+
+    @property
+    def seeds(self) -> list[int]:
+        """The simulator's seeds."""
+        return [FIRST_SEED + number for number in range(self.episodes)]
+
+
+@dataclass
+class Result:
+    """What came of a policy's trials: success by episode, and numbers of actions that were clipped."""
+
+    success: list[bool] = field(default_factory=list)
+    clipped: int = 0
+
+    @property
+    def share(self) -> Estimate:
+        """The share of successes with its Wilson interval."""
+        return wilson(sum(self.success), len(self.success))
+
+
+def try_policy(
+    policy: Policy,
+    world: World,
+    starts: Sequence[Any],
+    trials: Trials,
+    folder: Path,
+    name: str,
+    see: Callable[[int, Episode], None] = lambda number, episode: None,
+) -> Result:
+    """Runs a policy from each start, except where ``folder`` has the result already.
+
+    Args:
+        folder: of ``success.json``, which grows as episodes end, and of a few videos.
+        name: for the progress line.
+        see: called with the number and the episode of each that is run now.
+    """
+    file = folder / "success.json"
+    kept: dict[str, Any] = read_json(file, cure=f"delete {file}") if file.exists() else {"success": [], "clipped": 0}
+    settings = [len(starts), trials.max_steps, trials.together]
+    if kept.setdefault("trials", settings) != settings:
+        raise UserError(f"{file}: is of (episodes, steps, together) {kept['trials']}, not {settings}; delete it")
+    begins = len(kept["success"])
+    with Progress(f"{name}: trials", len(starts), "episodes", begins) as progress:
+
+        def keep(number: int, episode: Episode) -> None:
+            kept["success"].append(bool(episode.success.any()))
+            kept["clipped"] += episode.clipped
+            if begins + number < trials.videos:
+                write_mp4(folder / f"episode-{begins + number:02d}.mp4", episode.rgb, FPS, 4)
+            see(begins + number, episode)
+
+        def report(done: int) -> None:
+            write_json(file, kept)
+            progress.update(begins + done, success=sum(kept["success"]))
+
+        # Draws depend on an episode's group, which begins at a multiple of ``together``.
+        run_all(world, lambda first: policy.actor(begins + first), starts[begins:], trials.max_steps, keep, report)
+    return Result([bool(one) for one in kept["success"]], int(kept["clipped"]))
+
+
+@contextmanager
+def lift_simulators(config: SimConfig, trials: Trials) -> Iterator[Simulated]:
+    """Opens simulators of Lift and closes them afterwards."""
+    envs: list[LiftEnv] = []
+    try:
+        for _ in range(min(trials.together, trials.episodes)):
+            envs.append(LiftEnv(config, max_steps=trials.max_steps))
+        yield Simulated(envs)
+    finally:
+        for env in envs:
+            env.close()
+
+
+def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFrame]:
+    """Returns the simulator's first frames for these seeds, from a file if it has them."""
+    if file.exists():
+        with np.load(file) as arrays:
+            if arrays["seeds"].tolist() == list(seeds):
+                return _frames(arrays["rgb"], arrays["depth"])
+    rgb, depth = [], []
+    for first in range(0, len(seeds), world.count):
+        seen = world.restart(seeds[first : first + world.count])
+        rgb.append(seen.rgb)
+        depth.append(np.zeros((len(seen.rgb), 0)) if seen.depth is None else seen.depth)
+    stacked = np.concatenate(rgb), np.concatenate(depth)
+    save_arrays(file, seeds=np.array(seeds), rgb=stacked[0], depth=stacked[1])
+    return _frames(*stacked)
+
+
+def save_arrays(file: Path, **arrays: np.ndarray) -> None:
+    """Writes an .npz file, atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_file(file, buffer.getvalue())
+
+
+def _frames(rgb: np.ndarray, depth: np.ndarray) -> list[FirstFrame]:
+    return [
+        FirstFrame(one, two if two.size else None, number)
+        for number, (one, two) in enumerate(zip(rgb, depth, strict=True))
+    ]

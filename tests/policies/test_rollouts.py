@@ -1,0 +1,82 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsjax.errors import UserError
+from rsjax.policies.rollouts import FirstFrame, run_together
+from rsjax.policies.simulator import Episode
+from rsjax.policies.trials import Trials, first_frames, try_policy
+from tests.policies.toy import picture
+from tests.policies.worlds import ToyPolicy, imagined, simulated
+
+STARTS = [0, 3, 1]  # seeds; the dot begins in that column and is done in column 10
+
+
+def frames(places: list[int]) -> list[FirstFrame]:
+    return [FirstFrame(picture(place), np.ones((16, 16), np.float32), 7 + place) for place in places]
+
+
+@pytest.mark.parametrize("kind", ["simulated", "imagined"])
+def test_episodes_end_when_each_succeeds(kind: str) -> None:
+    world: Any = simulated(3) if kind == "simulated" else imagined(4)  # one more than needed
+    starts: Any = STARTS if kind == "simulated" else frames(STARTS)
+    episodes = run_together(world, ToyPolicy(1.0).actor(), starts, 9)
+    assert [len(one.rgb) for one in episodes] == [6, 5, 6]  # 2 columns a frame
+    for one, begins in zip(episodes, STARTS, strict=True):
+        assert one.success[-1] and not one.success[:-1].any() and one.clipped == 0
+        assert not one.actions[0].any() and (one.actions[1:].reshape(-1, 2, 3)[..., 0] == 1).all()
+        assert one.depth is not None and len(one.depth) == len(one.actions) == len(one.rgb)
+        for step, frame in enumerate(one.rgb):
+            np.testing.assert_array_equal(frame, picture(begins + 2 * step))
+    slow = run_together(world, ToyPolicy(0.1).actor(), starts, 4)
+    assert [len(one.rgb) for one in slow] == [5, 5, 5] and not any(one.success.any() for one in slow)
+
+
+@pytest.mark.parametrize("kind", ["simulated", "imagined"])
+def test_actions_out_of_range_are_clipped_and_counted(kind: str) -> None:
+    world: Any = simulated(2) if kind == "simulated" else imagined(2)
+    starts: Any = [0, 4] if kind == "simulated" else frames([0, 4])
+    episodes = run_together(world, ToyPolicy(3.0).actor(), starts, 9)
+    assert [len(one.rgb) - 1 for one in episodes] == [5, 3]
+    assert [one.clipped for one in episodes] == [10, 6]  # both controls of each step
+
+
+def test_the_worlds_begin_with_the_same_frames(tmp_path: Path) -> None:
+    world, model = simulated(2), imagined(2)
+    found = first_frames(world, STARTS, tmp_path / "starts.npz")
+    again = first_frames(None, STARTS, tmp_path / "starts.npz")  # type: ignore[arg-type]
+    for one, other, place in zip(found, again, STARTS, strict=True):
+        np.testing.assert_array_equal(one.rgb, picture(place))
+        np.testing.assert_array_equal(one.rgb, other.rgb)
+        np.testing.assert_array_equal(one.depth, other.depth)
+    np.testing.assert_array_equal(model.restart(found[:1]).rgb, picture(0)[None])
+
+
+def test_trials_that_are_interrupted_go_on(tmp_path: Path) -> None:
+    trials = Trials(episodes=5, max_steps=4, together=2, videos=1)
+    starts = [0, 3, 1, 4, 2]  # with 4 steps of 2 columns, seeds 3, 4 and 2 come to column 10
+
+    def stop(number: int, episode: Episode) -> None:
+        if number == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        try_policy(ToyPolicy(1.0), simulated(2), starts, trials, tmp_path, "toy", stop)  # type: ignore[arg-type]
+    seen: list[int] = []
+    result = try_policy(
+        ToyPolicy(1.0),  # type: ignore[arg-type]
+        simulated(2),
+        starts,
+        trials,
+        tmp_path,
+        "toy",
+        lambda number, episode: seen.append(number),
+    )
+    assert seen == [2, 3, 4]  # the group that was cut short is run again
+    assert result.success == [False, True, False, True, True]
+    assert result.share.value == 0.6 and result.share.low is not None and result.share.low < 0.6
+    assert [path.name for path in tmp_path.glob("*.mp4")] == ["episode-00.mp4"]
+    with pytest.raises(UserError, match=r"is of \(episodes, steps, together\) \[5, 4, 2\], not \[5, 9, 2\]"):
+        try_policy(ToyPolicy(1.0), simulated(2), starts, Trials(5, 9, 2), tmp_path, "toy")  # type: ignore[arg-type]
