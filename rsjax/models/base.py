@@ -167,16 +167,25 @@ class WorldModel(Trainable[B], Protocol[B]):
         ...
 
     def plan(
-        self, params: Params, assets: Assets, prompt: Video, actions: Float[np.ndarray, "N T A"], depth: bool = True
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "N T A"],
+        depth: bool = True,
+        last: int | None = None,
     ) -> Video:
         """Generates the videos that follow one prompt under N action sequences, with the same random draws.
 
         Args:
             prompt: one clip's first P frames.
             actions: as for :meth:`generate`.
+            depth: likewise.
+            last: return only so many frames, the last ones; a family need not decode the others.
         """
-        repeated = prompt[np.zeros(len(actions), int)]
-        return self.generate(params, assets, repeated, actions, index=np.zeros(len(actions), int), depth=depth)
+        repeated, alike = prompt[np.zeros(len(actions), int)], np.zeros(len(actions), int)
+        video = self.generate(params, assets, repeated, actions, index=alike, depth=depth)
+        return video if last is None else video.frames(-last)
 
     def imagine(self, params: Params, assets: Assets, clips: int) -> Imagination:
         """Returns a number of clips to be generated frame by frame: those that :meth:`generate` gives at once.

@@ -19,6 +19,7 @@ from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.trained import load
 from rsjax.policies.actions import OutOfRange, checked_actions
+from rsjax.policies.judging import judge_of
 from rsjax.policies.simulator import FAR, STEPS, UNIT, Observation
 from rsjax.policies.starts import Starts
 from rsjax.policies.verdicts import HISTORY, LABELS, Judge
@@ -35,7 +36,8 @@ class Settings:
         store: the new path of the run's store of ingested clips, if it was moved.
         split: the clips whose first frames episodes begin with.
         max_steps: steps after which an episode is truncated; it may be longer than the model's window.
-        judge: decides reward and termination; None: nothing does, every reward is 0.
+        judge: decides reward and termination: a judge, the directory of a trained one, or "run": the run's own if
+            ``experiments.judge`` trained it. Without any, every reward is 0.
         out_of_range: whether actions out of their space are clipped and counted ("clip"), or an error ("refuse").
     """
 
@@ -43,7 +45,7 @@ class Settings:
     store: Path | str | None = None
     split: str = "test"
     max_steps: int = STEPS
-    judge: Judge | None = None
+    judge: Judge | Path | str | None = "run"
     out_of_range: OutOfRange = "clip"
 
 
@@ -92,7 +94,7 @@ class Episodes:
         self._depth = config.model.uses_depth and norm.depth_range is not None
         store = Path(settings.store) if settings.store else None
         self._starts = Starts(config, where, Path(settings.data_dir), store, settings.split, self._depth)
-        self._settings = settings
+        self._settings, self._judge = settings, judge_of(run, settings.judge)
         self._low, self._high, self._unit = action_range(config, norm)
         self._recent = np.zeros((count, HISTORY, size, size, 3), np.uint8)
         self._steps, self._clipped = np.zeros(count, int), np.zeros(count, int)
@@ -151,12 +153,13 @@ class Episodes:
 
     def verdict(self) -> Float[np.ndarray, "B 3"]:
         """Returns the probability of each label at the present frames; zeros without a judge."""
-        judge = self._settings.judge
-        return np.zeros((len(self._steps), len(LABELS))) if judge is None else judge(self._recent)
+        if self._judge is None:
+            return np.zeros((len(self._steps), len(LABELS)))
+        return self._judge(self._recent)
 
     def info(self, verdict: Float[np.ndarray, "B 3"]) -> dict[str, np.ndarray]:
         """Returns facts of all episodes: label, its probabilities, success, numbers clipped so far, clip."""
-        judged = self._settings.judge is not None
+        judged = self._judge is not None
         labels = [LABELS[i] for i in verdict.argmax(-1)] if judged else ["unjudged"] * len(verdict)
         return {
             "success": np.array(labels) == LABELS[0],
@@ -177,7 +180,8 @@ def action_range(
     """
     width = config.clips.action_dim
     if not config.data.key:
-        return np.full(width, -1, np.float32), np.full(width, 1, np.float32), UNIT
+        unit = UNIT if config.sim.env == "lift" else "controls of the simulator, from -1 to 1"
+        return np.full(width, -1, np.float32), np.full(width, 1, np.float32), unit
     mean, std = np.array(normalization.action_mean), np.maximum(normalization.action_std, 1e-3)
     low, high = mean - SPREAD * std, mean + SPREAD * std
     return low.astype(np.float32), high.astype(np.float32), "in the recording's units, as the clips' actions"

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from rsjax.config import SimConfig
+from rsjax.config import SimConfig, require
 from rsjax.policies.actions import OutOfRange, checked_actions
 from rsjax.sim.expert import Expert, Manner
 from rsjax.sim.lift import LiftSim, State
@@ -53,7 +53,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
 
     Raises:
         GLError: no OpenGL context can be made.
-        ConfigError: there is no such camera.
+        ConfigError: there is no such camera, or the clips are of another simulator.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
@@ -65,6 +65,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         out_of_range: OutOfRange = "clip",
         render_mode: str | None = None,
     ) -> None:
+        require(config.env == "lift", f"sim.env is {config.env}; only lift can be acted in so far")
         size = config.image_size
         self._config, self._max_steps, self._out_of_range = config, max_steps, out_of_range
         self._sim = LiftSim(config.camera, size)

@@ -133,6 +133,8 @@ def test_a_plan_is_what_generate_makes_of_each_candidate_with_the_same_draws(tra
     made = trained.model.generate(trained.params, trained.assets, repeated, candidates, index=np.zeros(2, int))
     jax.tree.map(np.testing.assert_array_equal, vars(planned), vars(made))
     assert not np.array_equal(planned.rgb[0], planned.rgb[1])
+    inputs = (trained.params, trained.assets, repeated[:1], candidates)
+    assert_alike(trained.model.plan(*inputs, last=2), planned.frames(-2))
     alike = trained.plan(rgb, candidates[[0, 0]], depth)
     np.testing.assert_array_equal(alike.rgb[0], alike.rgb[1])
 

@@ -149,6 +149,15 @@ def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedMode
         WorldModelEnv(model, data_dir=tmp_path).reset()
 
 
+def test_somebody_elses_agent_learns_in_it(env: WorldModelEnv) -> None:
+    agents = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3 (pip install stable-baselines3)")
+    agent = agents.PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0)
+    agent.learn(8)
+    assert agent.num_timesteps == 8
+    seen, _ = env.reset(seed=0)
+    assert env.action_space.contains(agent.predict(seen)[0])
+
+
 def test_a_family_without_steps_is_named(clips: Store) -> None:
     family = toy.trained(clips, replace(toy.config(), model=ToyConfig()))
     with pytest.raises(UserError, match="cannot generate frame by frame"):

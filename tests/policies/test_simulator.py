@@ -1,14 +1,15 @@
 from collections.abc import Iterator
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from rsjax.config import SimConfig
+from rsjax.config import ConfigError, SimConfig
 from rsjax.policies.actions import ActionError
 from rsjax.policies.simulator import LiftEnv, clip_seed, run_episode, skilled_expert
-from rsjax.sim import collect
+from rsjax.sim import episode as episodes
 from rsjax.sim.lift import LiftSim
 
 CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, camera="near")
@@ -23,7 +24,7 @@ def env(gl: str) -> Iterator[LiftEnv]:
 
 def test_replaying_a_clip_gives_its_frames(env: LiftEnv) -> None:
     with LiftSim(CONFIG.camera, CONFIG.image_size) as sim:
-        clip = collect.run_episode(sim, CONFIG, 2)
+        clip = episodes.run_episode(sim, CONFIG, episodes.EpisodePlan("000002", 2))
     rows = iter(clip.actions[1:])
     episode = run_episode(env, lambda seen: next(rows), clip_seed(clip.provenance))
     np.testing.assert_array_equal(episode.rgb, clip.rgb)
@@ -43,6 +44,11 @@ def test_the_expert_lifts_and_its_actions_lift_again(gl: str) -> None:
     np.testing.assert_array_equal(first.rgb, again.rgb)
     assert again.success[-1]
     env.close()
+
+
+def test_another_simulator_is_refused() -> None:
+    with pytest.raises(ConfigError, match="sim.env is metaworld"):
+        LiftEnv(replace(CONFIG, env="metaworld"))
 
 
 def test_gymnasiums_checker_passes(env: LiftEnv) -> None:

@@ -43,6 +43,7 @@ def plan(
     prompt: Video,
     actions: Float[np.ndarray, "N T A"],
     depth: bool,
+    last: int | None = None,
 ) -> Video:
     """Implements :meth:`rsjax.models.base.WorldModel.plan`; the prompt is encoded once.
 
@@ -57,6 +58,8 @@ def plan(
     start = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], no_depth=~has_depth)
     key, index = jax.random.key(sample.seed), jnp.zeros(n, jnp.int32)
     made = rollout_from(arch, sample, params, start, inputs[:, past:], key, index)
+    if last is not None:
+        made = {name: grid[:, -last:] for name, grid in made.items()}
     return codec.decode(made, np.repeat(has_depth & depth, n))
 
 

@@ -223,9 +223,15 @@ class RoboScape(WorldModel[Batch]):
         return generate(self.config, self.architecture, self._codec(assets), params, prompt, actions, index, depth)
 
     def plan(
-        self, params: Params, assets: Assets, prompt: Video, actions: Float[np.ndarray, "N T A"], depth: bool = True
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "N T A"],
+        depth: bool = True,
+        last: int | None = None,
     ) -> Video:
-        return plan(self.config, self.architecture, self._codec(assets), params, prompt, actions, depth)
+        return plan(self.config, self.architecture, self._codec(assets), params, prompt, actions, depth, last)
 
     def imagine(self, params: Params, assets: Assets, clips: int) -> Imagined:
         return Imagined(self.config, self.architecture, self._codec(assets), params, clips)

@@ -1,0 +1,54 @@
+"""Trains a judge of success from pictures. ``python -m experiments.judge runs/tiny``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.cli import main_errors, parse_options
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options:
+    """Trains a classifier of success, fail and uninterpretable on a run's clips, and validates it on held-out video."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory, made by experiments.train."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    store: Path | None = None
+    """The new path of the run's store of ingested clips, if it was moved."""
+    steps: int = 1000
+    """Training steps."""
+    clips: int = 1000
+    """Training clips, at most."""
+    reconstructed: int = 200
+    """Those of them that are also shown as the tokenizer reconstructs them."""
+    validation_clips: int = 100
+    """Held-out clips, at most."""
+    seed: int = 0
+    """Seed of the training."""
+
+
+@main_errors()
+def main() -> None:
+    """Writes RUN/judge and prints the validation."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.judge", Options.__doc__ or "", Options())
+    from rich.console import Console
+
+    from rsjax.policies.judge_validation import table
+    from rsjax.policies.judging import JudgeSettings, make_judge
+
+    settings = JudgeSettings(
+        options.steps, options.clips, options.reconstructed, options.validation_clips, options.seed
+    )
+    result = make_judge(options.run, options.data_dir, options.store, settings)
+    Console().print(table(result))
+    print(options.run / "judge")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Plans in a world model and acts in the simulator. ``python -m experiments.plan runs/tiny --energy judge``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from experiments.cli import main_errors, parse_options
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options:
+    """Model-predictive control in a run's world model, closed loop in the simulator, beside random and the expert."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory, made by experiments.train on simulated clips."""
+    methods: tuple[Literal["cem", "mppi"], ...] = ("cem", "mppi")
+    """Ways to search."""
+    energy: Literal["judge", "tokens", "pixels", "lpips"] = "judge"
+    """What to minimise at the horizon: 1 - the judge's probability of success (experiments.judge), or the distance of
+    the last frame to a goal image, which is the expert's last frame."""
+    lpips_weights: str = ""
+    """Weights for the energy lpips (docs/evaluation.md)."""
+    episodes: int = 50
+    """Episodes of every way to act, with equal starts."""
+    max_steps: int = 20
+    """Frames of an episode, at most."""
+    horizon: int = 6
+    """Frames that a candidate looks ahead."""
+    candidates: int = 32
+    """Action sequences of a round."""
+    rounds: int = 3
+    """Rounds of a decision."""
+    elites: int = 6
+    """Best candidates that cem goes on from."""
+    temperature: float = 0.5
+    """Of mppi, in standard deviations of the energies."""
+    seed: int = 0
+    """Seed of the candidates."""
+
+
+@main_errors()
+def main() -> None:
+    """Writes RUN/plan/result.json and prints a table; an interrupted comparison goes on."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.plan", Options.__doc__ or "", Options())
+    from rich.console import Console
+
+    from rsjax.pipeline.trained import load
+    from rsjax.policies.planner import PlannerConfig
+    from rsjax.policies.planning import PlanSettings, compare, table
+
+    fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
+    planner = PlannerConfig(**{name: getattr(options, name) for name in fields})
+    limits = (options.episodes, options.max_steps)
+    settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
+    result = compare(load(options.run), options.run, settings)
+    Console().print(table(result))
+    print(options.run / "plan" / "result.json")
+
+
+if __name__ == "__main__":
+    main()

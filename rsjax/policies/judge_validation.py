@@ -1,0 +1,87 @@
+"""How far a judge can be trusted: its confusion matrix and calibration on held-out videos of three kinds.
+
+Raw frames, the tokenizer's reconstructions, and generated videos under the clips' own actions. The labels are always
+the simulator's. On generated videos the model's errors count as the judge's: a cube that the model dropped is "fail" to
+a right judge and "success" to the simulator.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.table import Table
+
+from rsjax.evaluation.statistics import wilson
+from rsjax.policies.judge import Footage, spoilt
+from rsjax.policies.verdicts import FAIL, LABELS, SUCCESS, UNINTERPRETABLE, Judge
+
+BINS = 10
+AT_ONCE = 1024  # histories judged at once
+
+
+def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False) -> dict[str, Any]:
+    """Judges every frame from ``first`` on, and returns counts and rates, JSON-ready.
+
+    Args:
+        spoil: also judge as many spoilt histories, whose label is "uninterpretable".
+    """
+    videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
+    truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
+    rng, probabilities = np.random.default_rng(0), []
+    labels = []
+    for start in range(0, len(videos), AT_ONCE):
+        rows = slice(start, start + AT_ONCE)
+        history = footage.histories(videos[rows], frames[rows])
+        probabilities.append(judge(history))
+        labels.append(truth[rows])
+        if spoil:
+            probabilities.append(judge(spoilt(history, history[rng.permutation(len(history))], rng)))
+            labels.append(np.full(len(history), UNINTERPRETABLE))
+    return scores(np.concatenate(probabilities), np.concatenate(labels))
+
+
+def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]) -> dict[str, Any]:
+    """Returns the confusion matrix (rows: the truth), rates with Wilson intervals, and the calibration.
+
+    ``calibration_error`` is the mean gap, over ten equal bins of the highest probability, between it and the share of
+    right labels, weighted by the bins' counts (ECE); ``brier`` is the mean squared error of the probabilities. Frames
+    of one clip resemble each other, so the intervals, which count frames, are narrower than they should be.
+    """
+    chosen, sure = probabilities.argmax(-1), probabilities.max(-1)
+    right = chosen == truth
+    matrix = np.zeros((len(LABELS), len(LABELS)), int)
+    np.add.at(matrix, (truth, chosen), 1)
+    place = np.minimum((sure * BINS).astype(int), BINS - 1)
+    bins = [
+        {"confidence": float(sure[place == i].mean()), "right": float(right[place == i].mean()), "frames": int(count)}
+        for i, count in enumerate(np.bincount(place, minlength=BINS))
+        if count
+    ]
+    rates = {f"{LABELS[i]}_found": (int(row[i]), int(row.sum())) for i, row in enumerate(matrix) if row.sum()}
+    rates["right"] = (int(right.sum()), len(right))
+    intervals = {name: wilson(*counts) for name, counts in rates.items()}
+    error = sum(each["frames"] * abs(each["confidence"] - each["right"]) for each in bins) / len(right)
+    return {
+        "labels": list(LABELS),
+        "confusion": matrix.tolist(),
+        **{name: [rate.value, rate.low, rate.high] for name, rate in intervals.items()},
+        "uninterpretable_share": float((chosen == UNINTERPRETABLE).mean()),
+        "calibration_error": error,
+        "brier": float(np.square(probabilities - np.eye(len(LABELS))[truth]).sum(-1).mean()),
+        "bins": bins,
+    }
+
+
+def table(result: dict[str, Any]) -> Table:
+    """Formats a validation: a row for each kind of video and true label."""
+    out = Table(title=f"judge on {result['clips']} held-out clips: frames by label")
+    for heading in ("video", "truth", *LABELS, "right", "calibration error"):
+        out.add_column(heading, justify="left" if heading in ("video", "truth") else "right")
+    for kind in ("raw", "reconstructed", "generated"):
+        part = result.get(kind)
+        for i, row in enumerate(part["confusion"] if part else ()):
+            if any(row):
+                share = f"{row[i] / sum(row):.1%}"
+                error = f"{part['calibration_error']:.3f}" if i == 0 else ""  # type: ignore[index]
+                out.add_row(kind, LABELS[i], *map(str, row), share, error)
+    return out

@@ -1,0 +1,225 @@
+"""Compares planning in a world model with other ways to act, in a closed loop with the real simulator.
+
+Every way acts in the same episodes: equal seeds mean equal starts. The goal image of an episode is what the scripted
+expert reaches from the same start; it is not shown how.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from rich.table import Table
+
+from rsjax.config import content_key
+from rsjax.config.fields import require, require_range
+from rsjax.errors import UserError
+from rsjax.evaluation.statistics import wilson
+from rsjax.files import parse_json, write_json
+from rsjax.models.trained import TrainedModel
+from rsjax.policies.energies import Score, Seen, imagined, judged, lpips_distance, pixel_distance, token_distance
+from rsjax.policies.judging import saved_judge
+from rsjax.policies.planner import Planner, PlannerConfig
+from rsjax.policies.simulator import Actor, Episode, LiftEnv, Observation, run_episode, skilled_expert
+from rsjax.progress import Progress
+
+EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
+MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
+MEMORY = 2  # last frames that the world model starts from; one at an episode's beginning
+FIRST_SEED = 1_000_000  # of episodes
+RESULT = "result.json"
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """What is compared.
+
+    Attributes:
+        planner: how the planner searches; its ``method`` is replaced by each of ``methods``.
+        methods: of planning.
+        energy: "judge": 1 - the run's judge's probability of success; or the distance of the last frame to the goal
+            image by the model's tokens, pixels, or LPIPS.
+        lpips_weights: a file of weights for "lpips".
+        episodes: seeds, from ``FIRST_SEED`` on.
+        max_steps: of an episode.
+    """
+
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    methods: tuple[str, ...] = ("cem", "mppi")
+    energy: EnergyName = "judge"
+    lpips_weights: str = ""
+    episodes: int = 50
+    max_steps: int = 20
+
+    def __post_init__(self) -> None:
+        require_range(self, "plan", 1, 2**31, "episodes", "max_steps")
+        known = ("judge", "tokens", "pixels", "lpips")
+        require(self.energy in known, f"plan.energy is {self.energy!r}; it is one of {', '.join(known)}")
+        require(self.energy != "lpips" or bool(self.lpips_weights), "plan.energy is lpips; it needs lpips_weights")
+
+
+class PlanningActor:
+    """Plans anew at every frame, with the last frames as the world model's prompt.
+
+    Attributes:
+        seconds: of each decision.
+    """
+
+    def __init__(self, planner: Planner, width: int, depth: bool) -> None:
+        self._planner, self._depth = planner, depth
+        self._frames: list[Observation] = []
+        self._actions = [np.zeros(width, np.float32)]
+        self.seconds: list[float] = []
+
+    def __call__(self, frame: Observation) -> Float32[np.ndarray, " A"]:
+        began = time.monotonic()
+        self._frames.append(frame)
+        kept = 1 if len(self._frames) < MEMORY else MEMORY  # two shapes, so that two programs are compiled
+        frames = self._frames[-kept:]
+        depth = np.stack([each["depth"] for each in frames]) if self._depth else None
+        seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        action = self._planner(seen).astype(np.float32)
+        self._actions.append(action)
+        self.seconds.append(time.monotonic() - began)
+        return action
+
+
+def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
+    """Returns the score that a planner minimises.
+
+    Raises:
+        UserError: the run has no judge or no tokens, or the weights are missing or damaged.
+    """
+    if settings.energy == "judge":
+        return judged(saved_judge(run))
+    if settings.energy == "tokens":
+        return token_distance(trained, goal)
+    return pixel_distance(goal) if settings.energy == "pixels" else lpips_distance(Path(settings.lpips_weights), goal)
+
+
+def actors(
+    trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
+) -> dict[str, MakeActor]:
+    """Returns the ways to act by name: random, expert, the given others, and the planner with each method."""
+    config = trained.config
+    depth = config.model.uses_depth and trained.assets.normalization.depth_range is not None
+    high, controls = np.ones(config.clips.action_dim), config.sim.control_steps
+
+    def random(seed: int, goal: np.ndarray) -> Actor:
+        rng = np.random.default_rng(seed)
+        return lambda frame: np.tile(
+            rng.uniform(-1, 1, len(high) // config.sim.control_steps), config.sim.control_steps
+        )
+
+    def planning(method: str) -> MakeActor:
+        search = PlannerConfig(**asdict(settings.planner) | {"method": method, "hold": controls})
+
+        def make(seed: int, goal: np.ndarray) -> Actor:
+            energy = imagined(trained, score_of(trained, run, settings, goal))
+            return PlanningActor(Planner(energy, -high, high, search), len(high), depth)
+
+        return make
+
+    def expert(seed: int, goal: np.ndarray) -> Actor:
+        scripted = skilled_expert(seed)
+        return lambda frame: scripted.act
+
+    return {"random": random, "expert": expert, **(others or {}), **{name: planning(name) for name in settings.methods}}
+
+
+def compare(
+    trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
+) -> dict[str, Any]:
+    """Acts in the simulator in every way, and returns success rates and times; also in ``RUN/plan/result.json``.
+
+    Finished episodes are kept in the result, so an interrupted comparison goes on where it was.
+
+    Args:
+        trained: the model of ``run``, which was trained on simulated clips.
+        others: further ways to act, such as a policy.
+
+    Raises:
+        UserError: the run is of recordings, or something that the energy needs is missing.
+    """
+    config = trained.config
+    if config.data.key:
+        raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
+    ways = actors(trained, run, settings, others)
+    score_of(
+        trained, run, settings, np.zeros((config.sim.image_size,) * 2 + (3,), np.uint8)
+    )  # fails before episodes do
+    path, key = run / "plan" / RESULT, content_key("plan", settings, sorted(ways))
+    done = _kept(path, key)
+    env = LiftEnv(config.sim, settings.max_steps)
+    total = settings.episodes * len(ways)
+    with Progress("episodes", total, "episodes") as progress:
+        for number in range(settings.episodes):
+            seed, goal = FIRST_SEED + number, None
+            for name, make in ways.items():
+                if not any(row["way"] == name and row["seed"] == seed for row in done):
+                    goal = _goal(env, seed) if goal is None else goal
+                    done.append(_row(env, name, make(seed, goal), seed))
+                    write_json(path, _summary(done, settings, key))
+                progress.update(len(done))
+    env.close()
+    return _summary(done, settings, key)
+
+
+def table(result: dict[str, Any]) -> Table:
+    """Formats a comparison."""
+    out = Table(
+        title=f"success in the simulator, {result['settings']['episodes']} episodes; energy: "
+        f"{result['settings']['energy']}"
+    )
+    for heading in ("way to act", "success", "95 % interval", "steps", "seconds a decision"):
+        out.add_column(heading, justify="left" if heading == "way to act" else "right")
+    for name, way in result["ways"].items():
+        seconds = "–" if way["seconds_per_decision"] is None else f"{way['seconds_per_decision']:.2f}"
+        interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
+        out.add_row(name, f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds)
+    return out
+
+
+def _goal(env: LiftEnv, seed: int) -> UInt8[np.ndarray, "S S 3"]:
+    """Returns the last frame of the expert's episode."""
+    expert = skilled_expert(seed)
+    last: np.ndarray = run_episode(env, lambda frame: expert.act, seed).rgb[-1]
+    return last
+
+
+def _row(env: LiftEnv, name: str, act: Actor, seed: int) -> dict[str, Any]:
+    episode: Episode = run_episode(env, act, seed)
+    seconds = act.seconds[1:] or act.seconds if isinstance(act, PlanningActor) else []  # the first one compiles
+    return {
+        "way": name,
+        "seed": seed,
+        "success": bool(episode.success.any()),
+        "steps": len(episode.rgb) - 1,
+        "seconds_per_decision": float(np.median(seconds)) if seconds else None,
+    }
+
+
+def _summary(rows: list[dict[str, Any]], settings: PlanSettings, key: str) -> dict[str, Any]:
+    ways = {}
+    for name in dict.fromkeys(row["way"] for row in rows):
+        of = [row for row in rows if row["way"] == name]
+        seconds = [row["seconds_per_decision"] for row in of if row["seconds_per_decision"] is not None]
+        ways[name] = {
+            **wilson(sum(row["success"] for row in of), len(of)).flat("success"),
+            "episodes": len(of),
+            "steps": float(np.mean([row["steps"] for row in of])),
+            "seconds_per_decision": float(np.median(seconds)) if seconds else None,
+        }
+    return {"key": key, "settings": asdict(settings), "ways": ways, "episodes": rows}
+
+
+def _kept(path: Path, key: str) -> list[dict[str, Any]]:
+    """Returns the episodes of an interrupted comparison with the same settings; those of others are done again."""
+    try:
+        saved = parse_json(path.read_bytes())
+    except (OSError, ValueError):
+        return []
+    return list(saved.get("episodes", [])) if saved.get("key") == key else []
