@@ -77,12 +77,12 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     config = replace(config, eval=replace(config.eval, **request.settings))
     evaluation.check_files(config.eval)
     standard = find(request.protocol, config)
-    protocol = replace(standard, **request.changes)
+    protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
     held_out = open_store(request.data) if request.data else _held_out(run, store, protocol)
-    for split in _splits(held_out, request.splits or protocol.splits):
+    for split in _splits(held_out, protocol.splits):
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
         name = ",".join([*parts, *([f"data={held_out.manifest.get('key')}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
