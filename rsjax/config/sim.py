@@ -9,7 +9,10 @@ from rsjax.config.fields import added, require, require_range, runtime
 from rsjax.config.metaworld import ML45, ML45_UNSEEN, TASKS
 from rsjax.errors import did_you_mean
 
-CONTROLS = {"lift": 7, "metaworld": 4}  # numbers of a control step: pose delta (6-D, or position alone) and gripper
+CONTROLS = {
+    "lift": 7,
+    "metaworld": 4,
+}  # numbers of a control step: change of the pose (6-D, or position alone) and gripper
 
 
 @dataclass(frozen=True)

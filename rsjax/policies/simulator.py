@@ -23,7 +23,7 @@ from rsjax.sim.lift import LiftSim, State
 Observation: TypeAlias = dict[str, np.ndarray]  # "rgb": uint8 (S, S, 3); "depth": float32 (S, S), metres
 Control: TypeAlias = Callable[[State], Float[np.ndarray, " 7"]]  # from the simulator's state, at each control step
 Actor: TypeAlias = Callable[[Observation], Any]  # one episode's policy: a frame's action, or a control
-UNIT = "6-D pose delta and gripper (+1 closes) for each control step, from -1 to 1"
+UNIT = "6-D change of the goal pose and gripper (+1 closes) for each control step, from -1 to 1"
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
 DEFAULT = SimConfig(camera="near")
 STEPS = 30  # of an episode, by default: 6 s at 5 frames per second

@@ -93,7 +93,7 @@ class Expert:
         rng: generator of the action noise and of aimless motion.
     """
 
-    GAIN = 20.0  # action per metre of error: full speed until 5 cm before the target
+    GAIN = 20.0  # action per metre of error: full speed until the goal is 5 cm before the target
     TURN_GAIN = 1.5  # action per radian
 
     def __init__(self, manner: Manner, rng: np.random.Generator) -> None:
@@ -109,7 +109,7 @@ class Expert:
         explores = self._manner.mode == "explore"
         target, finger = self._wander() if explores else self._pick(state)
         action = np.zeros(7)
-        action[:3] = np.clip(self.GAIN * (target - state.gripper), -self._manner.speed, self._manner.speed)
+        action[:3] = np.clip(self.GAIN * (target - state.goal), -self._manner.speed, self._manner.speed)
         if not explores and self._phase in ("hover", "descend"):
             # the cube looks the same after a quarter turn
             error = (state.cube_yaw - state.gripper_yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4

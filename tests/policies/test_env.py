@@ -126,7 +126,7 @@ def test_a_vector_of_environments_restarts_each_as_one_alone_would(model: Traine
 
 def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedModel, tmp_path: Path) -> None:
     env.reset(seed=0)
-    with pytest.raises(ActionError, match=r"actions have shape \(7,\); expected \(28,\), 6-D pose delta"):
+    with pytest.raises(ActionError, match=r"actions have shape \(7,\); expected \(28,\), 6-D change of the goal pose"):
         env.step(np.zeros(7))
     with pytest.raises(ActionError, match=r"actions\[3\] is inf"):
         env.step(np.where(np.arange(28) == 3, np.inf, 0))
