@@ -191,6 +191,11 @@ class TransformerConfig:
     # The encoder also reads the sum of all actions so far, which doubles its input. If actions are pose deltas, the sum
     # is the pose: a large model finds it by temporal attention, a small one in few steps may not. Not in the paper.
     integrate_actions: bool = False
+    # Every frame's input also has the embedded tokens of the frame before it, cell by cell, through a table of its own.
+    # In training these are visible where the frame before is masked, as past frames are in sampling, and the first
+    # spatial attention finds more than masks in the frame to predict. No output sees its own frame by it. Not in the
+    # paper.
+    read_previous: bool = False
     width: int = 256
     blocks: int = 32
     heads: int = 8

@@ -51,12 +51,14 @@ class Decoder:
         tokens, cache = carry
         pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
         actions = window_actions(self.arch, self.actions, base, t - 1, 2)
-        frame, cache = self.decode_pair(pair, actions, t - base, self._step_keys(t), cache)
+        before = {name: grid[:, t - 2] for name, grid in tokens.items()}
+        frame, cache = self.decode_pair(pair, before, actions, t - base, self._step_keys(t), cache)
         return _put(tokens, frame, t), cache
 
     def decode_pair(
         self,
         pair: Cells,
+        before: Cells,
         actions: Float[Array, "B 2 A"],
         position: Array | int,
         keys: Key[Array, "B steps"],
@@ -66,19 +68,23 @@ class Decoder:
 
         Args:
             pair: tokens of both; the second one's have no effect.
+            before: (B, S) tokens of the frame before both, for ``read_previous``; not read if the first is its window's
+                first.
             actions: into both, as the window has them.
             position: the second one's in the window.
             cache: of the frames before the first one.
         """
         b, _, cells = pair["rgb"].shape
         mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
-        logits, cache = self.apply(pair, mask, actions, position - 1, cache)
+        previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
+        logits, cache = self.apply(pair, mask, actions, position - 1, cache, previous=previous)
         frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1])
         frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
+        previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
         def step(i: Array, frame: Frame) -> Frame:
             one = {name: grid[:, None] for name, grid in frame.tokens.items()}
-            logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], position, cache)
+            logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], position, cache, previous=previous)
             return self._unmask(keys[:, i], i, frame, {name: x[:, 0] for name, x in logits.items()})
 
         return jax.lax.fori_loop(1, self.sample.steps, step, frame), cache

@@ -28,6 +28,7 @@ def apply_guided(
     start: Any,
     cache: Cache | None,
     no_depth: Bool[Array, " B"] | None = None,
+    previous: dict[str, Int[Array, "B T S"]] | None = None,
 ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
     """Returns logits without + g·(with - without the actions), g = ``sample.guidance``, and the cache.
 
@@ -35,13 +36,14 @@ def apply_guided(
         start: position of the first of these frames (may be traced).
         cache: from :func:`guided_cache` or an earlier call.
         no_depth: True for clips whose depth is hidden, as in :class:`rsjax.models.roboscape.transformer.Transformer`.
+        previous: tokens of the frame before each of these, likewise.
     """
     b, drop = len(mask), None
     if sample.guidance != 1:
-        inputs = (tokens, mask, actions, no_depth)
-        tokens, mask, actions, no_depth = jax.tree.map(lambda x: jnp.concatenate([x, x]), inputs)
+        inputs = (tokens, mask, actions, no_depth, previous)
+        tokens, mask, actions, no_depth, previous = jax.tree.map(lambda x: jnp.concatenate([x, x]), inputs)
         drop = jnp.arange(2 * b) >= b
-    logits, cache = _apply(arch, params, tokens, mask, actions, start, cache, drop, no_depth)
+    logits, cache = _apply(arch, params, tokens, mask, actions, start, cache, drop, no_depth, previous)
     if drop is not None:
         logits = {name: x[b:] + sample.guidance * (x[:b] - x[b:]) for name, x in logits.items()}
     return logits, cache
@@ -76,8 +78,9 @@ def _apply(
     cache: Any,
     drop: Any,
     no_depth: Any,
+    previous: Any,
 ) -> Any:
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
     inputs = (grids, mask.reshape(shape), actions, start, cache)
-    return Transformer(arch).apply({"params": params}, *inputs, drop, no_depth)
+    return Transformer(arch).apply({"params": params}, *inputs, drop, no_depth, previous)

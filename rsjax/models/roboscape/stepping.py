@@ -60,14 +60,19 @@ class State:
 AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0)  # type: ignore[arg-type]  # of clips
 
 
+def remembered_frames(net: Network) -> int:
+    """Returns K: the frames that stay in a window when it moves, and the one before the last if the model reads it."""
+    return max(kept_frames(net), 2 if net.arch.read_previous else 1)
+
+
 def kept_frames(net: Network) -> int:
-    """Returns K: the frames that stay in a window when it moves, or the last one alone for a window that rolls."""
+    """Returns the frames that stay in a window when it moves, or the last one alone for a window that rolls."""
     return 1 if net.arch.positions == "rotary" else net.arch.frames - stride(net.arch, net.sample)
 
 
 def begin(net: Network, clips: int) -> State:
     """Returns the state of clips that have yet to be :func:`restart` ed."""
-    arch, kept = net.arch, kept_frames(net)
+    arch, kept = net.arch, remembered_frames(net)
     cache = guided_cache(arch, net.sample, clips, cache_slots(arch, 1))
     copies = jax.tree.map(lambda x: x.reshape(len(x), clips, -1, *x.shape[2:]), cache)
     numbers = jnp.ones(clips, jnp.int32)
@@ -134,7 +139,8 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
     pair = {name: jnp.stack([grid[-1], grid[-1]])[None] for name, grid in state.tokens.items()}
     rows = _window_rows(net.arch, jnp.stack([state.actions[-1], actions]), state.base, state.position - 1)[None]
     keys = step_keys(net.sample, state.key, state.frame)[None]
-    frame, cache = _decoder(net, params).decode_pair(pair, rows, state.position, keys, state.cache)
+    before = {name: grid[-2:-1] if len(grid) > 1 else grid for name, grid in state.tokens.items()}
+    frame, cache = _decoder(net, params).decode_pair(pair, before, rows, state.position, keys, state.cache)
     return replace(
         state,
         tokens={name: jnp.append(grid[1:], frame.tokens[name], axis=0) for name, grid in state.tokens.items()},
@@ -148,10 +154,10 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
 def _move_window(net: Network, params: Params, state: State, full: Bool[Array, ""]) -> State:
     """Moves one clip's window if it is full, and fills the cache with the frames that stay but the last."""
     kept = kept_frames(net)
-    base, cache = state.actions[0], state.cache
+    base, cache = state.actions[-kept], state.cache
     if kept > 1:
-        tokens = {name: grid[None, :-1] for name, grid in state.tokens.items()}
-        rows = _window_rows(net.arch, state.actions[:-1], base, 0)[None]
+        tokens = {name: grid[None, -kept:-1] for name, grid in state.tokens.items()}
+        rows = _window_rows(net.arch, state.actions[-kept:-1], base, 0)[None]
         mask = jnp.zeros((1, kept - 1, net.arch.grid**2), bool)
         _, cache = _decoder(net, params).apply(tokens, mask, rows, 0, cache)
     choose = partial(jax.tree.map, lambda new, old: jnp.where(full, new, old))

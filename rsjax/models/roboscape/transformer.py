@@ -60,6 +60,7 @@ class Transformer(nn.Module):
         cache: Cache | None = None,
         drop_actions: Bool[Array, " B"] | None = None,
         no_depth: Bool[Array, " B"] | None = None,
+        previous: dict[str, Int[Array, "B T S"]] | None = None,
     ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
         """Returns logits of every cell of frames start … start + T - 1 by branch, and the cache.
 
@@ -73,6 +74,8 @@ class Transformer(nn.Module):
             drop_actions: True for clips that see the null action instead of theirs; needs ``config.action_dropout``.
             no_depth: True for clips without depth: all their cells are masked in the depth branch. Ignored by a model
                 without that branch.
+            previous: for ``config.read_previous``, tokens of the frame before each of these by branch, of which frame
+                0's are not read; by default ``tokens`` moved by one frame, if ``start`` is 0.
 
         Returns:
             float32 logits by branch, and the cache with these frames written in (None without a cache).
@@ -100,6 +103,13 @@ class Transformer(nn.Module):
             branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), masked) + shared
             for branch, masked in hidden.items()
         }
+        if cfg.read_previous:
+            first = (start + jnp.arange(t) == 0)[:, None]
+            for branch, before in (previous or {name: shifted(cells(tokens[name])) for name in x}).items():
+                absent = jnp.broadcast_to(first, before.shape)
+                if branch == "depth" and no_depth is not None:
+                    absent = absent | no_depth[:, None, None]
+                x[branch] = x[branch] + TokenEmbed(cfg, name=f"{branch}_previous_embed")(before, absent)
         blocks = nn.scan(
             _rematerialised(cfg),
             variable_axes={"params": 0},
@@ -144,6 +154,11 @@ class Transformer(nn.Module):
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
         return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
+
+
+def shifted(frames: Int[Array, "B T S"]) -> Int[Array, "B T S"]:
+    """Returns the frame before each frame; for the first, itself."""
+    return jnp.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
 
 
 def _rematerialised(config: Architecture) -> Any:

@@ -18,7 +18,7 @@ CLIPS = 3
 SOME = np.array([False, True, False])
 ALL = np.ones(CLIPS, bool)
 WARM = SampleConfig(steps=2, temperature=1.0, window_stride=2)
-GUIDED = replace(DUAL, action_dropout=0.2, positions="rotary")
+GUIDED = replace(DUAL, action_dropout=0.2, positions="rotary", read_previous=True)
 # Few, and shared by all tests here: compiling is most of the work.
 GREEDY = (DUAL, replace(WARM, steps=4, unmask="greedy"), 3, 6)
 WINDOW = (DUAL, WARM, 2, 12)

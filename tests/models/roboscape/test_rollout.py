@@ -21,8 +21,18 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model
         (DUAL, 3, SampleConfig(steps=1)),
         (RGB, 1, SampleConfig(steps=3, unmask="greedy")),
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
+        (replace(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
+        (replace(DUAL, read_previous=True), 3, SampleConfig(steps=1)),
     ],
-    ids=["dual-2-random", "dual-3-prompt-4-greedy", "dual-3-prompt-1", "rgb-3-greedy", "rgb-3-prompt-2-warm"],
+    ids=[
+        "dual-2-random",
+        "dual-3-prompt-4-greedy",
+        "dual-3-prompt-1",
+        "rgb-3-greedy",
+        "rgb-3-prompt-2-warm",
+        "previous-1-prompt",
+        "previous-3-prompt",
+    ],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)

@@ -14,8 +14,8 @@ from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.stepping import Network, advance, begin, restart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
 
-SUMS = replace(DUAL, action_inputs=4, integrate_actions=True)
-GUIDED = replace(RGB, action_dropout=0.1, positions="rotary")
+SUMS = replace(DUAL, action_inputs=4, integrate_actions=True, read_previous=True)
+GUIDED = replace(RGB, action_dropout=0.1, positions="rotary", read_previous=True)
 FRAMES = 15
 
 

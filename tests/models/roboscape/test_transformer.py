@@ -15,6 +15,7 @@ from tests.models.roboscape.toy import (
     GUIDED,
     NORMED,
     QK_NORM,
+    READS_PREVIOUS,
     RGB,
     apply,
     apply_plain,
@@ -25,7 +26,7 @@ from tests.models.roboscape.toy import (
     random_params,
 )
 
-CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "genie": GENIE}
+CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "previous": READS_PREVIOUS, "genie": GENIE}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -148,6 +149,19 @@ def test_a_future_frame_never_changes_a_past_logit() -> None:
         for name in before:
             np.testing.assert_array_equal(before[name][:, :t], after[name][:, :t])
             assert not np.allclose(before[name][:, t:], after[name][:, t:])
+
+
+def test_masked_tokens_are_read_in_the_next_frame_alone_and_only_where_the_model_reads_the_previous_frame() -> None:
+    for config, reads in ((READS_PREVIOUS, True), (DUAL, False)):
+        params, (tokens, mask, actions) = random_params(config), random_inputs(config)
+        mask[:, 2] = True
+        other = {name: x.copy() for name, x in tokens.items()}
+        for x in other.values():
+            x[:, 2] ^= 5
+        before, after = (forward(config, params, (x, mask, actions)) for x in (tokens, other))
+        for name in before:
+            np.testing.assert_array_equal(before[name][:, :3], after[name][:, :3])
+            assert np.any(before[name][:, 3:] != after[name][:, 3:]) == reads
 
 
 def test_every_cell_reads_every_cell_of_its_own_and_earlier_frames() -> None:

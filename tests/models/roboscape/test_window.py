@@ -19,6 +19,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model
 
 Positions = Literal["learned", "rotary"]
 ROTARY = replace(RGB, positions="rotary")
+PREVIOUS = replace(RGB, read_previous=True)
 SUMS = replace(RGB, action_inputs=4, integrate_actions=True)
 
 
@@ -49,8 +50,8 @@ def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, inte
 
 @pytest.mark.parametrize(
     ("model", "prompt", "stride"),
-    [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0)],
-    ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt"],
+    [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0), (PREVIOUS, 1, 2)],
+    ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt", "previous"],
 )
 def test_cached_is_uncached_beyond_the_window(model: Architecture, prompt: int, stride: int) -> None:
     sample = SampleConfig(steps=2, temperature=1.0, window_stride=stride)

@@ -16,6 +16,7 @@ DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blo
 RGB = replace(DUAL, use_depth=False)
 NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
 QK_NORM = replace(DUAL, qk_norm=True, mup=True)
+READS_PREVIOUS = replace(DUAL, read_previous=True)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
 GUIDED = replace(DUAL, action_dropout=0.5)
 BATCH = 2
@@ -125,19 +126,26 @@ def st_block(x: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
     return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
 
 
+def embed(tokens: np.ndarray, mask: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
+    x = sum(
+        p[f"factored_embed_{k}"]["embedding"][(tokens // config.vocabulary_size**k) % config.vocabulary_size]
+        for k in range(config.vocabularies)
+    )
+    x[mask] = p["mask_token_embed"]
+    return x
+
+
 def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str, np.ndarray]:
     tokens, mask, actions = inputs
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
     b, t = mask.shape[:2]
     h = {}
     for name, grid in tokens.items():
-        embed = p[f"{name}_embed"]
         flat = grid.reshape(b, t, -1)
-        x = sum(
-            embed[f"factored_embed_{k}"]["embedding"][(flat // config.vocabulary_size**k) % config.vocabulary_size]
-            for k in range(config.vocabularies)
-        )
-        x[mask.reshape(b, t, -1)] = embed["mask_token_embed"]
+        x = embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config)
+        if config.read_previous:
+            absent = np.broadcast_to((np.arange(t) == 0)[None, :, None], flat.shape)
+            x += embed(np.roll(flat, 1, axis=1), absent, p[f"{name}_previous_embed"], config)
         h[name] = x + p["pos_embed"][:t]
         if config.action_inputs:
             h[name] += (actions @ p["action_encoder"]["kernel"] + p["action_encoder"]["bias"])[:, :, None]
