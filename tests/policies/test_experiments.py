@@ -14,6 +14,7 @@ from rsjax.policies import comparison, improvement, learning
 from rsjax.policies.comparison import compare
 from rsjax.policies.improvement import Improvement, improve, mixed
 from rsjax.policies.learning import Learning, claims, learn
+from rsjax.policies.run_data import named
 from rsjax.policies.trials import Trials, first_frames
 from tests.policies.toy import demos
 from tests.policies.worlds import ToyPolicy, imagined, simulated
@@ -136,3 +137,10 @@ def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:
     made: Any = demos(6).records
     for share, count in ((0.0, 6), (0.5, 12), (0.75, 24)):
         assert len(mixed(demos(4), made, share, 0)) == count
+
+
+def test_runs_are_named_by_what_tells_them_apart() -> None:
+    assert list(named([Path("/a/runs/tiny")])) == ["tiny"]
+    assert list(named([Path("/a/tiny/s0"), Path("/a/genie/s0")])) == ["tiny-s0", "genie-s0"]
+    with pytest.raises(UserError, match="are the same"):
+        named([Path("/a"), Path("/a")])

@@ -1,0 +1,66 @@
+"""Improves a policy in a world model. ``python -m experiments.improve runs/tiny --demos 50``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.cli import main_errors, parse_options, part
+from rsjax.policies.improvement import Improvement
+from rsjax.policies.trials import Trials
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options(Improvement, Trials):
+    """Rolls a policy out in a world model, trains it on what the judge calls a success, and repeats that."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory on simulated clips, made by experiments.train."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    judge: Path | None = None
+    """Folder of the judge; default: the run's own (experiments.judge)."""
+    policy: Path | None = None
+    """Directory of the policy to begin with; default: one is trained on --demos real demonstrations."""
+    demos: int = 50
+    """Real demonstrations that the policy was, or is, trained on."""
+    size: str = "tiny"
+    """Size of that policy: public, tiny or toy."""
+    train_steps: int = 0
+    """Training steps of that policy; 0: those of its size."""
+    out: Path | None = None
+    """Directory of policies and results; default RUN/improve."""
+
+    def __post_init__(self) -> None:
+        Improvement.__post_init__(self)
+        Trials.__post_init__(self)
+
+
+@main_errors()
+def main() -> None:
+    """Writes results.json, results.md and success.png, and prints the table."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.improve", Options.__doc__ or "", Options())
+    from rsjax.policies.improvement import improve
+    from rsjax.policies.policy import load_policy
+    from rsjax.policies.run_data import RunData, sized_policy
+    from rsjax.policies.training import train_policy
+    from rsjax.policies.trials import lift_simulators
+
+    run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
+    settings, trials = part(options, Improvement), part(options, Trials)
+    model, demos = run.world(trials.together, options.judge), run.demos().first(options.demos)
+    if options.policy:
+        policy = load_policy(options.policy)
+    else:
+        policy = train_policy(sized_policy(options.size, options.train_steps), demos, out / "policy")
+    starts = run.first_frames(settings.imagined * settings.rounds)
+    with lift_simulators(run.simulator, trials) as simulator:
+        improve(policy, demos, starts, model, simulator, settings, trials, out)
+    print((out / "results.md").read_text(), out, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

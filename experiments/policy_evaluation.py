@@ -1,0 +1,70 @@
+"""Policies judged in world models (Fig. 5). ``python -m experiments.policy_evaluation runs/tiny runs/no-depth``"""
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import tyro
+
+from experiments.cli import main_errors, parse_options, part
+from rsjax.config import ConfigError
+from rsjax.policies.trials import Trials
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options(Trials):
+    """Rolls policies out from the same first frames in the simulator and in world models, and compares success."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Run directories on the same simulated clips: RoboScape, ablations, baselines."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    judge: Path | None = None
+    """Folder of the judge of all runs; default: the first run's own (experiments.judge)."""
+    policies: tuple[Path, ...] = ()
+    """Directories of trained policies to compare; default: stages of one policy's training on real demonstrations."""
+    checkpoints: int = 8
+    """Stages of that training."""
+    demos: int = 200
+    """Its demonstrations."""
+    size: str = "tiny"
+    """Its size: public, tiny or toy."""
+    steps: int = 0
+    """Its training steps; 0: those of its size."""
+    out: Path | None = None
+    """Directory of policies and results; default RUN/policy_evaluation of the first run."""
+
+
+@main_errors()
+def main() -> None:
+    """Writes results.json, results.md, scatter.png and videos, and prints the table."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.policy_evaluation", Options.__doc__ or "", Options())
+    if not options.runs or options.checkpoints < 2:
+        raise ConfigError("name a run directory at least, and --checkpoints 2 or more: policy_evaluation runs/tiny")
+    from rsjax.policies.comparison import checkpoints, compare
+    from rsjax.policies.judging import FOLDER
+    from rsjax.policies.policy import common_size, load_policy
+    from rsjax.policies.run_data import RunData, named, sized_policy
+    from rsjax.policies.trials import lift_simulators
+
+    runs = {name: RunData(run, options.data_dir) for name, run in named(options.runs).items()}
+    first, trials = next(iter(runs.values())), part(options, Trials)
+    out, judge = options.out or first.run / "policy_evaluation", options.judge or first.run / FOLDER
+    first.judge(judge)  # before hours of training
+    if options.policies:
+        policies = {name: load_policy(place) for name, place in named(options.policies).items()}
+    else:
+        demos = first.demos().first(options.demos)
+        policies = checkpoints(sized_policy(options.size, options.steps), demos, out / "policy", options.checkpoints)
+    common_size(policies.values())
+    worlds = {name: partial(run.world, trials.together, judge) for name, run in runs.items()}
+    with lift_simulators(first.simulator, trials) as simulator:
+        compare(policies, simulator, worlds, trials, out)
+    print((out / "results.md").read_text(), out, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

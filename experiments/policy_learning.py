@@ -1,0 +1,58 @@
+"""Policies from synthetic and real demonstrations (Table 3). ``python -m experiments.policy_learning runs/tiny``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.cli import main_errors, parse_options, part
+from rsjax.policies.learning import Learning
+from rsjax.policies.trials import Trials
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options(Learning, Trials):
+    """Trains policies on synthetic and on real demonstrations and compares their success in the simulator."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory on simulated clips, made by experiments.train."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    synthetic: Path | None = None
+    """A store of synthetic demonstrations; default: RUN/synthetic/clips, of experiments.synthesize."""
+    size: str = "tiny"
+    """Size of the policy: public, tiny or toy."""
+    steps: int = 0
+    """Training steps of each policy; 0: those of its size."""
+    seed: int = 0
+    """Seed of the choice of real demonstrations."""
+    out: Path | None = None
+    """Directory of policies and results; default RUN/policy_learning."""
+
+    def __post_init__(self) -> None:
+        Learning.__post_init__(self)
+        Trials.__post_init__(self)
+
+
+@main_errors()
+def main() -> None:
+    """Writes results.json, results.md and success.png, and prints the table."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.policy_learning", Options.__doc__ or "", Options())
+    from rsjax.policies.learning import learn
+    from rsjax.policies.run_data import RunData, sized_policy, synthetic_demos
+    from rsjax.policies.trials import lift_simulators
+
+    run, out = RunData(options.run, options.data_dir), options.out or options.run / "policy_learning"
+    config, trials = sized_policy(options.size, options.steps), part(options, Trials)
+    synthetic = synthetic_demos(options.synthetic or options.run / "synthetic" / "clips", options.run)
+    real = run.demos(seed=options.seed)
+    with lift_simulators(run.simulator, trials) as simulator:
+        learn(part(options, Learning), config, real, synthetic, simulator, trials, out)
+    print((out / "results.md").read_text(), out, sep="\n")
+
+
+if __name__ == "__main__":
+    main()

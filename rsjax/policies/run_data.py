@@ -1,0 +1,130 @@
+"""What the experiments with policies take from a run: its clips, simulator, judge and world model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from rsjax.config import Config, SimConfig, from_dict
+from rsjax.config.policy import PolicyConfig, policy_preset
+from rsjax.data.clips import readable
+from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
+from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.own_data import relocated
+from rsjax.pipeline.run import Run
+from rsjax.pipeline.trained import load, load_config
+from rsjax.policies.demos import Demos, Only, load_demos
+from rsjax.policies.episodes import action_range
+from rsjax.policies.judge import load_judge
+from rsjax.policies.judging import FOLDER
+from rsjax.policies.rollouts import FirstFrame, Imagined
+from rsjax.policies.verdicts import Judge
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run directory and where its clips are.
+
+    Attributes:
+        run: the directory.
+        data_dir: of simulated data sets.
+        moved: the new path of the run's store of ingested clips, if it was moved.
+    """
+
+    run: Path
+    data_dir: Path = Path("data")
+    moved: Path | None = None
+
+    @cached_property
+    def config(self) -> Config:
+        config = load_config(self.run)
+        return relocated(config, self.moved) if self.moved else config
+
+    @cached_property
+    def clips(self) -> Store:
+        """The store that the run was trained on."""
+        return Run(self.config, self.run, self.data_dir).open_clips()
+
+    @cached_property
+    def trained(self) -> TrainedModel:
+        return load(self.run)
+
+    @property
+    def simulator(self) -> SimConfig:
+        """The simulator that the clips are from.
+
+        Raises:
+            UserError: they are recordings, or of another simulator.
+        """
+        source = str(self.clips.manifest.get("source") or "an unknown source")
+        if not source.startswith("robosuite/Lift"):
+            raise UserError(
+                f"{self.clips.path}: clips of {source}; policies are tried in the simulated Lift, so take a run on its "
+                f"clips"
+            )
+        return from_dict(SimConfig, self.clips.manifest["config"])
+
+    def world(self, count: int, judge: Path | None = None) -> Imagined:
+        """Returns the run's world model as a world of ``count`` episodes, with the run's judge or another one's folder.
+
+        Raises:
+            UserError: the run is unfinished, or there is no judge.
+        """
+        low, high, _ = action_range(self.config, self.trained.assets.normalization)
+        return Imagined(self.trained, count, self.judge(judge), low, high)
+
+    def judge(self, folder: Path | None = None) -> Judge:
+        """Returns the run's judge, or the one in another folder.
+
+        Raises:
+            UserError: there is none.
+        """
+        return load_judge(folder or self.run / FOLDER)
+
+    def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
+        """Returns the first frames of so many clips, with depth where they have it."""
+        source = self.clips.source(split)
+        chosen = readable(source, range(min(count, len(source))))
+        return [
+            FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number)
+            for number, clip in chosen
+        ]
+
+    def demos(self, only: Only = "success", seed: int = 0) -> Demos:
+        """Returns the run's training clips as demonstrations."""
+        return load_demos(self.clips, ["train"], only, seed)
+
+
+def synthetic_demos(path: Path, run: Path) -> Demos:
+    """Returns the demonstrations that ``experiments.synthesize`` made.
+
+    Raises:
+        UserError: there are none.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: not there; make synthetic demonstrations with python -m experiments.synthesize {run}")
+    return load_demos(open_store(path), ["train"])
+
+
+def sized_policy(size: str, steps: int) -> PolicyConfig:
+    """Returns the settings of a named size, perhaps with another number of training steps.
+
+    Raises:
+        ConfigError: there is no such size.
+    """
+    config = policy_preset(size)
+    return replace(config, train=replace(config.train, steps=steps)) if steps else config
+
+
+def named(runs: Sequence[Path]) -> dict[str, Path]:
+    """Returns runs by a name for each: the last part of its path that tells them apart.
+
+    Raises:
+        UserError: two are the same.
+    """
+    for parts in range(1, 8):
+        names = ["-".join(run.absolute().parts[-parts:]) for run in runs]
+        if len(set(names)) == len(names):
+            return dict(zip(names, runs, strict=True))
+    raise UserError(f"two of the runs {', '.join(map(str, runs))} are the same; name each once")
