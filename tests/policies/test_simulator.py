@@ -63,7 +63,7 @@ def test_actions_are_clipped_and_counted_or_refused(env: LiftEnv) -> None:
     assert env.step(wide)[4]["clipped"] == 2
     assert env.step(wide)[4]["clipped"] == 4
     env._out_of_range = "refuse"
-    with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D pose"):
+    with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D change"):
         env.step(wide)
     env._out_of_range = "clip"
     with pytest.raises(ActionError, match=r"shape \(7,\); expected \(28,\)"):
