@@ -24,6 +24,8 @@ class Options:
     the last frame to a goal image, which is the expert's last frame."""
     lpips_weights: str = ""
     """Weights for the energy lpips (docs/evaluation.md)."""
+    policy: Path | None = None
+    """A policy of experiments.policy_learning to compare with too."""
     episodes: int = 50
     """Episodes of every way to act, with equal starts."""
     max_steps: int = 20
@@ -51,13 +53,15 @@ def main() -> None:
 
     from rsjax.pipeline.trained import load
     from rsjax.policies.planner import PlannerConfig
-    from rsjax.policies.planning import PlanSettings, compare, table
+    from rsjax.policies.planning import PlanSettings, compare, policy_actors, table
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
     planner = PlannerConfig(**{name: getattr(options, name) for name in fields})
     limits = (options.episodes, options.max_steps)
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
-    result = compare(load(options.run), options.run, settings)
+    trained = load(options.run)
+    others = {f"policy {options.policy}": policy_actors(options.policy, trained)} if options.policy else {}
+    result = compare(trained, options.run, settings, others)
     Console().print(table(result))
     print(options.run / "plan" / "result.json")
 

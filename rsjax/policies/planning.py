@@ -5,6 +5,7 @@ expert reaches from the same start; it is not shown how.
 """
 
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,9 +21,12 @@ from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
 from rsjax.files import parse_json, write_json
 from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.run import Run
 from rsjax.policies.energies import Score, Seen, imagined, judged, lpips_distance, pixel_distance, token_distance
-from rsjax.policies.judging import saved_judge
+from rsjax.policies.judge import FILE
+from rsjax.policies.judging import FOLDER, saved_judge
 from rsjax.policies.planner import Planner, PlannerConfig
+from rsjax.policies.policy import load_policy
 from rsjax.policies.simulator import Actor, Episode, LiftEnv, Observation, run_episode, skilled_expert
 from rsjax.progress import Progress
 
@@ -130,6 +134,26 @@ def actors(
     return {"random": random, "expert": expert, **(others or {}), **{name: planning(name) for name in settings.methods}}
 
 
+def policy_actors(directory: Path, trained: TrainedModel) -> MakeActor:
+    """Returns how a policy that ``experiments.policy_learning`` trained acts.
+
+    Raises:
+        UserError: it is missing or damaged, or its actions or frames are not those of the run's clips.
+    """
+    policy, clips = load_policy(directory), trained.config.clips
+    if (policy.action_dim, policy.model.image_size) != (clips.action_dim, clips.image_size):
+        raise UserError(
+            f"{directory}: the policy sees {policy.model.image_size} pixels and answers with {policy.action_dim} "
+            f"numbers; the run's clips have {clips.image_size} and {clips.action_dim}"
+        )
+
+    def make(seed: int, goal: np.ndarray) -> Actor:
+        actor = policy.actor(seed)
+        return lambda frame: actor(frame["rgb"][None])[0]
+
+    return make
+
+
 def compare(
     trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
 ) -> dict[str, Any]:
@@ -151,7 +175,7 @@ def compare(
     score_of(
         trained, run, settings, np.zeros((config.sim.image_size,) * 2 + (3,), np.uint8)
     )  # fails before episodes do
-    path, key = run / "plan" / RESULT, content_key("plan", settings, sorted(ways))
+    path, key = run / "plan" / RESULT, _key(trained, run, settings, ways)
     done = _kept(path, key)
     env = LiftEnv(config.sim, settings.max_steps)
     total = settings.episodes * len(ways)
@@ -181,6 +205,13 @@ def table(result: dict[str, Any]) -> Table:
         interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
         out.add_row(name, f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds)
     return out
+
+
+def _key(trained: TrainedModel, run: Path, settings: PlanSettings, ways: dict[str, MakeActor]) -> str:
+    """Returns the key of what episodes depend on: settings, ways to act, the world model and, if used, the judge."""
+    judge = (run / FOLDER / FILE).read_bytes() if settings.energy == "judge" else b""
+    model = Run(trained.config, run, Path("data")).keys()["world_model"]
+    return content_key("plan", settings, sorted(ways), model, zlib.crc32(judge))
 
 
 def _goal(env: LiftEnv, seed: int) -> UInt8[np.ndarray, "S S 3"]:
