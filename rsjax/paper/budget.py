@@ -9,6 +9,8 @@ import re
 from dataclasses import dataclass, fields, replace
 from functools import cache
 
+import jax
+
 from rsjax.config import Config, LoopConfig, TokenizerConfig, require
 from rsjax.config.leaves import with_values
 from rsjax.models.base import create_model
@@ -19,13 +21,13 @@ TOKENS = 1 / 35  # seconds to make a clip's tokens
 STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
 TOKENIZER_RATE = 7.1e10  # operations a second of the tokenizer's training
 START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
-EVALUATION, LOCALISER, ROLLOUT = 25.0, 0.04, 0.25  # seconds: of each evaluation, a localiser's step, a rollout
+EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds: of each evaluation, a localiser's step, a rollout
 
 COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # of a budget
-ROLLOUTS_SHARE, LOCALISER_SHARE = 0.2, 0.08  # of a cell
+ROLLOUTS_SHARE, LOCALISER_SHARE = 0.12, 0.04  # of a cell
 # Trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with three seeds,
-# of which half are without depth), and how their number grows with the budget.
-CELLS, GROWTH = 12.0, 0.42
+# of which six are cheaper, as they are without depth), and how their number grows with the budget.
+CELLS, GROWTH = 13.7, 0.4
 LEAST_STEPS, LEAST_TOKENIZER_STEPS, LEAST_EPISODES, LEAST_CLIPS = 40, 100, 60, 2
 SEEDS = 3
 _UNITS = {"s": 1, "sec": 1, "min": 60, "m": 60, "h": 3600, "d": 86400}
@@ -110,6 +112,13 @@ def train_flops(config: Config) -> int | None:
     return None if per_clip is None else config.train.steps * config.train.batch_size * per_clip
 
 
+@cache
+def parameters(config: Config) -> int:
+    """Returns the number of parameters of the world model."""
+    shapes = jax.eval_shape(create_model(config).init, jax.random.key(0))
+    return sum(x.size for x in jax.tree.leaves(shapes))
+
+
 def step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the world model; of a family without counts, 0."""
     flops = train_flops(config)
@@ -144,9 +153,15 @@ def trained_seconds(config: Config) -> float:
     return config.tokenizer_train.steps * tokenizer_step_seconds(config) + config.train.steps * step_seconds(config)
 
 
-def evaluation_seconds(config: Config) -> float:
-    """Returns the seconds of the evaluation and of the report."""
-    rollouts = config.eval.clips * (1 + 2 * config.eval.action_draws)
+def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0) -> float:
+    """Returns the seconds of an evaluation and a report.
+
+    Args:
+        draws: of random actions; None: those of the configuration.
+        frames: of a rollout; 0: the clips'.
+    """
+    draws = config.eval.action_draws if draws is None else draws
+    rollouts = config.eval.clips * (1 + 2 * draws) * (frames or config.clips.frames) / config.clips.frames
     return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
 
 

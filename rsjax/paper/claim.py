@@ -96,6 +96,11 @@ class Claim:
         """Returns the arm of this name."""
         return next(arm for arm in self.arms if arm.name == name)
 
+    def measurements(self, arm: str) -> tuple[str, ...]:
+        """Returns the names of the measurements that its comparisons need of an arm."""
+        used = (each.measurement for each in self.comparisons if arm in (each.better, each.than))
+        return tuple(dict.fromkeys(filter(None, used)))
+
 
 def pairs(better: str, than: str, *metrics: str) -> tuple[Comparison, ...]:
     """Returns the comparison of two arms by each of these metrics."""

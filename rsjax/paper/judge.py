@@ -99,7 +99,7 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
     Args:
         runs: the run of each of the plan's cells by name.
     """
-    results = {cell.name: read_result(runs[cell.name]) for cell in (*plan.cells, *plan.left_out)}
+    results = {name: read_result(runs[name]) for name in plan.cells}
     read: dict[tuple[str, str], tuple[Mapping[str, Sequence[float]], str]] = {}
     for name, result in results.items():
         for source in {each.measurement for claim in plan.claims for each in claim.comparisons}:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rsjax.config import require
+from rsjax.config import Config, require
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.files import FileError, read_json, write_json
@@ -18,13 +18,17 @@ from rsjax.progress import note
 
 Scores = Mapping[str, Sequence[float]]  # a number per clip, in the same order for all runs
 Measurement = Callable[[Run], Scores]
+Seconds = Callable[[Config], float]
 FOLDER = "measured"
 
-_MEASUREMENTS: dict[str, Measurement] = {}
+_MEASUREMENTS: dict[str, tuple[Measurement, Seconds]] = {}
 
 
-def measurement(name: str) -> Callable[[Measurement], Measurement]:
+def measurement(name: str, seconds: Seconds) -> Callable[[Measurement], Measurement]:
     """Registers a measurement under a name for :attr:`rsjax.paper.claim.Comparison.measurement`.
+
+    Args:
+        seconds: estimates its time for a run of a configuration.
 
     Raises:
         ConfigError: another one has that name.
@@ -32,26 +36,36 @@ def measurement(name: str) -> Callable[[Measurement], Measurement]:
 
     def register(function: Measurement) -> Measurement:
         require(name not in _MEASUREMENTS, f"two measurements are named {name!r}; rename one of them")
-        _MEASUREMENTS[name] = function
+        _MEASUREMENTS[name] = function, seconds
         return function
 
     return register
 
 
+def seconds_of(name: str, config: Config) -> float:
+    """Returns the estimated seconds of a measurement."""
+    return _MEASUREMENTS[name][1](config)
+
+
+def measured(run: Run, name: str) -> bool:
+    """Returns whether a run has the scores of a measurement."""
+    with suppress(FileError):
+        return "scores" in read_json(_path(run, name))
+    return False
+
+
 def measure(run: Run, name: str) -> None:
     """Measures a finished run unless that was done; a failure is recorded and tried again by the next command."""
-    path = _path(run, name)
-    with suppress(FileError):
-        if "scores" in read_json(path):
-            return
+    if measured(run, name):
+        return
     result: dict[str, Any] = {}
     try:
-        result["scores"] = {key: list(map(float, values)) for key, values in _MEASUREMENTS[name](run).items()}
+        result["scores"] = {key: list(map(float, values)) for key, values in _MEASUREMENTS[name][0](run).items()}
     except Exception as error:
         line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         note(f"{name} failed: {line}")
         result["error"] = " ".join(line.split())
-    write_json(path, result)
+    write_json(_path(run, name), result)
 
 
 def read_scores(run: Run, name: str) -> tuple[Scores, str]:

@@ -1,6 +1,6 @@
 """The cells that the claims need, in the order in which they run, as far as a budget goes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from rsjax.config.leaves import with_values
 from rsjax.paper import budget
 from rsjax.paper.budget import Scale
 from rsjax.paper.claim import Arm, Claim
+from rsjax.paper.measurements import seconds_of
 from rsjax.pipeline.run import Run
 from rsjax.sim.expert import MODES, SIMPLE
 
@@ -24,48 +25,65 @@ class Cell:
     Attributes:
         name: its directory; it ends with a content key, so that a directory keeps the cells of several budgets apart.
         config: what is trained.
-        seconds: the estimate, with those of shared stages that it is the first to need.
         uses: (claim, arm) for which it runs.
     """
 
     name: str
     config: Config
-    seconds: float
     uses: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
-class Plan:
-    """All cells of some claims at a scale.
+class Task:
+    """A step of a plan: a cell's training with its evaluation, or a measurement of a trained cell.
 
     Attributes:
-        cells: in the order in which they run.
+        cell: its name.
+        measurement: its name; empty: the training.
+        claim: the first one that needs it.
+        seconds: the estimate; the first task that needs a shared stage has its seconds too.
+    """
+
+    cell: str
+    measurement: str
+    claim: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What some claims need at a scale.
+
+    Attributes:
+        cells: by name, those that the budget leaves out too.
+        tasks: in the order in which they run.
         left_out: those that the budget has no time for, known before anything runs.
         absent: (claim, arm) → why the arm cannot be trained.
     """
 
     scale: Scale
     claims: tuple[Claim, ...]
-    cells: tuple[Cell, ...]
-    left_out: tuple[Cell, ...]
+    cells: Mapping[str, Cell]
+    tasks: tuple[Task, ...]
+    left_out: tuple[Task, ...]
     absent: Mapping[tuple[str, str], str]
 
     def of(self, claim: str, arm: str) -> tuple[Cell, ...]:
-        """Returns an arm's cells, one for each seed; those left out too."""
-        return tuple(cell for cell in (*self.cells, *self.left_out) if (claim, arm) in cell.uses)
+        """Returns an arm's cells, one for each seed."""
+        return tuple(cell for cell in self.cells.values() if (claim, arm) in cell.uses)
 
 
 def make_plan(known: Sequence[Claim], wanted: Sequence[Claim], scale: Scale, data: Path) -> Plan:
-    """Returns the cells of the wanted claims.
+    """Returns the cells of the wanted claims, and what is to be done in which order.
 
     Args:
-        known: all claims, which share the budget: the cells do not depend on which of them are wanted.
+        known: all claims, which share the budget: what is done for a claim does not depend on which others are wanted.
         wanted: some of these.
         data: the directory of simulated data sets.
     """
     absent: dict[tuple[str, str], str] = {}
-    cells, names = list[Cell](), {claim.name for claim in wanted}
-    made: dict[str, int] = {}  # content key → place
+    cells: dict[str, Cell] = {}  # by content key
+    tasks: dict[tuple[str, str], Task] = {}
     shared = set[str]()
     for claim, arm, seed in _ordered(known):
         try:
@@ -73,25 +91,39 @@ def make_plan(known: Sequence[Claim], wanted: Sequence[Claim], scale: Scale, dat
         except ConfigError as error:
             absent[claim.name, arm.name] = str(error)
             continue
-        keys, use = Run(config, Path(), data).keys(), (claim.name, arm.name)
-        if keys["evaluation"] in made:
-            place = made[keys["evaluation"]]
-            cells[place] = replace(cells[place], uses=(*cells[place].uses, use))
-            continue
-        made[keys["evaluation"]] = len(cells)
-        seconds = budget.cell_seconds(config, scale.base)
-        for stage, part in (("collect", budget.collect_seconds), ("tokenizer", budget.tokenizer_seconds)):
-            if stage in keys and keys[stage] not in shared:
-                shared.add(keys[stage])
-                seconds += part(config)
-        name = f"{cell_name(_label(arm), seed)}-{keys['evaluation'][:8]}"
-        cells.append(Cell(name, config, seconds, (use,)))
-    fits, left_out, spent = list[Cell](), list[Cell](), 0.0
-    for cell in cells:
-        spent += cell.seconds
-        (fits if spent <= SLACK * scale.seconds or not fits else left_out).append(cell)
-    mine = lambda cell: any(claim in names for claim, _ in cell.uses)  # noqa: E731
-    return Plan(scale, tuple(wanted), tuple(filter(mine, fits)), tuple(filter(mine, left_out)), absent)
+        keys = Run(config, Path(), data).keys()
+        key, use = keys["evaluation"], (claim.name, arm.name)
+        if key not in cells:
+            cells[key] = Cell(f"{cell_name(_label(arm), seed)}-{key[:8]}", config, ())
+            seconds = budget.cell_seconds(config, scale.base) + _shared_seconds(config, keys, shared)
+            tasks[key, ""] = Task(cells[key].name, "", claim.name, seconds)
+        cells[key] = replace(cells[key], uses=(*cells[key].uses, use))
+        for name in claim.measurements(arm.name):
+            task = Task(cells[key].name, name, claim.name, seconds_of(name, config))
+            tasks.setdefault((key, name), task)
+    needed = _needed(cells, {claim.name for claim in wanted}, wanted)
+    fits, left_out, spent = list[Task](), list[Task](), 0.0
+    for number, task in enumerate(tasks.values()):
+        spent += task.seconds
+        if (task.cell, task.measurement) in needed:
+            (fits if spent <= SLACK * scale.seconds or not number else left_out).append(task)
+    mine = {cell.name: cell for cell in cells.values() if (cell.name, "") in needed}
+    return Plan(scale, tuple(wanted), mine, tuple(fits), tuple(left_out), absent)
+
+
+def _needed(cells: Mapping[str, Cell], names: Collection[str], wanted: Sequence[Claim]) -> set[tuple[str, str]]:
+    """Returns (cell, measurement) of all that the wanted claims need; the measurement is empty for the training."""
+    measurements = {(claim.name, arm.name): claim.measurements(arm.name) for claim in wanted for arm in claim.arms}
+    uses = [(cell.name, use) for cell in cells.values() for use in cell.uses if use[0] in names]
+    return {(cell, name) for cell, use in uses for name in ("", *measurements[use])}
+
+
+def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
+    """Returns the seconds of the shared stages that no cell before has made, and adds them to ``made``."""
+    parts = {"collect": budget.collect_seconds, "tokenizer": budget.tokenizer_seconds}
+    new = [stage for stage in parts if stage in keys and keys[stage] not in made]
+    made.update(keys[stage] for stage in new)
+    return sum(parts[stage](config) for stage in new)
 
 
 def _ordered(known: Sequence[Claim]) -> list[tuple[Claim, Arm, int]]:

@@ -2,10 +2,14 @@
 
 import base64
 import math
+import os
+from collections import Counter
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import jax
 import jinja2
 
 from rsjax.ablation.figure import draw
@@ -17,7 +21,9 @@ from rsjax.paper import budget
 from rsjax.paper.judge import Judged, Outcome, Trained
 from rsjax.paper.plan import Plan
 from rsjax.progress import duration
+from rsjax.report.score_charts import SCENES
 
+OWN_STAGES = ("world_model", "evaluation", "report")  # of which every cell has its own
 LEGEND = (
     "Differences are paired by clip: mean (or median) over clips and seeds, with the 95 % interval from resampling "
     "both. A verdict takes the wider of this interval and Welch's t over the seeds; p is Welch's. A claim holds if all "
@@ -32,7 +38,12 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
     Raises:
         FileError: the disk is full.
     """
-    content = {"command": command, **_summary(plan), "legend": LEGEND, "claims": [_claim(each) for each in outcomes]}
+    content = {
+        "command": command,
+        **_summary(plan, outcomes),
+        "legend": LEGEND,
+        "claims": [_claim(each) for each in outcomes],
+    }
     folders = [jinja2.PackageLoader(package, ".") for package in ("rsjax.paper", "rsjax.report")]
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader(folders),
@@ -54,9 +65,15 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
     return out / "report.html"
 
 
-def _summary(plan: Plan) -> dict[str, Any]:
+def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     base = plan.scale.base
+    results = {result.name: result for outcome in outcomes for arm in outcome.arms for result in arm.results}
+    seconds = [result.run.mark(stage).get("seconds", 0.0) for result in results.values() for stage in OWN_STAGES]
+    states = Counter(result.state for result in results.values())
     return {
+        "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {jax.local_devices()[0].device_kind}, {os.cpu_count()} cores",
+        "states": ", ".join(f"{count} {state}" for state, count in states.items()),
+        "spent": duration(sum(seconds)),
         "budget": duration(plan.scale.seconds),
         "preset": base.name,
         "sizes": {
@@ -66,7 +83,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
             "steps of the model": base.train.steps,
             "draws of random actions": base.eval.action_draws,
         },
-        "left_out": [cell.name for cell in plan.left_out],
+        "left_out": [f"{task.cell}: {task.measurement}" if task.measurement else task.cell for task in plan.left_out],
     }
 
 
@@ -83,6 +100,7 @@ def _claim(outcome: Outcome) -> dict[str, Any]:
         "counts": outcome.counts,
         "header": [column.heading for column in columns],
         "arms": [_arm(arm, outcome, columns) for arm in outcome.arms],
+        "baselines": _baselines(outcome, columns),
         "published": any(arm.published for arm in claim.arms),
         "comparisons": [_comparison(each) for each in outcome.judged],
         "missing": [_missing(result) for arm in outcome.arms for result in arm.results if result.state != "finished"],
@@ -108,10 +126,23 @@ def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str,
         "published": [f"{published[c.name]:.{c.decimals}f}" if c.name in published else ABSENT for c in columns],
         "values": {name: spread._asdict() for name, spread in arm.spreads.items()},
         "steps": config.train.steps if config and not config.train.curriculum else None,
+        "parameters": f"{budget.parameters(config) / 1e6:.2f} M" if config and arm.finished else None,
         "tflop": None if flops is None else round(flops / 1e12, 1),
         "minutes": round(sum(seconds) / len(seconds) / 60, 1) if seconds else None,
         "runs": [str(result.run.directory) for result in arm.results],
     }
+
+
+def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, Any]]:
+    """Returns the scores of repeating the first frame and of the reconstruction, of the first arm that has any."""
+    finished = [result for arm in outcome.arms for result in arm.finished][:1]
+    rows = []
+    for suffix, name in (("_repeat_first", SCENES["_repeat_first"]), ("_tokenizer", SCENES["_tokenizer"])):
+        numbers = [result.metrics.get(f"{column.name}{suffix}") for result in finished for column in columns]
+        if any(number is not None for number in numbers):
+            texts = [ABSENT if n is None else f"{n:.{c.decimals}f}" for n, c in zip(numbers, columns, strict=True)]
+            rows.append({"name": name, "scores": texts})
+    return rows
 
 
 def _trained(result: Result) -> dict[str, float]:

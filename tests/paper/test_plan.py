@@ -62,28 +62,37 @@ def test_a_small_preset_keeps_its_own_sizes() -> None:
 @pytest.mark.parametrize("hours", [0.5, 3, 12])
 def test_the_estimates_keep_to_the_budget_and_the_tables_come_first(hours: float) -> None:
     plan = make_plan(KNOWN, KNOWN, scale(TINY, hours * HOUR), DATA)
-    assert 0.75 * hours * HOUR < sum(cell.seconds for cell in plan.cells) <= 1.05 * hours * HOUR
-    tables = [any(claim in ("table1", "table2") for claim, _ in cell.uses) for cell in plan.cells]
-    assert tables[:12] == [True] * 12 and tables == sorted(tables, reverse=True)
-    assert [cell.config.train.seed for cell in plan.cells[:12]] == [0] * 4 + [1] * 4 + [2] * 4
+    assert 0.75 * hours * HOUR < sum(task.seconds for task in plan.tasks) <= 1.05 * hours * HOUR
+    assert [task.claim for task in plan.tasks[:15]] == ["table2"] * 12 + ["table1"] * 3
+    seeds = [plan.cells[task.cell].config.train.seed for task in plan.tasks[:12]]
+    assert seeds == [0] * 4 + [1] * 4 + [2] * 4
 
 
 def test_no_configuration_is_there_twice_and_every_arm_has_its_seeds(three_hours: Plan) -> None:
-    cells = (*three_hours.cells, *three_hours.left_out)
+    cells = three_hours.cells.values()
     keys = Counter(Run(cell.config, Path(), DATA).keys()["evaluation"] for cell in cells)
     assert set(keys.values()) == {1}
-    assert len({cell.name for cell in cells}) == len(cells)
     for claim in KNOWN:
         for arm in claim.arms:
             seeds = [cell.config.train.seed for cell in three_hours.of(claim.name, arm.name)]
             assert seeds == ([] if (claim.name, arm.name) in three_hours.absent else [0, 1, 2])
 
 
-def test_the_cells_of_one_claim_are_those_of_all(three_hours: Plan) -> None:
+def test_every_cell_is_trained_before_it_is_measured(three_hours: Plan) -> None:
+    tasks = [*three_hours.tasks, *three_hours.left_out]
+    assert [task.cell for task in tasks if not task.measurement] == list(three_hours.cells)
+    places = {task.cell: place for place, task in enumerate(tasks) if not task.measurement}
+    measured = [(task, place) for place, task in enumerate(tasks) if task.measurement]
+    assert measured
+    assert all(places[task.cell] < place for task, place in measured)
+
+
+def test_the_tasks_of_one_claim_are_those_of_all(three_hours: Plan) -> None:
     some = make_plan(KNOWN, chosen(["table1", "departure-a*"], claims()), three_hours.scale, DATA)
     assert [claim.name for claim in some.claims] == ["table1", "departure-actions"]
-    assert set(some.cells) < set(three_hours.cells)
-    assert {use for cell in some.cells for use in cell.uses} >= {("table1", "Genie"), ("departure-actions", "ours")}
+    assert set(some.tasks) < set(three_hours.tasks)
+    assert not any(task.measurement for task in some.tasks)
+    assert some.of("table1", "Genie") and some.of("departure-actions", "to the letter")
 
 
 def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> None:
@@ -117,7 +126,7 @@ def test_a_share_of_the_data_is_read_for_as_many_steps(three_hours: Plan) -> Non
     train = arm_config(Arm("", data=0.5), three_hours.scale, 0).train
     (stage,) = train.curriculum
     base = three_hours.scale.base
-    assert stage.components[0].clips == (base.sim.episodes - base.sim.test_episodes) // 2
+    assert stage.components[0].clips == round((base.sim.episodes - base.sim.test_episodes) / 2)
     assert stage.epochs * stage.components[0].clips == pytest.approx(base.train.steps * base.train.batch_size)
 
 
