@@ -20,7 +20,7 @@ from rsjax.config.fields import (
     sampling_settings,
     to_dict,
 )
-from rsjax.config.irasim import DiTConfig
+from rsjax.config.irasim import DiTConfig, IRASimConfig, KLConfig
 from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig, TopKConfig
 from rsjax.config.model import (
     FAMILIES,
@@ -52,7 +52,9 @@ __all__ = [
     "DiTConfig",
     "EvalConfig",
     "GenieConfig",
+    "IRASimConfig",
     "IVideoGPTConfig",
+    "KLConfig",
     "LoopConfig",
     "LossConfig",
     "MaskConfig",

@@ -1,9 +1,14 @@
 """Settings of IRASim, a diffusion transformer on the latents of a clip's frames."""
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
-from rsjax.config.fields import require, runtime
+from rsjax.config.data import ClipShape
+from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
+from rsjax.config.fields import require, require_range, runtime, sampling
+from rsjax.config.model import ModelConfig, register_family
+from rsjax.config.tokenizer import TokenizerConfig
 
 
 @dataclass(frozen=True)
@@ -33,4 +38,87 @@ class DiTConfig:
         require(
             self.blocks % 2 == 0,
             f"model.blocks is {self.blocks}; half of the blocks attend over time, so it must be even",
+        )
+
+
+@dataclass(frozen=True)
+class KLConfig:
+    """An autoencoder with a Gaussian posterior in each cell. The defaults are SDXL's.
+
+    Its training follows ``tokenizer_train``: steps, batch, optimizer, and the weights of l1, l2 and perceptual terms.
+    """
+
+    # sdxl: that of Stable Diffusion XL. magvit2: the tokenizer's convolutions, without a quantiser.
+    network: Literal["sdxl", "magvit2"] = "sdxl"
+    latent_channels: int = 4
+    channels: int = 128
+    channel_multipliers: tuple[int, ...] = (1, 2, 4, 4)  # one per level; every level but the last halves the grid
+    res_blocks: int = 2
+    norm_groups: int = 32
+    patch_size: int = 1  # magvit2: space-to-depth before the first convolution
+    local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
+    kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.autoencoder", 1, math.inf, "latent_channels")
+        require_range(self, "model.autoencoder", 0, math.inf, "kl_weight")
+        require(
+            self.network == "magvit2" or (self.patch_size == 1 and not self.local_codes),
+            "model.autoencoder.patch_size and local_codes belong to the network magvit2; "
+            "leave them at 1 and False, or set model.autoencoder.network",
+        )
+        self.convolutions  # noqa: B018 - checks the other fields
+
+    @property
+    def convolutions(self) -> TokenizerConfig:
+        """The settings of the tokenizer's encoder and decoder of these sizes; the encoder's output is the posterior."""
+        return TokenizerConfig(
+            patch_size=self.patch_size,
+            channels=self.channels,
+            channel_multipliers=self.channel_multipliers,
+            res_blocks=self.res_blocks,
+            norm_groups=self.norm_groups,
+            local_codes=self.local_codes,
+            code_bits=2 * self.latent_channels,
+        )
+
+    @property
+    def downsampling(self) -> int:
+        """Pixels per cell along each side."""
+        return self.convolutions.downsampling
+
+
+@register_family("irasim")
+@dataclass(frozen=True)
+class IRASimConfig(DiTConfig, ModelConfig):
+    """IRASim (reference: its authors' public code): predicts the noise in a clip's latents, its first frames clean."""
+
+    uses_tokenizer: ClassVar[bool] = True
+    autoencoder: KLConfig = KLConfig()
+    action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
+    error_weight: float = 1.0
+    noise: NoiseConfig = NoiseConfig()
+    sample: DenoiseConfig = sampling(DenoiseConfig())
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            0 <= self.action_dropout < 1,
+            f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
+        )
+        self.sample.check(self.noise)
+
+    @property
+    def own_autoencoder(self) -> KLConfig:
+        return self.autoencoder
+
+    def check(self, clips: ClipShape) -> None:
+        token = self.autoencoder.downsampling * self.patch_size
+        below = clips.image_size // token * token
+        fitting = f"{below} or {below + token}" if below else f"{token}"
+        require(
+            clips.image_size % token == 0,
+            f"images have {clips.image_size} pixels a side, which the {token} pixels of a token (the autoencoder's "
+            f"{self.autoencoder.downsampling} × model.patch_size {self.patch_size}) do not divide; take clips of "
+            f"{fitting} pixels, or change model.patch_size",
         )

@@ -17,9 +17,11 @@ from rsjax.config import (
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
+    irasim_presets,
     ivideogpt_presets,
 )
 from rsjax.config.curriculum import parse_stage
+from rsjax.config.irasim_presets import irasim_b, irasim_l, irasim_s, irasim_xl
 from rsjax.config.ivideogpt_presets import ivideogpt_64, ivideogpt_256
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.errors import did_you_mean
@@ -170,6 +172,11 @@ def ivideogpt_tiny() -> Config:
     return ivideogpt_presets.ivideogpt_tiny(tiny())
 
 
+def irasim_tiny() -> Config:
+    """Returns IRASim on the clips of :func:`tiny`, in about its time."""
+    return irasim_presets.irasim_tiny(tiny())
+
+
 def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
 
@@ -231,8 +238,10 @@ def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
 
 
 ROBOSCAPE = (debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l)
-BASELINES = (genie_35m, genie_138m, genie_35m_actions, ivideogpt_64, ivideogpt_256, ivideogpt_tiny)
-PRESETS = collect(*ROBOSCAPE, *BASELINES)
+GENIE = (genie_35m, genie_138m, genie_35m_actions)
+IVIDEOGPT = (ivideogpt_64, ivideogpt_256, ivideogpt_tiny)
+IRASIM = (irasim_s, irasim_b, irasim_l, irasim_xl, irasim_tiny)
+PRESETS = collect(*ROBOSCAPE, *GENIE, *IVIDEOGPT, *IRASIM)
 
 
 def get(name: str) -> Config:

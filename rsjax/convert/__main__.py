@@ -14,6 +14,8 @@ KINDS = {
     "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
     "genie": "1xgpt's Genie (STMaskGIT); reads the config.json beside IN",
     "ivideogpt": "iVideoGPT's tokenizer or transformer, whichever IN holds",
+    "irasim": "IRASim's transformer, Frame-Ada or Video-Ada",
+    "sdxl": "the autoencoder of Stable Diffusion XL; reads the config.json beside IN",
     "lpips": "the perceptual distance: torchvision's backbone and the published heads",
 }
 
@@ -35,6 +37,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--part", choices=("tokenizer", "world_model"), help="to export; default: all there is"
             )
+        if kind == "irasim":
+            command.add_argument(
+                "--weights", choices=("ema", "raw"), default="ema", help="raw: not their moving average"
+            )
+            command.add_argument("--heads", type=int, help="attention heads, if the width is none of the public sizes")
         if kind == "lpips":
             command.add_argument("--heads-file", type=Path, help="the published heads, if IN is only the backbone")
     return top
@@ -46,7 +53,7 @@ def main(argv: Sequence[str]) -> None:
     refuse_repeated(argv)
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.convert import commands, ivideogpt
+    from rsjax.convert import commands, diffusion_commands, ivideogpt
 
     if options.kind == "tokenizer":
         lines = commands.convert_tokenizer(options.source, options.out, options.weights)
@@ -54,6 +61,10 @@ def main(argv: Sequence[str]) -> None:
         lines = commands.convert_genie(options.source, options.out, options.heads)
     elif options.kind == "ivideogpt":
         lines = ivideogpt.convert(options.source, options.out, options.heads, options.part)
+    elif options.kind == "irasim":
+        lines = diffusion_commands.convert_irasim(options.source, options.out, options.weights, options.heads)
+    elif options.kind == "sdxl":
+        lines = diffusion_commands.convert_sdxl(options.source, options.out)
     else:
         lines = commands.convert_lpips([path for path in (options.source, options.heads_file) if path], options.out)
     print(*lines, sep="\n")

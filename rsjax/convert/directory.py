@@ -8,9 +8,10 @@ from typing import Literal, TypeVar
 
 import jax
 
-from rsjax.config import ModelConfig, TokenizerConfig, to_dict
+from rsjax.config import KLConfig, ModelConfig, TokenizerConfig, to_dict
 from rsjax.convert.files import ConvertError
 from rsjax.files import disk_guard, read_json, write_json
+from rsjax.models.irasim import autoencoder, dit, pretrained
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -26,10 +27,12 @@ Part = Literal["tokenizer", "world_model"]
 SECTIONS: dict[type, tuple[str, str]] = {  # section of config.json, and directory of the weights
     TokenizerConfig: ("tokenizer", "tokenizer/weights"),
     Architecture: ("architecture", "world_model/weights"),
+    KLConfig: (pretrained.AUTOENCODER, "tokenizer/weights"),
+    dit.Architecture: (pretrained.NETWORK, "world_model/weights"),
 }
 
 
-def save(directory: Path, config: TokenizerConfig | Architecture, params: Params) -> bool:
+def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | dit.Architecture, params: Params) -> bool:
     """Writes a tokenizer or a world model; the directory's other network is kept, the same one replaced.
 
     Returns:
@@ -46,7 +49,8 @@ def save(directory: Path, config: TokenizerConfig | Architecture, params: Params
     with disk_guard(directory):
         (directory / place).parent.mkdir(parents=True, exist_ok=True)
         # Stopped in between, there is no such network rather than one's settings beside another's weights.
-        if replaces := settings.pop(section, None) is not None:
+        old = [settings.pop(name, None) for name, there in SECTIONS.values() if there == place]
+        if replaces := any(old):
             write_json(path, settings)
         save_weights(directory / place, params)
         write_json(path, settings | {section: to_dict(config)})
@@ -111,4 +115,18 @@ def load_world_model(directory: Path) -> tuple[Architecture, Params]:
     """
     architecture = read_architecture(directory)
     shapes = jax.eval_shape(Transformer(architecture).init_params, jax.random.key(0))
+    return architecture, load_weights(directory / "world_model" / "weights", shapes)
+
+
+def load_kl_autoencoder(directory: Path) -> tuple[KLConfig, Params]:
+    """Reads the autoencoder of a converted directory, or of a run of IRASim. Errors as in :func:`load_world_model`."""
+    config = pretrained.saved_autoencoder(directory)
+    shapes = jax.eval_shape(lambda key: autoencoder.init(config, key), jax.random.key(0))
+    return config, load_weights(directory / "tokenizer" / "weights", shapes)
+
+
+def load_irasim(directory: Path) -> tuple[dit.Architecture, Params]:
+    """Reads the transformer of a converted directory, or of a run of IRASim. Errors as in :func:`load_world_model`."""
+    architecture = pretrained.saved_network(directory)
+    shapes = jax.eval_shape(dit.DiT(architecture).init_params, jax.random.key(0))
     return architecture, load_weights(directory / "world_model" / "weights", shapes)

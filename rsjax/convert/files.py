@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,11 +53,12 @@ class TensorFile(NamedTuple):
     names: dict[str, str]
 
 
-def read_tensors(path: Path) -> TensorFile:
+def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
     """Reads the tensors of a file.
 
     Args:
-        path: a ``.safetensors`` file, or one of PyTorch's; also with a network under one of ``HOLDERS``.
+        path: a ``.safetensors`` file, or one of PyTorch's; also with a network under one of ``holders``.
+        holders: keys under which to look for the network's tensors, in this order.
 
     Raises:
         ConvertError: the file does not exist, is of another kind, is damaged, or holds what could run code; a tensor's
@@ -70,7 +72,7 @@ def read_tensors(path: Path) -> TensorFile:
     if path.suffix == SAFE:
         read, metadata = _read_safetensors(path)
     elif path.suffix in PICKLED:
-        read, metadata = _read_torch(path), {}
+        read, metadata = _read_torch(path, holders), {}
     else:
         raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
     names: dict[str, str] = {}
@@ -111,7 +113,7 @@ class _Placeholder:
     def __setstate__(self, state: object) -> None: ...
 
 
-def _read_torch(path: Path) -> Tensors:
+def _read_torch(path: Path, holders: Sequence[str]) -> Tensors:
     try:
         torch: Any = importlib.import_module("torch")
     except ImportError:
@@ -121,13 +123,13 @@ def _read_torch(path: Path) -> Tensors:
         ) from None
     content = _unpickled(path, torch)
     state = content
-    for holder in HOLDERS:
+    for holder in holders:
         if isinstance(content, dict) and _tensors(content.get(holder), torch):
             state = content[holder]
             break
     tensors = _tensors(state, torch)
     if not tensors:
-        raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(HOLDERS)}")
+        raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(holders)}")
     return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}
 
 

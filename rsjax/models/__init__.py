@@ -2,7 +2,8 @@
 
 from rsjax.models.base import Assets, WorldModel, create_model, implements
 from rsjax.models.genie import Genie
+from rsjax.models.irasim.model import IRASim
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.roboscape.model import RoboScape
 
-__all__ = ["Assets", "Genie", "IVideoGPT", "RoboScape", "WorldModel", "create_model", "implements"]
+__all__ = ["Assets", "Genie", "IRASim", "IVideoGPT", "RoboScape", "WorldModel", "create_model", "implements"]

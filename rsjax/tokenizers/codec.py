@@ -1,5 +1,6 @@
 """Encodes and decodes numpy images with a trained tokenizer: RGB frames and depth maps."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
@@ -86,18 +87,30 @@ class Codec:
         return self.normalization.depth_range
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
-        item_axes = {"encode": 3, "decode": 2}[method]
-        lead, item = images.shape[:-item_axes], images.shape[-item_axes:]
-        flat = images.reshape(-1, *item)
-        size = min(CHUNK, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
-        out = []
-        for start in range(0, len(flat), size):
-            chunk = flat[start : start + size]
-            padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
-            made = _apply(self.config, method, self.params, divide(padded, self.params))
-            out.append(np.asarray(made)[: len(chunk)])
-        joined = np.concatenate(out)
-        return joined.reshape(*lead, *joined.shape[1:])
+        def apply(chunk: np.ndarray) -> ArrayLike:
+            return _apply(self.config, method, self.params, divide(chunk, self.params))
+
+        return in_chunks(apply, images, {"encode": 3, "decode": 2}[method])
+
+
+def in_chunks(
+    apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int = CHUNK
+) -> np.ndarray:
+    """Returns ``apply`` of all items, which it maps one by one, in passes of at most ``most``.
+
+    Args:
+        items: with any leading axes before the ``item_axes`` of an item.
+    """
+    lead, item = items.shape[:-item_axes], items.shape[-item_axes:]
+    flat = items.reshape(-1, *item)
+    size = min(most, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
+    out = []
+    for start in range(0, len(flat), size):
+        chunk = flat[start : start + size]
+        padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
+        out.append(np.asarray(apply(padded))[: len(chunk)])
+    joined = np.concatenate(out)
+    return joined.reshape(*lead, *joined.shape[1:])
 
 
 @partial(jax.jit, static_argnums=(0, 1))

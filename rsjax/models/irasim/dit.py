@@ -4,15 +4,15 @@ Axes: B clips, T frames (t: T, or 1 for all), h×w cells of latents with C chann
 action inputs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from rsjax.config import DiTConfig
-from rsjax.models.diffusion.layers import TimeEmbedding, grid_positions, modulate, positions
+from rsjax.config import Config, DiTConfig, IRASimConfig
+from rsjax.models.diffusion.layers import TIME_CHANNELS, TimeEmbedding, grid_positions, modulate, positions
 from rsjax.models.roboscape.attention import Dense, attend, attend_cells
 from rsjax.trainable import Params
 
@@ -43,6 +43,21 @@ class Architecture(DiTConfig):
     def grid(self) -> tuple[int, int]:
         """Rows and columns of a frame's tokens."""
         return self.rows // self.patch_size, self.columns // self.patch_size
+
+
+def architecture(config: Config) -> Architecture:
+    """Returns the architecture of a configuration whose model is IRASim."""
+    model, clips = config.model, config.clips
+    assert isinstance(model, IRASimConfig)
+    side = clips.image_size // model.autoencoder.downsampling
+    return Architecture(
+        **{field.name: getattr(model, field.name) for field in fields(DiTConfig)},
+        frames=clips.frames,
+        rows=side,
+        columns=side,
+        channels=model.autoencoder.latent_channels,
+        action_inputs=clips.action_dim,
+    )
 
 
 class Block(nn.Module):
@@ -158,3 +173,16 @@ class DiT(nn.Module):
         latents = jnp.zeros((1, cfg.frames, cfg.rows, cfg.columns, cfg.channels))
         actions = jnp.zeros((1, cfg.frames, cfg.action_inputs))
         return self.init(key, latents, jnp.zeros(1, jnp.int32), actions)["params"]
+
+
+def forward_flops(config: Architecture) -> int:
+    """Returns the floating-point operations of one pass over a clip: its matrix products, 2·m·n·k each."""
+    width, cells, frames = config.width, config.grid[0] * config.grid[1], config.frames
+    linear = (4 + 2 * config.mlp_ratio) * width**2  # qkv, proj, fc1, fc2
+    attention = (cells + frames) * width  # scores and weighted sums, on the average of both kinds of blocks
+    patches = 2 * config.patch_size**2 * config.channels * width
+    acted = frames if config.conditioning == "frame" else 1
+    conditions = config.blocks // 2 * (acted + 1) * 6 * width**2 + 2 * width**2 + (TIME_CHANNELS + width) * width
+    rows = (frames - 1, 1) if config.conditioning == "frame" else (1, frames - 1)
+    encoder = rows[0] * config.mlp_ratio * width * (rows[1] * config.action_inputs + width)
+    return 2 * (frames * cells * (config.blocks * (linear + attention) + patches) + conditions + encoder)

@@ -1,0 +1,88 @@
+"""The presets of IRASim: the public sizes with their training, and a small one for 2 CPU cores."""
+
+from dataclasses import replace
+
+from rsjax.config.diffusion import DenoiseConfig
+from rsjax.config.irasim import IRASimConfig, KLConfig
+from rsjax.config.run import Config
+from rsjax.config.sim import SimConfig
+from rsjax.config.tokenizer import TokenizerTrainConfig
+from rsjax.config.train import LoopConfig, OptimizerConfig
+
+
+def irasim_s() -> Config:
+    """Returns the smallest of IRASim's public sizes."""
+    return _irasim("irasim_s", width=384, blocks=12, heads=6)
+
+
+def irasim_b() -> Config:
+    """Returns the second of IRASim's public sizes."""
+    return _irasim("irasim_b", width=768, blocks=12, heads=12)
+
+
+def irasim_l() -> Config:
+    """Returns the third of IRASim's public sizes."""
+    return _irasim("irasim_l", width=1024, blocks=24, heads=16)
+
+
+def irasim_xl() -> Config:
+    """Returns IRASim's published model."""
+    return _irasim("irasim_xl", width=1152, blocks=28, heads=16)
+
+
+def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
+    """Returns a preset with the public code's settings on the latents of SDXL's autoencoder, which stays frozen.
+
+    The public batch is 1 clip a GPU, accumulated twice, on GPUs of unknown number; 16 is our choice.
+    """
+    public = OptimizerConfig(warmup_steps=0, schedule="steps", beta2=0.999, grad_clip=0.1)
+    return Config(
+        name=name,
+        sim=SimConfig(image_size=256),
+        tokenizer_train=TokenizerTrainConfig(steps=0, start_from="sdxl_vae"),
+        model=IRASimConfig(width=width, blocks=blocks, heads=heads, compute_dtype="bfloat16", remat="blocks"),
+        train=LoopConfig(
+            steps=300_000,
+            batch_size=16,
+            optimizer=public,
+            ema=0.9999,
+            log_every=100,
+            checkpoint_every=1000,
+            eval_every=10_000,
+        ),
+    )
+
+
+def irasim_tiny(base: Config) -> Config:
+    """Returns IRASim and its own autoencoder on the clips and in about the time of the preset ``tiny``."""
+    return replace(
+        base,
+        name="irasim_tiny",
+        tokenizer_train=replace(base.tokenizer_train, steps=2000, depth_share=0.0),
+        model=IRASimConfig(
+            autoencoder=KLConfig(
+                network="magvit2",
+                latent_channels=16,
+                channels=64,
+                channel_multipliers=(1, 2),
+                res_blocks=1,
+                norm_groups=8,
+                patch_size=4,
+                local_codes=True,
+            ),
+            width=128,
+            blocks=8,
+            heads=4,
+            patch_size=1,
+            compute_dtype="bfloat16",
+            sample=DenoiseConfig("ddim", steps=20),
+        ),
+        train=replace(
+            base.train,
+            steps=2400,
+            accumulate=1,
+            optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
+            ema=0.998,
+            eval_every=1200,
+        ),
+    )

@@ -1,0 +1,197 @@
+"""Maps the names of ``diffusers``' AutoencoderKL, such as SDXL's, to the parameters of IRASim's autoencoder.
+
+The ``config.json`` that is published beside the weights has the factor of the latents, which the weights do not reveal:
+older autoencoders of the same shapes have another one.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.config import ConfigError, KLConfig
+from rsjax.convert.files import ConvertError, Tensors
+from rsjax.convert.table import (
+    SAME_NAMES,
+    Entry,
+    Names,
+    Table,
+    norm,
+    shape_of,
+    to_params,
+    to_tensors,
+    weight_and_bias,
+)
+from rsjax.files import read_json
+from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
+from rsjax.trainable import Params
+
+CONFIG = "config.json"
+CLASS = "AutoencoderKL"
+# Names of attention's layers in older files.
+OLDER = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
+_OLDER = re.compile(rf"(mid_block\.attentions\.0\.)({'|'.join(OLDER)})\.")
+
+
+def table(config: KLConfig) -> Table:
+    """Returns an entry for each public tensor.
+
+    Raises:
+        ConvertError: the network is not SDXL's, so it has no public names.
+    """
+    if config.network != "sdxl":
+        raise ConvertError(f"the public format cannot express model.autoencoder.network {config.network!r}, only sdxl")
+    last = len(config.channel_multipliers) - 1
+    entries: list[Entry] = [
+        *weight_and_bias("quant_conv", "encoder/quant_conv", "conv"),
+        *weight_and_bias("post_quant_conv", "decoder/post_quant_conv", "conv"),
+    ]
+    for half in ("encoder", "decoder"):
+        for name in ("conv_in", "conv_out"):
+            entries += weight_and_bias(f"{half}.{name}", f"{half}/{name}", "conv")
+        entries += norm(f"{half}.conv_norm_out", f"{half}/conv_norm_out")
+        attention, own = f"{half}.mid_block.attentions.0", f"{half}/mid"
+        entries += norm(f"{attention}.group_norm", f"{own}/group_norm")
+        for public, name in {"to_q": "to_q", "to_k": "to_k", "to_v": "to_v", "to_out.0": "to_out"}.items():
+            entries += weight_and_bias(f"{attention}.{public}", f"{own}/{name}", "linear")
+        for i in range(2):
+            entries += _block(f"{half}.mid_block.resnets.{i}", f"{own}/resnets_{i}", shortcut=False)
+    widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
+    for level, width in enumerate(widths):
+        before, after = widths[max(level - 1, 0)], widths[min(level + 1, last)]
+        down, up = f"encoder.down_blocks.{level}", f"decoder.up_blocks.{last - level}"
+        for i in range(config.res_blocks):
+            entries += _block(f"{down}.resnets.{i}", f"encoder/down_{level}_resnets_{i}", i == 0 and before != width)
+        for i in range(config.res_blocks + 1):
+            entries += _block(f"{up}.resnets.{i}", f"decoder/up_{level}_resnets_{i}", i == 0 and after != width)
+        if level < last:
+            entries += weight_and_bias(f"{down}.downsamplers.0.conv", f"encoder/down_{level}_downsample", "conv")
+        if level > 0:
+            entries += weight_and_bias(f"{up}.upsamplers.0.conv", f"decoder/up_{level}_upsample", "conv")
+    return tuple(entries)
+
+
+def _block(public: str, own: str, shortcut: bool) -> list[Entry]:
+    entries: list[Entry] = []
+    for i in (1, 2):
+        entries += norm(f"{public}.norm{i}", f"{own}/norm{i}")
+        entries += weight_and_bias(f"{public}.conv{i}", f"{own}/conv{i}", "conv")
+    return entries + list(weight_and_bias(f"{public}.conv_shortcut", f"{own}/conv_shortcut", "conv")) * shortcut
+
+
+def read_settings(weights: Path) -> dict[str, Any]:
+    """Reads the settings beside a file of weights; returns an empty dict if there are none.
+
+    Raises:
+        UserError: the file is damaged or of another network.
+    """
+    path = weights.parent / CONFIG
+    if not path.exists():
+        return {}
+    cure = f"put the published one beside {weights.name}, or delete it"
+    settings = read_json(path, cure=cure)
+    if settings.get("_class_name") != CLASS:
+        raise ConvertError(f"{path}: describes {settings.get('_class_name', 'no network')}, not an {CLASS}; {cure}")
+    return settings
+
+
+def infer_config(source: object, tensors: Tensors, settings: dict[str, Any], names: Names = SAME_NAMES) -> KLConfig:
+    """Infers the network from the shapes of its tensors, and from ``norm_num_groups`` of its settings.
+
+    Raises:
+        ConvertError: the tensors are not an AutoencoderKL's.
+    """
+
+    def width(key: str) -> int:
+        return shape_of(source, tensors, f"{key}.weight", 4, names)[0]
+
+    if not {"quant_conv.weight", "encoder.conv_in.weight", "encoder.down_blocks.0.resnets.0.conv1.weight"} <= set(
+        tensors
+    ):
+        raise ConvertError(f"{source}: holds no {CLASS} of diffusers, such as SDXL's, with a tensor quant_conv.weight")
+    channels, z = width("encoder.conv_in"), width("post_quant_conv")
+    first = re.compile(r"encoder\.down_blocks\.(\d+)\.resnets\.(\d+)\.conv1\.weight")
+    places = [(int(match[1]), int(match[2])) for match in map(first.fullmatch, tensors) if match]
+    levels, blocks = (max(column) + 1 for column in zip(*places, strict=True))
+    try:
+        return KLConfig(
+            latent_channels=z,
+            channels=channels,
+            channel_multipliers=tuple(
+                width(f"encoder.down_blocks.{level}.resnets.0.conv1") // channels for level in range(levels)
+            ),
+            res_blocks=blocks,
+            norm_groups=settings.get("norm_num_groups", 32),
+        )
+    except ConfigError as error:
+        raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
+
+
+def from_public(
+    source: object, tensors: Tensors, settings: dict[str, Any], names: Names = SAME_NAMES
+) -> tuple[KLConfig, Params]:
+    """Returns an autoencoder's settings and parameters, converted from a public file's tensors.
+
+    Args:
+        settings: of the file, from :func:`read_settings`; without them the latents' factor is SDXL's.
+        names: of the tensors in the file, for errors, where they differ.
+
+    Raises:
+        ConvertError: as :func:`infer_config`; or tensors are missing, unexpected, of another shape or no finite floats;
+            or the settings are no numbers.
+    """
+    own = {_renamed(name): name for name in tensors}
+    tensors, names = (
+        {new: _flat(new, tensors[old]) for new, old in own.items()},
+        {n: names.get(o, o) for n, o in own.items()},
+    )
+    config = infer_config(source, tensors, settings, names)
+    factor, shift = settings.get("scaling_factor", SDXL_FACTOR), settings.get("shift_factor") or 0.0
+    if not all(type(x) in (int, float) and math.isfinite(x) for x in (factor, shift)) or factor <= 0:
+        raise ConvertError(
+            f"{source}: its {CONFIG} has scaling_factor {factor!r} and shift_factor {shift!r}; numbers fit"
+        )
+    shapes = jax.eval_shape(lambda key: init(config, key), jax.random.key(0))
+    latents = shapes.pop("latents")
+    fixed = {"mean": shift, "log_deviation": -math.log(factor)}
+    params = to_params(source, tensors, table(config), shapes, names)
+    return config, params | {"latents": {n: np.full(x.shape, fixed[n], np.float32) for n, x in latents.items()}}
+
+
+def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]]:
+    """Returns the tensors of a public file, and the settings beside it.
+
+    Raises:
+        ConvertError: the public format cannot express the network or its latents' statistics.
+    """
+    networks = {name: params[name] for name in ("encoder", "decoder")}
+    tensors = to_tensors(networks, table(config))
+    mean, deviation = np.asarray(params["latents"]["mean"]), np.exp(params["latents"]["log_deviation"])
+    if np.ptp(mean) > 0 or np.ptp(deviation) > 0:
+        raise ConvertError(
+            "the public format has one factor for all latent channels; this autoencoder has one for each"
+        )
+    widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
+    return tensors, {
+        "_class_name": CLASS,
+        "block_out_channels": widths,
+        "down_block_types": ["DownEncoderBlock2D"] * len(widths),
+        "up_block_types": ["UpDecoderBlock2D"] * len(widths),
+        "layers_per_block": config.res_blocks,
+        "latent_channels": config.latent_channels,
+        "norm_num_groups": config.norm_groups,
+        "scaling_factor": round(float(1 / deviation[0]), 7),
+        "shift_factor": float(mean[0]) or None,
+    }
+
+
+def _renamed(name: str) -> str:
+    return _OLDER.sub(lambda match: f"{match[1]}{OLDER[match[2]]}.", name)
+
+
+def _flat(name: str, x: np.ndarray) -> np.ndarray:
+    """Returns attention's weights as matrices; some files have them as 1×1 convolutions."""
+    return x[..., 0, 0] if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1) else x

@@ -1,0 +1,175 @@
+"""IRASim's autoencoder: its networks, training and codec. SDXL's with public weights, or a small one that a run trains.
+
+Latents are standardised channel by channel. The parameters hold the channels' means and deviations ("latents"): the
+public factor for SDXL, and for a trained one numbers that its training fits to what its encoder makes.
+
+Axes: B images, H×W pixels, h×w cells, z latent channels, T frames.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import Config, KLConfig, TokenizerTrainConfig
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.devices import divide
+from rsjax.models.irasim import pretrained
+from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
+from rsjax.tokenizers import magvit2
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.lpips import load_lpips, lpips
+from rsjax.tokenizers.magvit2 import to_pixels, to_unit
+from rsjax.tokenizers.training import TokenizerImages, image_batch
+from rsjax.trainable import Extra, Params, StepContext, Term
+
+Images = Float[Array, "B H W 3"]
+Latents = Float[Array, "B h w z"]
+
+SDXL_FACTOR = 0.13025  # by which the public code multiplies latents
+LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's, as in the public code
+CHUNK_PIXELS = CHUNK * 64**2  # of images per pass, to bound memory
+
+
+def networks(config: KLConfig) -> tuple[Any, Any]:
+    """Returns the modules of encoder and decoder."""
+    if config.network == "sdxl":
+        return Encoder(config), Decoder(config)
+    return magvit2.Encoder(config.convolutions), magvit2.Decoder(config.convolutions)
+
+
+def init(config: KLConfig, key: Key[Array, ""]) -> Params:
+    """Returns fresh parameters of "encoder", "decoder" and "latents"."""
+    encoder, decoder = networks(config)
+    z, size = config.latent_channels, 2 * config.downsampling
+    scale = -math.log(SDXL_FACTOR) if config.network == "sdxl" else 0.0
+    return {
+        "encoder": encoder.init(key, jnp.zeros((1, size, size, 3)))["params"],
+        "decoder": decoder.init(jax.random.fold_in(key, 1), jnp.zeros((1, 2, 2, z)))["params"],
+        "latents": {"mean": jnp.zeros(z), "log_deviation": jnp.full(z, scale)},
+    }
+
+
+def posterior(config: KLConfig, params: Params, images: Images) -> tuple[Latents, Latents]:
+    """Returns the mean and the log-variance of images' latents, not standardised."""
+    mean, log_variance = jnp.split(networks(config)[0].apply({"params": params["encoder"]}, images), 2, axis=-1)
+    return mean, jnp.clip(log_variance, *LOG_VARIANCE)
+
+
+def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
+    """Returns the images of latents that are not standardised."""
+    return networks(config)[1].apply({"params": params["decoder"]}, latents)
+
+
+@dataclass(frozen=True)
+class KLTraining(Autoencoder[Images]):
+    """Learns to reconstruct RGB frames from a sample of their posterior. A batch is images 0–255, (B, H, W, 3)."""
+
+    config: KLConfig
+    train: TokenizerTrainConfig
+    image_size: int
+
+    @classmethod
+    def create(cls, config: Config) -> "KLTraining":
+        """Returns the training of the autoencoder of a configuration whose model is IRASim."""
+        return cls(config.autoencoder, config.tokenizer_train, config.clips.image_size)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        weights = {name: w for name, w in self.train.loss_weights.items() if name in ("l1", "l2", "perceptual")}
+        return weights | {"kl": self.config.kl_weight, "standard": 1.0}
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return init(self.config, key)
+
+    def init_extra(self) -> Extra:
+        if "perceptual" not in self.loss_weights:
+            return None
+        return {"lpips": jax.tree.map(jnp.array, load_lpips(self.train.lpips_weights))}
+
+    def loss_terms(self, params: Params, batch: Images, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns the terms of the reconstruction, and
+
+        - "kl": the divergence of the posterior from the normal distribution, per number;
+        - "standard": how far the parameters "latents" are from the statistics of the batch, which they follow.
+        """
+        images = to_unit(batch)
+        mean, log_variance = posterior(self.config, params, images)
+        latents = mean + jnp.exp(log_variance / 2) * jax.random.normal(key, mean.shape)
+        output = decode(self.config, params, latents)
+        of_batch = jax.lax.stop_gradient(latents).reshape(-1, latents.shape[-1])
+        fitted = params["latents"]
+        means = {
+            "l1": jnp.mean(jnp.abs(images - output)),
+            "l2": jnp.mean(jnp.square(images - output)),
+            "kl": jnp.mean(jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance) / 2,
+            "standard": jnp.mean(jnp.square(fitted["mean"] - jnp.mean(of_batch, 0)))
+            + jnp.mean(jnp.square(fitted["log_deviation"] - jnp.log(jnp.std(of_batch, 0) + 1e-6))),
+        }
+        if "perceptual" in self.loss_weights:
+            assert context.extra is not None
+            means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], images, output))
+        count = jnp.float32(len(batch))
+        return {name: (means[name] * count, count) for name in self.loss_weights}
+
+    def transform(self) -> Transform:
+        return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
+
+    def batch(self, arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
+        return image_batch(arrays)
+
+    def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
+        return KLCodec(self.config, params)
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        saved = pretrained.check_autoencoder(directory, self.config)
+        return jax.eval_shape(partial(init, saved), jax.random.key(0))
+
+
+@dataclass(frozen=True)
+class KLCodec:
+    """A trained autoencoder that takes and returns numpy arrays. Its latents are standardised."""
+
+    config: KLConfig
+    params: Params
+
+    def encode(self, video: Video) -> dict[str, Float[np.ndarray, "B T h w z"]]:
+        """Returns the posterior's "mean" and "deviation" of each frame."""
+        made = in_chunks(partial(self._run, _encode), video.rgb, 3, self._most(video.rgb.shape[-2]))
+        mean, deviation = np.split(made, 2, axis=-1)
+        return {"mean": mean, "deviation": deviation}
+
+    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
+        """Returns the frames of latents "mean"."""
+        latents = np.asarray(tokens["mean"])
+        side = latents.shape[-2] * self.config.downsampling
+        frames = in_chunks(partial(self._run, _decode), latents, 3, self._most(side))
+        return Video(np.round(frames).astype(np.uint8))
+
+    def _run(self, function: Any, chunk: np.ndarray) -> Any:
+        return function(self.config, self.params, divide(chunk, self.params))
+
+    def _most(self, side: int) -> int:
+        return max(1, CHUNK_PIXELS // side**2)
+
+
+@partial(jax.jit, static_argnums=0)
+def _encode(config: KLConfig, params: Params, images: Any) -> Float[Array, "B h w z2"]:
+    mean, log_variance = posterior(config, params, to_unit(images))
+    scale = jnp.exp(-params["latents"]["log_deviation"])
+    return jnp.concatenate([(mean - params["latents"]["mean"]) * scale, jnp.exp(log_variance / 2) * scale], axis=-1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _decode(config: KLConfig, params: Params, latents: Any) -> Float[Array, "B H W 3"]:
+    own = latents * jnp.exp(params["latents"]["log_deviation"]) + params["latents"]["mean"]
+    return to_pixels(decode(config, params, own))

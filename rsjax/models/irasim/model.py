@@ -1,0 +1,152 @@
+"""IRASim: the transformer with its autoencoder, loss and sampler, behind the interface of world models.
+
+Axes: B clips, T frames, P of the prompt, h×w cells of latents with C channels, A action inputs.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from rsjax.clip import Video
+from rsjax.config import ClipShape, Config, IRASimConfig
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.data.store import Store
+from rsjax.models.base import Assets, WorldModel, implements
+from rsjax.models.diffusion.schedule import add_noise, target
+from rsjax.models.irasim import pretrained
+from rsjax.models.irasim.autoencoder import KLCodec, KLTraining
+from rsjax.models.irasim.dit import Architecture, DiT, architecture, forward_flops
+from rsjax.models.irasim.rollout import rollout
+from rsjax.tokenizers.tokenize import described, prepare_store
+from rsjax.trainable import Params, StepContext, Term
+
+Batch = dict[str, Any]  # latents (B, T, h, w, C), actions (B, T, A), weight and index (B,)
+
+
+@implements(IRASimConfig)
+@dataclass(frozen=True)
+class IRASim(WorldModel[Batch]):
+    """The latent video diffusion transformer.
+
+    Attributes:
+        config: the family's settings.
+        architecture: the network's settings.
+        prompt_frames: frames that are clean in training and given in generation.
+        clips: the shape of the training clips.
+    """
+
+    config: IRASimConfig
+    architecture: Architecture
+    prompt_frames: int
+    clips: ClipShape
+
+    @classmethod
+    def create(cls, config: Config) -> "IRASim":
+        assert isinstance(config.model, IRASimConfig)
+        return cls(config.model, architecture(config), config.prompt_frames, config.clips)
+
+    @classmethod
+    def autoencoder(cls, config: Config) -> KLTraining:
+        return KLTraining.create(config)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return self.config.loss_weights
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return DiT(self.architecture).init_params(key)
+
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns "error": the mean square error of the predicted noise in the frames after the prompt."""
+        noise, latents, past = self.config.noise, batch["latents"], self.prompt_frames
+
+        def draw(index: Int[Array, ""]) -> tuple[Array, Array, Array]:
+            t_key, noise_key, drop_key = jax.random.split(jax.random.fold_in(key, index), 3)
+            dropped = jax.random.bernoulli(drop_key, self.config.action_dropout)
+            return (
+                jax.random.randint(t_key, (), 0, noise.steps),
+                jax.random.normal(noise_key, latents.shape[1:]),
+                dropped,
+            )
+
+        t, drawn, drop = jax.vmap(draw)(batch["index"])
+        noisy = add_noise(noise, latents, drawn, t).at[:, :past].set(latents[:, :past])
+        predicted: Any = DiT(self.architecture).apply({"params": params}, noisy, t, batch["actions"], drop)
+        error = jnp.square(predicted - target(noise, latents, drawn, t))[:, past:]
+        weight = batch["weight"].astype(jnp.float32)
+        return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
+
+    def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
+        """Makes the latents of every clip, stored beside the clips for all runs with this autoencoder."""
+        codec = self._codec(assets)
+
+        def encode(clip: Record) -> Record:
+            latents = codec.encode(Video(clip["rgb"][None]))
+            return {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
+
+        size = self.clips.image_size
+        return prepare_store(clips, codec.config, codec.params, encode, size, folder, max_damaged)
+
+    def transform(self, normalization: Normalization) -> Transform:
+        return partial(latent_arrays, normalization)
+
+    def example(self, rng: np.random.Generator) -> Record:
+        arch = self.architecture
+        shape = (arch.frames, arch.rows, arch.columns, arch.channels)
+        return {
+            "mean": rng.normal(size=shape).astype(np.float16),
+            "deviation": np.full(shape, 0.1, np.float16),
+            "actions": rng.normal(size=(arch.frames, arch.action_inputs)).astype(np.float32),
+        }
+
+    def generate(
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "B T A"],
+        *,
+        index: Int[np.ndarray, " B"] | None = None,
+        depth: bool = True,
+    ) -> Video:
+        codec, numbers = self._codec(assets), np.arange(len(actions)) if index is None else np.asarray(index)
+        known, inputs = codec.encode(prompt)["mean"], assets.normalization.action_inputs(actions, False)
+        made = rollout(self.architecture, self.config, self.prompt_frames, params, known, inputs, numbers)
+        return codec.decode({"mean": made})
+
+    def reconstruct(self, assets: Assets, video: Video) -> Video:
+        codec = self._codec(assets)
+        return codec.decode(codec.encode(video))
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        saved = pretrained.check_network(directory, self.architecture)
+        return jax.eval_shape(DiT(saved).init_params, jax.random.key(0))
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        return pretrained.completed(fresh, saved)
+
+    def flops(self, frames: int) -> dict[str, int]:
+        forward = forward_flops(self.architecture)
+        return {"forward": forward, "train": 3 * forward}
+
+    def _codec(self, assets: Assets) -> KLCodec:
+        assert assets.tokenizer is not None
+        return KLCodec(self.config.autoencoder, assets.tokenizer)
+
+
+def latent_arrays(normalization: Normalization, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns a sample of a record's posterior, and its actions, normalised."""
+    mean, deviation = (record[name].astype(np.float32) for name in ("mean", "deviation"))
+    drawn = rng.standard_normal(mean.shape, np.float32)
+    return {
+        "latents": mean + deviation * drawn,
+        "actions": normalization.action_inputs(record["actions"], False),
+    }

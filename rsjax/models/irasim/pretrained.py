@@ -1,0 +1,90 @@
+"""Starts training from the weights of another run, or of a public checkpoint that was converted.
+
+Both directories contain ``config.json`` and weights. A run's ``config.json`` is its configuration; a converted
+checkpoint's has a section ``kl_autoencoder`` or ``irasim``.
+"""
+
+from pathlib import Path
+from typing import TypeVar
+
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from rsjax.config import Config, ConfigError, IRASimConfig, KLConfig, from_dict
+from rsjax.config.fields import differences
+from rsjax.errors import UserError
+from rsjax.files import read_json
+from rsjax.models.irasim.dit import Architecture, architecture
+from rsjax.trainable import Params
+
+AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
+# Fields that may differ between the saved network and the one to train: parameters do not depend on them, or begin
+# fresh.
+FREE = ("rows", "columns", "action_inputs", "compute_dtype", "remat")
+C = TypeVar("C")
+
+
+def saved_autoencoder(directory: Path) -> KLConfig:
+    """Returns the settings of a directory's autoencoder.
+
+    Raises:
+        UserError: there is none, or its settings are missing, damaged or of another family.
+    """
+    saved = _section(directory, AUTOENCODER, KLConfig, "tokenizer", "sdxl")
+    return _irasim(directory, saved).autoencoder if isinstance(saved, Config) else saved
+
+
+def saved_network(directory: Path) -> Architecture:
+    """Returns the architecture of a directory's transformer. Errors as in :func:`saved_autoencoder`."""
+    saved = _section(directory, NETWORK, Architecture, "world_model", "irasim")
+    if not isinstance(saved, Config):
+        return saved
+    _irasim(directory, saved)
+    return architecture(saved)
+
+
+def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
+    """Returns :func:`saved_autoencoder`, and raises also if it is another network than ``own``."""
+    saved = saved_autoencoder(directory)
+    if differing := differences(saved, own, ("kl_weight",)):
+        raise UserError(
+            f"{directory}: holds another autoencoder ({differing}); set these fields of model.autoencoder alike"
+        )
+    return saved
+
+
+def check_network(directory: Path, own: Architecture) -> Architecture:
+    """Returns :func:`saved_network`, and raises also if it is another network than ``own``."""
+    saved = saved_network(directory)
+    free = FREE if own.conditioning == "video" else (*FREE, "frames")
+    if differing := differences(saved, own, free):
+        raise UserError(f"{directory}: holds another network ({differing}); set these fields of model alike")
+    return saved
+
+
+def completed(fresh: Params, saved: Params) -> Params:
+    """Returns the saved parameters; the action encoder's first layer is a fresh one for actions of another length."""
+    own, there = flatten_dict(fresh, sep="/"), flatten_dict(saved, sep="/")
+    first = "action_fc1/kernel"
+    if there[first].shape != own[first].shape:
+        there |= {name: own[name] for name in (first, "action_fc1/bias")}
+    return unflatten_dict(there, sep="/")
+
+
+def _section(directory: Path, name: str, kind: type[C], stage: str, command: str) -> C | Config:
+    cure = f"make it with python -m rsjax.convert {command}"
+    if not (directory / stage / "weights").exists():
+        raise UserError(f"{directory}: holds no {stage}/weights with their settings in config.json; {cure}")
+    path = directory / "config.json"
+    settings = read_json(path, cure=cure)
+    if not settings.keys() & {name, "model"}:
+        raise UserError(f"{path}: describes no network of IRASim but {', '.join(settings) or 'nothing'}; {cure}")
+    try:
+        return from_dict(kind, settings[name]) if name in settings else from_dict(Config, settings)
+    except (ConfigError, TypeError) as error:
+        raise UserError(f"{path}: the network's settings cannot be read ({error}); make it again") from error
+
+
+def _irasim(directory: Path, config: Config) -> IRASimConfig:
+    if not isinstance(config.model, IRASimConfig):
+        raise UserError(f"{directory}: holds a model of family {config.model.family!r}; start from IRASim")
+    return config.model
