@@ -7,6 +7,7 @@ Axes: B clips, T frames (the first P are the prompt), c context frames, F later 
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +45,7 @@ def generate(
     begin = frames.shape[1] - given
     made = [codec.decode(codec.encode(Video(frames))).rgb[:, : begin + given]]
     window = frames[:, begin:]
-    keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), index)
+    keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), jnp.asarray(index))
     while begin + given < rows.shape[1]:
         tokens = codec.encode(Video(window))
         used = rows[:, begin : begin + count].copy()  # shorter in the last sequence, whose surplus is cut
@@ -80,7 +81,8 @@ def sample(
     end = layout.length(layout.context + actions.shape[1])
 
     def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:
-        logits, new = network.apply({"params": params}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
+        out: Any = network.apply({"params": params}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
+        logits, new = out
         return new, logits[:, 0]
 
     def draw(logits: Float[Array, "B V"], place: Array) -> Int[Array, " B"]:

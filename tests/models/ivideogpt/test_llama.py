@@ -104,7 +104,7 @@ def test_draws_are_from_the_most_probable_and_follow_the_clips_key() -> None:
 
 def test_the_loss_is_the_mean_over_numbers_after_the_first_slot_of_clips_that_count() -> None:
     model, params = IVideoGPT(MODEL, CLIPS), llama_params()
-    batch = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.array([1, 0], np.float32), "index": np.arange(2)}
+    batch: Any = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.array([1, 0], np.float32), "index": np.arange(2)}
     value, weight = model.loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))["token"]
     first = ARCH.layout.first_slot
     log_p = jax.nn.log_softmax(logits(params))[0, first:-1]
@@ -168,6 +168,6 @@ def test_logits_are_those_of_transformers() -> None:
         made = reference(inputs_embeds=embedded, labels=labels)
     assert 0.3 < made.logits.std() < 10
     np.testing.assert_allclose(logits(params), made.logits.numpy(), atol=1e-5)
-    batch = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.ones(2, np.float32), "index": np.arange(2)}
+    batch: Any = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.ones(2, np.float32), "index": np.arange(2)}
     terms = IVideoGPT(MODEL, CLIPS).loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))
     assert float(terms["token"][0] / terms["token"][1]) == pytest.approx(float(made.loss), abs=1e-5)

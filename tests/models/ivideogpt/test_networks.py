@@ -73,7 +73,8 @@ def test_the_codebook_takes_the_nearest_vector_and_passes_the_gradient_through()
     vectors = {"params": {"embedding": jnp.array([[0.0, 0], [1, 1], [3, 0]] + [[9.0, 9]] * 29)}}
     book, z = Codebook(replace(VQ, latent=2)), jnp.array([[0.9, 0.7], [2.5, 0.4]])
     np.testing.assert_array_equal(book.apply(vectors, z, method="nearest"), [1, 2])
-    out, codebook, commitment = book.apply(vectors, z)
+    outs: Any = book.apply(vectors, z)
+    out, codebook, commitment = outs
     np.testing.assert_allclose(out, [[1, 1], [3, 0]])
     assert float(codebook) == pytest.approx(float(commitment)) == pytest.approx((0.01 + 0.09 + 0.25 + 0.16) / 4)
     gradient = jax.grad(lambda z: jnp.sum(book.apply(vectors, z)[0] * jnp.array([2.0, 3])))(z)
@@ -127,5 +128,5 @@ def test_tokens_and_images_are_those_of_plain_pytorch(changes: dict[str, Any]) -
     made = network.apply(variables, clips, method="encode")
     for mine, theirs in zip(made, tokens, strict=True):
         np.testing.assert_array_equal(mine.reshape(theirs.shape), theirs)
-    pixels = network.apply(variables, *made, method="decode")
+    pixels: Any = network.apply(variables, *made, method="decode")
     np.testing.assert_allclose(pixels / 255, np.clip(decoded, 0, 1), atol=1e-5)
