@@ -10,9 +10,10 @@ import pytest
 
 from experiments import paper
 from rsjax.ablation import sweep
+from rsjax.ablation.figure import draw
 from rsjax.errors import Preempted
 from rsjax.evaluation.statistics import Verdict
-from rsjax.paper import measurements
+from rsjax.paper import measurements, report
 from rsjax.paper.claim import Comparison
 from rsjax.paper.judge import judge_all
 from rsjax.paper.measurements import measurement
@@ -166,8 +167,13 @@ def main(*argv: object) -> None:
 
 
 def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
-    debug: Path, tmp_path: Path, command: Commands, capsys: pytest.CaptureFixture[str]
+    debug: Path,
+    tmp_path: Path,
+    command: Commands,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(report, "draw", draw)
     options = ("--preset", "debug", "--budget", "3h", "--dir", tmp_path, "--data-dir", command.data)
     main(*options, "--only", "table2", "--dry-run")
     lines = capsys.readouterr().out.splitlines()
