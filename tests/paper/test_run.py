@@ -13,7 +13,8 @@ from rsjax.ablation import sweep
 from rsjax.ablation.figure import draw
 from rsjax.errors import Preempted
 from rsjax.evaluation.statistics import Verdict
-from rsjax.paper import measurements, report
+from rsjax.paper import measurements
+from rsjax.paper import report as page
 from rsjax.paper.claim import Comparison
 from rsjax.paper.judge import judge_all
 from rsjax.paper.measurements import measurement
@@ -173,7 +174,7 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(report, "draw", draw)
+    monkeypatch.setattr(page, "draw", draw)
     options = ("--preset", "debug", "--budget", "3h", "--dir", tmp_path, "--data-dir", command.data)
     main(*options, "--only", "table2", "--dry-run")
     lines = capsys.readouterr().out.splitlines()
