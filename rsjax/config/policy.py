@@ -101,8 +101,8 @@ def tiny() -> PolicyConfig:
 def toy() -> PolicyConfig:
     """Returns a size for tests: seconds."""
     return PolicyConfig(
-        horizon=4,
-        execute=2,
+        horizon=8,
+        execute=4,
         channels=(8,),
         groups=4,
         step_embedding=8,

@@ -200,7 +200,7 @@ def test_impossible_settings_are_named() -> None:
     with pytest.raises(ConfigError, match="policy.horizon is 6; a U-Net of 3 levels takes multiples of 4"):
         PolicyConfig(horizon=6, execute=4)
     with pytest.raises(ConfigError, match="policy.execute is 2; it is a multiple of the 4 controls of a frame"):
-        DiffusionPolicy(toy(), SIZE, 4, WIDTH)
+        DiffusionPolicy(replace(toy(), execute=2), SIZE, 4, WIDTH)
     with pytest.raises(ConfigError, match="no policy size 'tinyy'; did you mean 'tiny'"):
         policy_preset("tinyy")
 
