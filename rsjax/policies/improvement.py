@@ -10,7 +10,7 @@ import numpy as np
 from rsjax.config.policy import PolicyConfig
 from rsjax.data.codec import Record, decode, encode
 from rsjax.errors import UserError
-from rsjax.evaluation.statistics import Estimate, paired_bootstrap, verdict, wilson
+from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wilson
 from rsjax.files import write_file, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.figures import success_curves
@@ -143,12 +143,12 @@ def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demo
 
 
 def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Returns what the last round gained, against before and against the control; episodes are paired by start."""
+    """Returns what the last round gained, against before and against the control."""
     last = {name: np.array([results["rounds"][-1][name]], float) for name in ("imagined", "control")}
     last["before"] = np.array([results["before"]], float)
     found = []
     for one, other in (("imagined", "before"), ("imagined", "control"), ("control", "before")):
-        gap = paired_bootstrap(last[one], last[other])
+        gap = share_difference(last[one], last[other])
         found.append({"compares": [one, other], **asdict(gap), "verdict": verdict(gap)})
     return found
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rsjax.config.policy import PolicyConfig
 from rsjax.errors import UserError
-from rsjax.evaluation.statistics import Estimate, paired_bootstrap, verdict, wilson
+from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wilson
 from rsjax.files import write_file, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.figures import success_curves
@@ -117,7 +117,7 @@ def pooled(row: dict[str, Any]) -> Estimate:
 
 
 def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Returns what the differences between rows say of the paper's claims; episodes are paired by their start."""
+    """Returns what the differences between rows say of the paper's claims."""
     success = {row["name"]: np.array(row["success"], float) for row in rows}
     least = min((row["synthetic"] for row in rows if row["synthetic"] and not row["real"]), default=0)
     wanted = [
@@ -131,7 +131,7 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     found = []
     for claim, one, other, margin in wanted:
         if one != other and one in success and other in success:
-            interval = paired_bootstrap(success[one], success[other])
+            interval = share_difference(success[one], success[other])
             holds = verdict(interval, "higher", margin)
             found.append(
                 {"claim": claim, "compares": [one, other], **asdict(interval), "margin": margin, "verdict": holds}

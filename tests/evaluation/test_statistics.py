@@ -7,6 +7,7 @@ from rsjax.evaluation.statistics import (
     bootstrap,
     over_predicted_frames,
     paired_bootstrap,
+    share_difference,
     verdict,
     welch,
     wilson,
@@ -120,3 +121,14 @@ def test_a_verdict_is_what_the_interval_says(low, high, direction, margin, expec
 def test_clips_that_cannot_be_paired_are_refused(other):
     with pytest.raises(ValueError, match="finite number per seed and clip"):
         paired_bootstrap(np.zeros((2, 3)), other)
+
+
+def test_the_difference_of_shares_is_newcombes_and_tells_nothing_of_few_trials_that_end_alike() -> None:
+    """Newcombe (1998), method 10: 56/70 and 48/80 differ by 0.2, from 0.0524 to 0.3339."""
+    gap = share_difference(np.arange(70) < 56, np.arange(80) < 48)
+    assert (gap.value, gap.low, gap.high) == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
+    alike = share_difference(np.zeros(2), np.zeros(2))
+    assert verdict(alike, "higher", -0.1) == "cannot tell"
+    assert verdict(share_difference(np.zeros(60), np.zeros(60)), "higher", -0.1) == "holds"
+    with pytest.raises(ValueError, match="no share"):
+        share_difference([], [1])

@@ -45,7 +45,8 @@ def test_each_cell_learns_from_its_demonstrations(tmp_path: Path, monkeypatch: p
     success = {row["name"]: np.mean(row["success"]) for row in results["rows"]}
     assert success["synthetic-1"] == success["real-1"] < success["synthetic-4"] == 0.6
     found = {claim["claim"]: claim for claim in results["claims"]}
-    assert found["4 synthetic as good as 4 real"]["verdict"] == "holds"
+    as_good = found["4 synthetic as good as 4 real"]
+    assert (as_good["value"], as_good["verdict"]) == (0, "cannot tell"), "20 trials each are too few for 10 %"
     assert found["more synthetic is better"]["value"] == pytest.approx(success["synthetic-4"] - success["synthetic-1"])
     assert "| synthetic-4 | 4 synthetic | 60 % |" in (out / "results.md").read_text()
     assert (out / "success.png").read_bytes().startswith(b"\x89PNG")
