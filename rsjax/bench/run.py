@@ -145,7 +145,7 @@ def _shown(name: str, value: Any) -> str:
         return f"{value:.2%}"
     if "_flops" in name:
         return f"{value / 1e9:,.1f} GFLOP/s"
-    if name.endswith("_per_s"):
+    if "_per_s" in name:
         return f"{value:,.1f} /s"
     if "_s_" in name or name.endswith("_s"):
         return f"{value:,.3f} s" if value >= 1 else f"{1e3 * value:,.2f} ms"

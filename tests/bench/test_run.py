@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from rsjax.bench import parts
-from rsjax.bench.run import PARTS, bench, ratios, table
+from rsjax.bench.run import PARTS, _shown, bench, ratios, table
 from rsjax.config import Config, ConfigError, presets
 from rsjax.config.leaves import with_values
 from rsjax.errors import UserError
@@ -71,6 +71,19 @@ def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     assert numbers["data_wait_share"] == pytest.approx(numbers["data_wait_s"] / numbers["feed_step_s"])
     peaks = [numbers[f"{part}_peak_memory_bytes"] for part in PARTS]
     assert peaks == sorted(peaks) and numbers["peak_memory_bytes"] >= peaks[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("environment_steps_per_s_64", "73.8 /s"),
+        ("train_tokens_per_s", "73.8 /s"),
+        ("train_step_s", "73.760 s"),
+        ("sample_s_per_frame_cached_16", "73.760 s"),
+    ],
+)
+def test_rates_and_times_have_their_units(name: str, text: str) -> None:
+    assert _shown(name, 73.76) == text
 
 
 def test_the_table_has_a_row_for_every_key(numbers: dict[str, Any]) -> None:
