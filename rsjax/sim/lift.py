@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Float, Int32
 
-from rsjax.config import require
+from rsjax.sim.base import MujocoSim, choose_camera
 from rsjax.sim.gl import choose_gl
-from rsjax.sim.render import Camera, Renderer, View
-from rsjax.sim.scenery import SEEN, Scenery, Variation, aim
+from rsjax.sim.render import Renderer
+from rsjax.sim.scenery import SEEN, Scenery, Variation
 
 TASK = "lift the red cube"
 ANY_TASK = "lift the cube"  # of another colour
@@ -57,7 +57,7 @@ def _yaw(rotation: Float[np.ndarray, "3 3"]) -> float:
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-class LiftSim:
+class LiftSim(MujocoSim):
     """The Lift environment: 20 Hz, 7-D actions in [-1, 1] (6-D change of the goal pose, gripper; +1 closes).
 
     robosuite's OSC_POSE controller pulls the gripper to a goal pose. Its own actions set the goal relative to the pose
@@ -95,21 +95,10 @@ class LiftSim:
             )
         self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
         _compute_once(self._env.sim)
-        self._camera_id = _camera_id(self._model, camera)
+        self._camera_id = choose_camera(self._model, camera, NEAR)
         self._cube_id = self._model.body(CUBE_BODY).id
         self._scenery = Scenery(self._model, self._camera_id, [self._cube_id], CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size)
-
-    def __enter__(self) -> "LiftSim":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Frees the renderer and the simulation."""
-        self._renderer.close()
-        self._env.close()
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
@@ -154,14 +143,6 @@ class LiftSim:
         return bool(self._env._check_success())
 
     @property
-    def camera(self) -> Camera:
-        return Camera(
-            self._data.cam_xpos[self._camera_id].copy(),
-            self._data.cam_xmat[self._camera_id].reshape(3, 3).copy(),
-            float(self._model.cam_fovy[self._camera_id]),
-        )
-
-    @property
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]:
         """Returns where the object and the gripper are, in metres in the world."""
         state = self.state
@@ -185,38 +166,6 @@ class LiftSim:
     def cube_width(self) -> float:
         """Returns the length of the cube's edges in metres."""
         return 2 * float(self._model.geom_size[self._model.body_geomadr[self._cube_id], 0])
-
-    @property
-    def movable(self) -> Bool[np.ndarray, " bodies"]:
-        """Returns whether each body can move at all (is not welded to the world)."""
-        return self._model.body_weldid != 0
-
-    def body_poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3 3"]]:
-        """Returns each body's position in metres and rotation in the world."""
-        return self._data.xpos.copy(), self._data.xmat.reshape(-1, 3, 3).copy()
-
-    def render(self) -> View:
-        """Renders the current frame."""
-        return self._renderer.render(self._data)
-
-    def segment(self) -> Int32[np.ndarray, "S S"]:
-        """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
-        return self._renderer.segment(self._data)
-
-
-def _camera_id(model: Any, name: str) -> int:
-    """Returns a camera's number; "near" takes the place of robosuite's first one.
-
-    Raises:
-        ConfigError: there is no such camera.
-    """
-    names = [model.camera(i).name for i in range(model.ncam)]
-    own, position, target, fovy = NEAR
-    if name != own:
-        require(name in names, f"sim.camera is {name!r}; this scene has {own}, {', '.join(names)}")
-        return names.index(name)
-    aim(model, 0, position, target, fovy)
-    return 0
 
 
 def _compute_once(sim: Any) -> None:

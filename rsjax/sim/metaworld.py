@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Float, Int32
 
-from rsjax.config import require
 from rsjax.errors import UserError
+from rsjax.sim.base import MujocoSim, choose_camera
 from rsjax.sim.gl import choose_gl
-from rsjax.sim.render import Camera, Renderer, View
-from rsjax.sim.scenery import SEEN, Scenery, Variation, aim
+from rsjax.sim.render import Renderer
+from rsjax.sim.scenery import SEEN, Scenery, Variation
 
 CONTROL_HZ = 80
 CENTRE = (0.0, 0.66, 0.1)  # of the workspace, metres
@@ -48,7 +48,7 @@ def load_metaworld() -> tuple[Any, Any]:
     return ALL_V3_ENVIRONMENTS, ENV_POLICY_MAP
 
 
-class MetaworldSim:
+class MetaworldSim(MujocoSim):
     """A task of Meta-World: 80 Hz, 4-D actions in [-1, 1] (position delta of up to 1 cm an axis, gripper; +1 closes).
 
     An episode depends on nothing but the seed of :meth:`reset`. Use as a context manager, or call :meth:`close`.
@@ -73,24 +73,13 @@ class MetaworldSim:
         self._env._partially_observable = False  # the experts look for the goal in the observation,
         del self._env.sawyer_observation_space  # which is clipped to this space
         self._model, self._data = self._env.model, self._env.data
-        self._camera_id = _camera_id(self._model, camera)
+        self._camera_id = choose_camera(self._model, camera, NEAR)
         roots, arm = self._model.body_rootid, self._model.body_rootid[self._model.body("hand").id]
         self.object_bodies: Int32[np.ndarray, " N"] = np.flatnonzero(self.movable & (roots != arm)).astype(np.int32)
         self._scenery = Scenery(self._model, self._camera_id, self.object_bodies.tolist(), CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size, hidden=())
         self.state: Float[np.ndarray, " 39"] = np.zeros(39)
         self.success = False
-
-    def __enter__(self) -> "MetaworldSim":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Frees the renderer and the simulation."""
-        self._renderer.close()
-        self._env.close()
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
         """Begins an episode; the places of objects and goal follow from the seed (0 … 2³² - 1)."""
@@ -126,42 +115,6 @@ class MetaworldSim:
     @property
     def object_width(self) -> float:
         return OBJECT_WIDTH
-
-    @property
-    def camera(self) -> Camera:
-        return Camera(
-            self._data.cam_xpos[self._camera_id].copy(),
-            self._data.cam_xmat[self._camera_id].reshape(3, 3).copy(),
-            float(self._model.cam_fovy[self._camera_id]),
-        )
-
-    @property
-    def movable(self) -> Bool[np.ndarray, " bodies"]:
-        """Returns whether each body can move at all (is not welded to the world)."""
-        return np.array(self._model.body_weldid != 0)
-
-    def body_poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3 3"]]:
-        """Returns each body's position in metres and rotation in the world."""
-        return self._data.xpos.copy(), self._data.xmat.reshape(-1, 3, 3).copy()
-
-    def render(self) -> View:
-        """Renders the current frame."""
-        return self._renderer.render(self._data)
-
-    def segment(self) -> Int32[np.ndarray, "S S"]:
-        """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
-        return self._renderer.segment(self._data)
-
-
-def _camera_id(model: Any, name: str) -> int:
-    """Returns a camera's number; "near" takes the place of Meta-World's first one."""
-    names = [model.camera(i).name for i in range(model.ncam)]
-    own, position, target, fovy = NEAR
-    if name != own:
-        require(name in names, f"sim.camera is {name!r}; this scene has {own}, {', '.join(names)}")
-        return names.index(name)
-    aim(model, 0, position, target, fovy)
-    return 0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rsjax.config import SampleConfig
 from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.maskgit import sample_tokens
-from rsjax.models.roboscape.transformer import Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Transformer, empty_cache, shifted
 from rsjax.models.roboscape.window import window_actions, window_start
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
@@ -79,11 +79,13 @@ def _score_window(
     slots = frames if arch.positions == "learned" else max(arch.frames + 1, frames)
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
+    before = {name: shifted(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}
 
     def score(t: Array) -> tuple[Scores, Scores]:
         frame = {name: jax.lax.dynamic_slice_in_dim(grid, t, 1, axis=1) for name, grid in tokens.items()}
         action = jax.lax.dynamic_slice_in_dim(actions, t, 1, axis=1)
-        logits, _ = transformer(frame, ~visible[:, :1], action, t, cache)
+        previous = {name: jax.lax.dynamic_slice_in_dim(cells, t, 1, axis=1) for name, cells in before.items()}
+        logits, _ = transformer(frame, ~visible[:, :1], action, t, cache, previous=previous)
         likeliest = {
             name: sample_tokens(jax.random.key(0), x, 0.0, arch.code_bits)[0].reshape(frame[name].shape)
             for name, x in logits.items()

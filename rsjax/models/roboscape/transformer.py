@@ -81,12 +81,14 @@ class Transformer(nn.Module):
             float32 logits by branch, and the cache with these frames written in (None without a cache).
 
         Raises:
-            ValueError: actions are missing; ``drop_actions`` is passed to a model without a null action; or the model
-                has no positions for so many frames.
+            ValueError: actions are missing; ``drop_actions`` is passed to a model without a null action; the model has
+                no positions for so many frames; or ``previous`` is missing.
         """
         cfg = self.config
         if drop_actions is not None and not cfg.action_dropout:
             raise ValueError("drop_actions needs a model with a null action: model.action_dropout above 0")
+        if cfg.read_previous and previous is None and not (isinstance(start, int) and start == 0):
+            raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
         cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
         init = nn.initializers.normal(cfg.position_std)

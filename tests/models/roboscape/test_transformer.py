@@ -164,6 +164,11 @@ def test_masked_tokens_are_read_in_the_next_frame_alone_and_only_where_the_model
             assert np.any(before[name][:, 3:] != after[name][:, 3:]) == reads
 
 
+def test_frames_that_do_not_begin_a_clip_need_the_frame_before_them() -> None:
+    with pytest.raises(ValueError, match="pass previous"):
+        apply_plain(READS_PREVIOUS, random_params(READS_PREVIOUS), *random_inputs(READS_PREVIOUS), start=1)
+
+
 def test_every_cell_reads_every_cell_of_its_own_and_earlier_frames() -> None:
     params, (tokens, mask, actions) = random_params(DUAL), random_inputs(DUAL)
     shown = (tokens, np.zeros_like(mask), actions)
