@@ -6,7 +6,10 @@ They are of other data (AgiBot-World), resolution and clips, so they stand besid
 from collections.abc import Mapping
 from typing import Any
 
-SOURCE = "arXiv 2506.23135, on AgiBot-World: other clips, other resolution; not comparable with the columns to the left"
+SOURCE = (
+    "arXiv 2506.23135, on AgiBot-World: other clips, other resolution; not comparable with the columns to the left; "
+    "its Physics-IQ counts the prompt's frame too, as our …_all_frames do"
+)
 COLUMNS = ("lpips", "psnr", "depth_absrel", "depth_delta1", "depth_delta2", "delta_psnr")
 _PHYSICS = ("physics_iq_spatial", "physics_iq_spatiotemporal", "physics_iq_weighted", "physics_iq_mse")
 _TABLE: dict[str, tuple[float | None, ...]] = {

@@ -3,12 +3,13 @@
 Each family is registered under a name. ``Config.model`` is one of them, chosen by the preset or by ``--model NAME``.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, TypeVar
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import ConfigError, loss_weights, require, runtime, sampling
+from rsjax.config.fields import ConfigError, added, loss_weights, require, require_range, runtime, sampling
 from rsjax.errors import did_you_mean
 
 M = TypeVar("M", bound="type[ModelConfig]")
@@ -42,6 +43,11 @@ class ModelConfig:
         :mod:`rsjax.tokenizers.autoencoder` says how a family comes to have one.
         """
         return None
+
+    @property
+    def token_shifts(self) -> tuple[int, ...]:
+        """How many moved copies of a training clip have tokens, and how far they are moved; empty: none."""
+        return ()
 
     @property
     def uses_depth(self) -> bool:
@@ -258,10 +264,14 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     Attributes:
         max_frames: positions in time, and how many frames temporal attention covers; 0: the clips' frames.
+        shifts: copies of each training clip, moved by up to ``shift_pixels``, of which a step draws one or the clip.
+            Few clips last longer with them: a scene that is moved by less than a token has other tokens everywhere.
     """
 
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
+    shifts: int = added(0)
+    shift_pixels: int = added(4)
     mask: MaskConfig = MaskConfig()
     sample: SampleConfig = sampling(SampleConfig())
 
@@ -269,7 +279,12 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
         """Returns the number of positions in time for such clips."""
         return self.max_frames or clips.frames
 
+    @property
+    def token_shifts(self) -> tuple[int, ...]:
+        return (self.shifts, self.shift_pixels) if self.shifts else ()
+
     def check(self, clips: ClipShape) -> None:
+        require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
         require(
             clips.frames <= self.frames(clips),
             f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "

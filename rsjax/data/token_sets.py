@@ -8,14 +8,16 @@ from rsjax.data.store import Store, StoreError, open_store
 FOLDER = "tokens"  # in the store of clips
 
 
-def tokenizer_key(config: Any, weights: str) -> str:
+def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:
     """Returns the key of everything that decides an image's tokens: the tokenizer and how depth becomes an image.
 
     Args:
         config: settings of the tokenizer or of a family's own autoencoder (``Config.autoencoder``).
         weights: fingerprint of the tokenizer's weights.
+        shifts: how many moved copies of a clip there are and how far they are moved, if there are any.
     """
-    return content_key("tokenizer", weights, config.depth_scale if isinstance(config, TokenizerConfig) else config)
+    settings = config.depth_scale if isinstance(config, TokenizerConfig) else config
+    return content_key("tokenizer", weights, settings, *shifts)
 
 
 def tokens_key(clips: str, tokenizer: str) -> str:

@@ -93,7 +93,8 @@ class Run:
         key = self.config.data.key
         if not key or not self.config.model.uses_tokenizer:
             return not key or prepared.get("key") == key
-        tokenizer = tokenizer_key(self.config.autoencoder, str(prepared.get("tokenizer")))
+        shifts = prepared.get("shifts", ())
+        tokenizer = tokenizer_key(self.config.autoencoder, str(prepared.get("tokenizer")), *shifts)
         return prepared.get("key") == tokens_key(key, tokenizer)
 
     def keys(self) -> dict[str, str]:
@@ -103,7 +104,7 @@ class Run:
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
-            "tokens": (),
+            "tokens": cfg.model.token_shifts,
             "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
             "evaluation": (sampling_settings(cfg.model), cfg.eval),
             "report": (),

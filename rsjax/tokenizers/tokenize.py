@@ -6,6 +6,7 @@ tokens instead of pixels; actions stay in the data's units. The manifest lists u
 
 import hashlib
 import os
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rsjax.data.clips import first_clip, readable
 from rsjax.data.codec import Record
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
+from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
 from rsjax.files import lock_file, making
@@ -30,16 +32,26 @@ UNITS = ("action_mean", "action_std", "action_count", "depth_range", "depth_unit
 _LEFT_OUT = "left_out"  # manifest entry: numbers of the clips without tokens by split
 
 
-def tokenize_store(clips: Store, codec: Codec, image_size: int, place: Path, max_damaged: float) -> Store:
+def tokenize_store(
+    clips: Store, codec: Codec, image_size: int, place: Path, max_damaged: float, shifts: tuple[int, ...] = ()
+) -> Store:
     """Makes the tokens of every clip, unless they exist.
 
     Args:
         codec: the trained tokenizer.
         image_size, place, max_damaged: as for :func:`prepare_store`, whose errors it raises.
+        shifts: how many moved copies each training clip has, and how far they are moved at most, in pixels; empty:
+            none.
     """
-    return prepare_store(
-        clips, codec.config, codec.params, lambda clip: token_record(codec, clip), image_size, place, max_damaged
-    )
+
+    def encode(clip: Record) -> Record:
+        return token_record(codec, clip)
+
+    def copies(clip: Record) -> Record:
+        return shifted_tokens(codec, clip, *shifts)
+
+    sized = (image_size, place, max_damaged)
+    return prepare_store(clips, codec.config, codec.params, encode, *sized, copies if shifts else None, shifts)
 
 
 def prepare_store(
@@ -50,6 +62,8 @@ def prepare_store(
     image_size: int,
     place: Path,
     max_damaged: float,
+    more: Callable[[Record], Record] | None = None,
+    more_key: tuple[int, ...] = (),
 ) -> Store:
     """Makes what an autoencoder maps every clip to, unless it exists.
 
@@ -60,6 +74,8 @@ def prepare_store(
         image_size: pixels per side of its images.
         place: a directory for the list of damaged clips, and for the tokens if the store is write-protected.
         max_damaged: the share of a split's clips that may be damaged.
+        more: returns further fields of a training clip's token record.
+        more_key: what these depend on.
 
     Returns:
         The store of tokens.
@@ -72,7 +88,7 @@ def prepare_store(
         raise StoreError(f"{clips.path}: its pictures have {side} pixels a side, the tokenizer takes {image_size}")
     (place / QUARANTINE).unlink(missing_ok=True)  # all clips are checked again
     weights = fingerprint(params)
-    tokenizer = tokenizer_key(config, weights)
+    tokenizer = tokenizer_key(config, weights, *more_key)
     key = tokens_key(str(clips.manifest.get("key")), tokenizer)
     out = beside = clips.path.resolve() / FOLDER / tokenizer
     if _is_made(beside, key, clips):
@@ -81,7 +97,7 @@ def prepare_store(
         out = place.resolve() / "own" / tokenizer
     with making(out, wait=True):
         if not _is_made(out, key, clips):
-            _write(out, clips, encode, {"key": key, "tokenizer": weights})
+            _write(out, clips, encode, more, {"key": key, "tokenizer": weights, "shifts": more_key})
     return _listed(out, clips, max_damaged, place)
 
 
@@ -102,7 +118,13 @@ def _writable(out: Path) -> bool:
     return os.access(parent, os.W_OK) and (not lock.exists() or os.access(lock, os.W_OK))
 
 
-def _write(out: Path, clips: Store, encode: Callable[[Record], Record], keys: dict[str, Any]) -> None:
+def _write(
+    out: Path,
+    clips: Store,
+    encode: Callable[[Record], Record],
+    more: Callable[[Record], Record] | None,
+    keys: dict[str, Any],
+) -> None:
     total = sum(len(clips.source(split)) for split in clips.splits)
     left_out: dict[str, list[int]] = {split: [] for split in clips.splits}
     with Progress("tokens", total, "clips") as progress:
@@ -114,7 +136,7 @@ def _write(out: Path, clips: Store, encode: Callable[[Record], Record], keys: di
             missing = set(range(len(source)))
             for number, clip in readable(source, tell=lambda _: None):
                 missing.remove(number)
-                yield encode(clip)
+                yield encode(clip) | (more(clip) if more and split == "train" else {})
                 done += 1
                 progress.update(done)
             left_out[split] = sorted(missing)
@@ -149,6 +171,23 @@ def token_record(codec: Codec, clip: Record) -> Record:
         "depth": None if clip["depth"] is None else codec.encode_depth(clip["depth"]),
         **described(clip),
     }
+
+
+def shifted_tokens(codec: Codec, clip: Record, count: int, pixels: int) -> Record:
+    """Returns the tokens of a clip's moved copies, which the clip itself decides.
+
+    Returns:
+        ``shifts``, the moves to the right and down in widths of the image (count, 2), and ``rgb_shifted`` and
+        ``depth_shifted``, the copies' tokens (count, T, h, w).
+    """
+    rng = np.random.default_rng(zlib.crc32(clip["rgb"].tobytes()))
+    moves = rng.integers(-pixels, pixels + 1, (count, 2))
+    rgb = codec.encode_rgb(np.stack([moved(clip["rgb"], *move) for move in moves]))
+    depth = clip["depth"]
+    if depth is not None:
+        depth = codec.encode_depth(np.stack([moved(depth, *move) for move in moves]))
+    side = clip["rgb"].shape[2]
+    return {"shifts": (moves / side).astype(np.float32), "rgb_shifted": rgb, "depth_shifted": depth}
 
 
 def described(clip: Record) -> Record:

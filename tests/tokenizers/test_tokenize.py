@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rsjax.data.quarantine import read_quarantine
+from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
 from tests.pipeline import toy
@@ -48,3 +49,18 @@ def test_weights_that_differ_anywhere_have_another_fingerprint() -> None:
     assert fingerprint(params) == fingerprint(other)
     other["b"]["c"][1, 1] += 1e-6  # type: ignore[index, call-overload]
     assert fingerprint(params) != fingerprint(other)
+
+
+def test_training_clips_have_tokens_of_moved_copies_in_a_set_of_their_own(tmp_path: Path) -> None:
+    clips = toy.store(tmp_path / "clips")
+    codec, size = toy.codec(clips), toy.config().clips.image_size
+    plain = tokenized(clips, tmp_path)
+    moved_too = tokenize_store(clips, codec, size, tmp_path, 0.01, (2, 3))
+    assert moved_too.path != plain.path
+    assert "shifts" not in moved_too.source("test")[0]
+    record, clip = moved_too.source("train")[1], clips.source("train")[1]
+    np.testing.assert_array_equal(record["rgb"], plain.source("train")[1]["rgb"])
+    for number, move in enumerate(np.round(record["shifts"] * size).astype(int)):
+        assert abs(move).max() <= 3
+        np.testing.assert_array_equal(record["rgb_shifted"][number], codec.encode_rgb(moved(clip["rgb"], *move)))
+        np.testing.assert_array_equal(record["depth_shifted"][number], codec.encode_depth(moved(clip["depth"], *move)))

@@ -197,8 +197,9 @@ class RoboScape(WorldModel[Batch]):
         return jax.tree.map(lambda x: x.astype("float32"), terms)
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
-        """Makes the tokens of every clip, stored beside the clips for all runs with this tokenizer."""
-        return tokenize_store(clips, self._codec(assets), self.clips.image_size, folder, max_damaged)
+        """Makes the tokens of every clip, stored beside the clips for all runs with this tokenizer and these shifts."""
+        codec, shifts = self._codec(assets), self.config.token_shifts
+        return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 
     def transform(self, normalization: Normalization) -> Transform:
         return partial(records.token_arrays, normalization, self.config.integrate_actions)

@@ -9,6 +9,7 @@ from rsjax.config import ClipShape
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
+from rsjax.data.shift import moved_tracks
 
 
 @struct.dataclass
@@ -47,7 +48,10 @@ def token_arrays(normalization: Normalization, integrate: bool, record: Record, 
     Args:
         normalization: that of the run's own store, even for records of other stores.
         integrate: whether to append the actions' sums (see ``Normalization.action_inputs``).
+        rng: chooses among the clip and its moved copies, if it has any.
     """
+    if "shifts" in record:
+        record = _drawn(record, rng)
     has_depth = record["depth"] is not None
     return {
         "rgb": record["rgb"],
@@ -57,6 +61,15 @@ def token_arrays(normalization: Normalization, integrate: bool, record: Record, 
         "visible": record["visible"],
         "has_depth": np.array(has_depth, np.float32),
     }
+
+
+def _drawn(record: Record, rng: np.random.Generator) -> Record:
+    number = rng.integers(len(record["shifts"]) + 1)
+    if number == 0:
+        return record
+    of = {name: record[f"{name}_shifted"] for name in ("rgb", "depth")}
+    tokens = {name: copies if copies is None else copies[number - 1] for name, copies in of.items()}
+    return record | tokens | moved_tracks(record, record["shifts"][number - 1])
 
 
 def token_batch(arrays: Arrays) -> Batch:

@@ -77,6 +77,6 @@ register(
             for comparison in pairs("RoboScape", name, *_PHYSICS)
         ),
         rank=1,
-        notes=_FAIR,
+        notes=(*_FAIR, "The paper's numbers count the prompt's frame too, ours the predicted frames alone."),
     )
 )

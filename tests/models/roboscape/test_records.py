@@ -56,3 +56,20 @@ def test_an_example_of_the_model_makes_a_batch_and_its_transform_can_be_sent_to_
     batch = model.batch({name: array[None] for name, array in arrays.items()})
     assert batch.rgb.shape == batch.depth.shape == (1, 6, 8, 8)
     assert batch.actions.shape == (1, 6, model.architecture.action_inputs)
+
+
+def test_a_draw_takes_the_clip_or_one_of_its_moved_copies(record: Record) -> None:
+    copies = np.stack([record["rgb"] + 1000, record["rgb"] + 2000])
+    moves = np.array([[0.25, 0.0], [0.0, -0.25]], np.float32)
+    with_copies = record | {"shifts": moves, "rgb_shifted": copies, "depth_shifted": copies + 1}
+    seen = set()
+    for seed in range(20):
+        arrays = token_arrays(NORMALIZATION, True, with_copies, np.random.default_rng(seed))
+        number = int(arrays["rgb"].flat[0]) // 1000
+        np.testing.assert_array_equal(arrays["rgb"], record["rgb"] + 1000 * number)
+        np.testing.assert_array_equal(arrays["depth"], arrays["rgb"] + 1)
+        if number:
+            moved = record["tracks"] + moves[number - 1]
+            np.testing.assert_allclose(arrays["tracks"][arrays["visible"]], moved[arrays["visible"]], atol=1e-6)
+        seen.add(number)
+    assert seen == {0, 1, 2}
