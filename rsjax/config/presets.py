@@ -90,6 +90,7 @@ def tiny() -> Config:
             heads=4,
             integrate_actions=True,
             read_previous=True,
+            shifts=3,
             temporal_norm=True,
             final_norm=True,
             embed_std=0.5,
