@@ -19,9 +19,9 @@ train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
 test: setup  ## the tests
 	@$(python) -m pytest -n $(JOBS) $(ARGS)
 
-extras: setup  ## the optional packages (networks, PyTorch, Rerun), and the tests that want them
+extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
 	@scripts/extras.sh "$(VENV)"
-	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun)' tests) $(ARGS)
+	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright)' tests) $(ARGS)
 
 lint: setup  ## ruff and mypy
 	@$(python) -m ruff check

@@ -43,5 +43,10 @@ fi
 echo "extras: installing the packages of requirements-extras.txt (about 1.7 GB)"
 "$base/bin/python" -m pip --python "$python" install --quiet --progress-bar off "${index[@]}" -r requirements-extras.txt ||
     stop "pip could not install requirements-extras.txt, which needs a package index and 1.7 GB of disk; see its lines above"
+if ! command -v chromium >/dev/null; then
+    echo "extras: installing Chromium for the tests of pages"
+    scripts/apt.sh chromium ||
+        echo "extras: without Chromium the tests of pages are skipped; install it: apt-get install chromium" >&2
+fi
 key >"$stamp"
 echo "extras: $venv is ready"

@@ -55,13 +55,15 @@ def _figure(result: evaluation.Evaluation, row: int, config: Config) -> ClipFigu
         tracks, visible = shown["tracks"][row], shown["visible"][row]
         chosen = np.argsort(-np.asarray(motion_magnitude(tracks, visible)))[: config.model.marked_keypoints]
         arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
-    title = f"test clip {int(shown['clip'][row])}: {shown['task'][row] or 'no task named'}"
+    label = f"test clip {int(shown['clip'][row])}"
+    title = f"{label}: {shown['task'][row] or 'no task named'}"
     if shown["success"].any():  # otherwise success may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
     if "rank" in shown:  # not in files of earlier versions
-        title += f", {_rank(int(shown['rank'][row]), int(result.metrics['clips']))}: {shown['psnr'][row]:.1f} dB"
+        rank, score = _rank(int(shown["rank"][row]), int(result.metrics["clips"])), f"{shown['psnr'][row]:.1f} dB"
+        title, label = f"{title}, {rank}: {score}", f"{rank.split(' of ')[0]}, {score}"
     unit = "metres" if shown.get("metric", shown["has_depth"])[row] else "relative"
-    return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, **arrays)
+    return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, label=label, **arrays)
 
 
 def _rank(rank: int, clips: int) -> str:

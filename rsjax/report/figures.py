@@ -40,6 +40,7 @@ class ClipFigure:
         visible: as in :class:`rsjax.clip.Clip`.
         selected: indices of the top-K tracks by motion.
         prompt_frames: number of recorded frames that generation starts from.
+        label: a short name for lists of clips.
 
     Raises:
         ValueError: the shape of an array does not fit the truth's.
@@ -57,6 +58,7 @@ class ClipFigure:
     selected: Int[np.ndarray, " K"] | None = None
     prompt_frames: int = 1
     depth_unit: str = "metres"
+    label: str = ""
 
     def __post_init__(self) -> None:
         shape = self.truth.shape

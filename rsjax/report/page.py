@@ -1,4 +1,4 @@
-"""Writes a run's HTML report: one self-contained page without scripts."""
+"""Writes a run's HTML report: one self-contained page, whose only script plays the clips."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,13 +13,13 @@ from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.report.curves import curves_svg
-from rsjax.report.figures import ClipFigure, animation, filmstrip, keypoints
+from rsjax.report.figures import ClipFigure, filmstrip, keypoints
+from rsjax.report.player import player_clip, player_script, player_style
 from rsjax.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg
 from rsjax.report.targets import judge
-from rsjax.report.video import animation_uri, webp_uri
+from rsjax.report.video import webp_uri
 
-_HEADLINE_CLIPS = 2  # clips whose animations head the page
-_FPS = 4.0
+_FPS = 4  # at which the player starts; one of its rates
 
 Row = tuple[str, str]
 Column = tuple[str, str, int]
@@ -52,7 +52,7 @@ class Report:
         metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` bound the 95 % interval of ``name``. The page
             lists all of them, and tabulates those of its columns.
         reasons: why a metric is absent, by name; footnotes of its cells.
-        clips: test clips; the first ones head the page.
+        clips: test clips; the player that heads the page opens with the first one.
         curves: scores at each predicted frame, as in curves.json.
         per_clip: the scores of single clips by name, of which the errors of places are drawn.
         logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
@@ -92,7 +92,9 @@ def write_report(path: Path, report: Report) -> None:
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
         report=report,
-        headline=_HEADLINE_CLIPS,
+        gallery={"rate": _FPS, "clips": [player_clip(clip) for clip in report.clips]},
+        player_script=Markup(player_script()),
+        player_style=Markup(player_style()),
         clips=[_clip_pictures(clip) for clip in report.clips],
         scores=_table(report, notes, _SCORE_ROWS, _columns(metric for metric in shown if metric not in places)),
         depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
@@ -129,7 +131,6 @@ def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
     has_depth = clip.true_depth is not None or clip.predicted_depth is not None
     return {
         "title": clip.title,
-        "animation": animation_uri(animation(clip), _FPS),
         "filmstrip": webp_uri(filmstrip(clip)),
         "keypoints": None if clip.tracks is None else webp_uri(keypoints(clip)),
         "depth_range": clip.depth_range() if has_depth else None,

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -52,11 +53,22 @@ def write_gif(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
     write_file(path, _encode_animation("GIF", resize(frames, upscale, "nearest"), fps))
 
 
-def webp_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
+def webp_uri(image: UInt8[np.ndarray, "H W 3"], quality: int = 90) -> str:
     """Returns an RGB image as a lossy ``data:image/webp`` URI, about a tenth the size of a PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", quality=90)
+    Image.fromarray(image).save(buffer, "WEBP", quality=quality)
     return _webp_uri(buffer.getvalue())
+
+
+def sprite_uri(frames: UInt8[np.ndarray, "T H W 3"]) -> str:
+    """Returns frames as one ``data:image/webp`` URI: a near-square of tiles, row by row, the rest black."""
+    count, height, width, _ = frames.shape
+    columns = math.ceil(math.sqrt(count))
+    lines = -(-count // columns)
+    tiles = np.zeros((lines * columns, height, width, 3), np.uint8)
+    tiles[:count] = frames
+    sheet = tiles.reshape(lines, columns, height, width, 3).swapaxes(1, 2)
+    return webp_uri(sheet.reshape(lines * height, columns * width, 3), quality=95)
 
 
 def animation_uri(frames: UInt8[np.ndarray, "T H W 3"], fps: float) -> str:
