@@ -1,44 +1,64 @@
-// The list of branches: a bar over their frames for each, from where it left another.
+// The list of branches: for each a bar over its frames, from where it left another.
 import { element } from "./player/dom.js";
+
+const INDENT = 0.6; // rem
+const DEEPEST = 6; // steps of indentation
 
 /**
  * Makes the list.
  * @param open called with a branch to drive, compare with one to show beside it (or null), drop with one to remove.
  */
 export function makeBranches({ host, open, compare, drop }) {
+  const rows = new Map(); // kept while their branches last, so that buttons keep the focus
+
   function draw(tree, current, beside, frame) {
-    const longest = Math.max(2, ...[...tree.branches.values()].map(({ length }) => length));
-    host.replaceChildren(...tree.ordered().map((each) => row(each, tree, { current, beside, frame, longest })));
+    const all = tree.ordered();
+    const longest = Math.max(2, ...all.map(({ length }) => length));
+    const parents = new Set(all.map(({ parent }) => parent));
+    for (const branch of rows.keys()) if (!tree.branches.has(branch)) rows.delete(branch);
+    for (const each of all) {
+      if (!rows.has(each.branch)) rows.set(each.branch, makeRow(each.branch));
+      rows.get(each.branch).show(each, { current, beside, frame, longest, leaf: !parents.has(each.branch) });
+    }
+    const items = all.map(({ branch }) => rows.get(branch).item);
+    if (items.length !== host.children.length || items.some((item, place) => item !== host.children[place])) {
+      host.replaceChildren(...items);
+    }
   }
 
-  function row(each, tree, { current, beside, frame, longest }) {
-    const { branch, parent, fork, length, depth } = each;
-    const from = parent === null ? 0 : fork;
-    const bar = element("i", { class: "bar" });
-    bar.style.marginLeft = `${(100 * from) / longest}%`;
-    bar.style.width = `${Math.max(1.5, (100 * (length - from)) / longest)}%`;
-    const cursor = branch === current ? element("i", { class: "here" }) : null;
-    if (cursor) cursor.style.left = `${(100 * Math.min(frame + 0.5, length)) / longest}%`;
-    const text = parent === null ? "start" : `from frame ${fork + 1} of ${parent}`;
-    const leaf = parent !== null && ![...tree.branches.values()].some((other) => other.parent === branch);
+  function makeRow(branch) {
+    let shown = false; // beside the current one
+    const [name, count] = [element("span", {}), element("span", { class: "faint" })];
+    const [bar, here] = [element("i", { class: "bar" }), element("i", { class: "here" })];
     const main = element(
       "button",
-      { type: "button", class: "branch", "aria-pressed": branch === current, onclick: () => open(branch) },
-      element("span", { class: "branch-name" }, element("b", {}, `${branch}`), ` ${text}`),
-      element("span", { class: "faint" }, `${length} frames`),
-      element("span", { class: "track" }, bar, cursor),
+      { type: "button", class: "branch", onclick: () => open(branch) },
+      element("span", { class: "branch-name" }, element("b", {}, `${branch}`), " ", name),
+      count,
+      element("span", { class: "track" }, bar, here),
     );
-    main.style.marginLeft = `${Math.min(depth, 6) * 0.6}rem`;
-    const side = element(
-      "button",
-      { type: "button", class: "small", "aria-pressed": branch === beside, disabled: branch === current, "aria-label": `show branch ${branch} beside`,
-        title: "show beside", onclick: () => compare(branch === beside ? null : branch) },
-      "beside",
-    );
-    const remove = leaf
-      ? element("button", { type: "button", class: "small", "aria-label": `remove branch ${branch}`, title: "remove", onclick: () => drop(branch) }, "✕")
-      : null;
-    return element("li", {}, main, side, remove);
+    const small = { type: "button", class: "small" };
+    const label = `show branch ${branch} beside`;
+    const side = element("button", { ...small, "aria-label": label, onclick: () => compare(shown ? null : branch) }, "beside");
+    const remove = element("button", { ...small, "aria-label": `remove branch ${branch}`, onclick: () => drop(branch) }, "✕");
+
+    function show({ parent, fork, length, depth }, { current, beside, frame, longest, leaf }) {
+      const from = parent === null ? 0 : fork;
+      const percent = (frames) => `${(100 * frames) / longest}%`;
+      shown = branch === beside;
+      name.textContent = parent === null ? "start" : `from frame ${fork + 1} of ${parent}`;
+      count.textContent = `${length} frames`;
+      main.style.marginLeft = `${Math.min(depth, DEEPEST) * INDENT}rem`;
+      main.setAttribute("aria-pressed", branch === current);
+      side.setAttribute("aria-pressed", shown);
+      side.disabled = branch === current;
+      remove.hidden = parent === null || !leaf;
+      [bar.style.marginLeft, bar.style.width] = [percent(from), percent(length - from)];
+      here.hidden = branch !== current;
+      here.style.left = percent(Math.min(frame + 0.5, length));
+    }
+
+    return { item: element("li", {}, main, side, remove), show };
   }
 
   return { draw };

@@ -196,6 +196,5 @@ function keyList(controls, keysOf, toggles) {
 export function keepsKey({ target, code }) {
   if (!takesKeys(target)) return target.closest?.("button, summary, a") && ["Space", "Enter"].includes(code);
   if (target.closest("dialog")) return true;
-  const letters = target.matches("input[type=range], input[type=checkbox], select") && /^(Key|Digit|Shift)/.test(code);
-  return !letters || (target.matches("select") && code.startsWith("Key"));
+  return !target.matches("input[type=range], input[type=checkbox], select") || !/^(Key|Digit|Shift)/.test(code);
 }

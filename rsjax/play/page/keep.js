@@ -1,6 +1,7 @@
 // What is kept: a video, clips of a store, and a link.
 import { address } from "./connection.js";
 import { element } from "./player/dom.js";
+import { note } from "./state.js";
 
 function select(name, values) {
   return element("select", { "aria-label": name }, ...values.map(([value, text]) => element("option", { value }, text)));
@@ -11,7 +12,7 @@ function select(name, values) {
  * @param call sends a message and returns the promise of its answer.
  * @param view returns {branch, beside, truth, depth}: what is shown now.
  */
-export function makeKeep({ host, call, view, fps, note }) {
+export function makeKeep({ host, call, view, fps }) {
   const format = select("format", [["mp4", "MP4"], ["gif", "GIF"]]);
   const scale = select("size", [[4, "4 × as large"], [1, "as it is"], [2, "2 ×"], [8, "8 ×"]]);
   const rate = element("input", { type: "number", min: 1, max: 60, step: 1, value: Math.max(1, Math.round(fps)), "aria-label": "frames a second" });

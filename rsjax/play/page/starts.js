@@ -62,5 +62,11 @@ export function makeStarts({ start, upload, note }) {
   file.addEventListener("change", take);
   document.getElementById("restart").addEventListener("click", () => begin(last));
   document.getElementById("open-clips").addEventListener("click", open);
-  return { open, setSeed: (value) => (seed.value = value), setLast: (fields) => (last = fields), last: () => last };
+  /** Shows what a session began from. */
+  function taken({ seed: number, start: from }) {
+    seed.value = number;
+    last = from.clip === undefined ? { upload: true } : { clip: from.clip };
+  }
+
+  return { open, taken, last: () => last };
 }
