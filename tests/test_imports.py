@@ -28,6 +28,7 @@ ORDER = [
     "report",
     "pipeline",
     "policies",
+    "play",
     "ablation",
     "compare",
     "paper",

@@ -19,6 +19,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.models.moments import Branching
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Params, Trainable
@@ -194,6 +195,18 @@ class WorldModel(Trainable[B], Protocol[B]):
             UserError: the family does not implement it.
         """
         raise UserError(f"{type(self).__name__} cannot generate frame by frame, so it cannot be an environment")
+
+    def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> Branching:
+        """Returns what generates clips that branch.
+
+        Args:
+            has_depth: whether first frames have depth.
+            lanes: clips that one pass generates.
+
+        Raises:
+            UserError: the family does not implement it.
+        """
+        raise UserError(f"a model of family {self.config.model.family!r} cannot generate frame by frame")
 
     def reconstruct(self, assets: Assets, video: Video) -> Video | None:
         """Returns a video's reconstruction from the model's tokens or latents, the upper bound of its quality.

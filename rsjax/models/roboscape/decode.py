@@ -31,6 +31,8 @@ class Decoder:
         actions: into all frames.
         keys: one per clip.
         no_depth: True for clips without depth.
+        temperature: of each clip, above 0, in place of that of ``sample``.
+        entropy: whether :meth:`decode_pair` gives its frame's entropy.
     """
 
     arch: Architecture
@@ -39,6 +41,8 @@ class Decoder:
     actions: Float[Array, "B T A"]
     keys: Key[Array, " B"]
     no_depth: Bool[Array, " B"] | None
+    temperature: Float[Array, " B"] | None = None
+    entropy: bool = False
 
     def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Cache]) -> tuple[Cells, Cache]:
         """Decodes frame t with the cache of frames before t-1: one pass over (t-1, t), then passes over t.
@@ -78,7 +82,8 @@ class Decoder:
         mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
         previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
         logits, cache = self.apply(pair, mask, actions, position - 1, cache, previous=previous)
-        frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1])
+        entropy = jnp.zeros((b, cells)) if self.entropy else None
+        frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1], entropy)
         frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
         previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
@@ -124,7 +129,8 @@ class Decoder:
         return jax.vmap(lambda key: step_keys(self.sample, key, t))(self.keys)
 
     def _unmask(self, keys: Array, step: Array | int, frame: Frame, logits: dict[str, Array]) -> Frame:
-        return unmask_step(self.sample, self.arch.code_bits, keys, step, frame, logits, self.no_depth)
+        clips = (keys, step, frame, logits, self.no_depth, self.temperature)
+        return unmask_step(self.sample, self.arch.code_bits, *clips)
 
 
 def step_keys(sample: SampleConfig, key: Key[Array, ""], t: Array | int) -> Key[Array, " steps"]:

@@ -29,6 +29,7 @@ def apply_guided(
     cache: Cache | None,
     no_depth: Bool[Array, " B"] | None = None,
     previous: dict[str, Int[Array, "B T S"]] | None = None,
+    strength: Float[Array, " B"] | None = None,
 ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
     """Returns logits without + g·(with - without the actions), g = ``sample.guidance``, and the cache.
 
@@ -37,6 +38,7 @@ def apply_guided(
         cache: from :func:`guided_cache` or an earlier call.
         no_depth: True for clips whose depth is hidden, as in :class:`rsjax.models.roboscape.transformer.Transformer`.
         previous: tokens of the frame before each of these, likewise.
+        strength: g of each clip in place of ``sample.guidance``, which still decides whether there is guidance.
     """
     b, drop = len(mask), None
     if sample.guidance != 1:
@@ -45,7 +47,8 @@ def apply_guided(
         drop = jnp.arange(2 * b) >= b
     logits, cache = _apply(arch, params, tokens, mask, actions, start, cache, drop, no_depth, previous)
     if drop is not None:
-        logits = {name: x[b:] + sample.guidance * (x[:b] - x[b:]) for name, x in logits.items()}
+        g = sample.guidance if strength is None else strength[:, None, None, None, None]
+        logits = {name: x[b:] + g * (x[:b] - x[b:]) for name, x in logits.items()}
     return logits, cache
 
 

@@ -21,10 +21,15 @@ from rsjax.tokenizers import lfq
 
 @struct.dataclass
 class Frame:
-    """A partly decoded frame: tokens by branch, and the cells that are still masked."""
+    """A partly decoded frame: tokens by branch, and the cells that are still masked.
+
+    Attributes:
+        entropy: of the RGB tokens in nats, in the step that decided each cell; None: not asked for.
+    """
 
     tokens: dict[str, Int[Array, "*B S"]]
     mask: Bool[Array, "*B S"]
+    entropy: Float[Array, "*B S"] | None = None
 
 
 def masked_after(steps: int, cells: int) -> Int[np.ndarray, " K"]:
@@ -38,12 +43,16 @@ def masked_after(steps: int, cells: int) -> Int[np.ndarray, " K"]:
 
 
 def sample_tokens(
-    key: Key[Array, ""], logits: Float[Array, "*B S n V"], temperature: float, code_bits: int, top_k: int = 0
+    key: Key[Array, ""],
+    logits: Float[Array, "*B S n V"],
+    temperature: float | Float[Array, ""],
+    code_bits: int,
+    top_k: int = 0,
 ) -> tuple[Int[Array, "*B S"], Float[Array, "*B S"]]:
     """Draws a token per cell.
 
     Args:
-        temperature: logits are divided by it; 0 takes each vocabulary's most probable code.
+        temperature: logits are divided by it; 0 takes each vocabulary's most probable code. An array is above 0.
         top_k: draw from the ``top_k`` most probable codes of each vocabulary (and ties with the last of them); 0: from
             all.
 
@@ -51,12 +60,18 @@ def sample_tokens(
         Tokens, and their log-probabilities: the sum over vocabularies, in nats, at temperature 1, without ``top_k``.
     """
     log_p = jax.nn.log_softmax(logits, axis=-1)
-    if temperature == 0:
+    if not isinstance(temperature, jax.Array) and temperature == 0:
         codes = jnp.argmax(logits, -1)
     else:
         codes = jax.random.categorical(key, keep_top(logits, top_k) / temperature, axis=-1)
     confidence = jnp.take_along_axis(log_p, codes[..., None], axis=-1)[..., 0].sum(-1)
     return lfq.merge_tokens(codes.astype(jnp.int32), code_bits), confidence
+
+
+def token_entropy(logits: Float[Array, "*B n V"]) -> Float[Array, "*B"]:
+    """Returns the entropy of tokens in nats, the sum over their vocabularies."""
+    log_p = jax.nn.log_softmax(logits, axis=-1)
+    return -jnp.sum(jnp.exp(log_p) * log_p, axis=(-2, -1))
 
 
 def keep_top(logits: Float[Array, "*N V"], top_k: int) -> Float[Array, "*N V"]:
@@ -75,6 +90,7 @@ def unmask_step(
     frame: Frame,
     logits: dict[str, Float[Array, "B S n V"]],
     no_depth: Bool[Array, " B"] | None = None,
+    temperature: Float[Array, " B"] | None = None,
 ) -> Frame:
     """Does one decoding step: fills the masked cells, then masks some of them again as the schedule says.
 
@@ -85,8 +101,9 @@ def unmask_step(
         keys: one per clip.
         logits: of this frame, by branch.
         no_depth: True for clips without depth, whose depth tokens are meaningless.
+        temperature: above 0, of each clip, in place of that of ``config``.
     """
-    return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth)
+    return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth, temperature)
 
 
 def _unmask_clip(
@@ -97,15 +114,19 @@ def _unmask_clip(
     frame: Frame,
     logits: dict[str, Array],
     no_depth: Array | None,
+    temperature: Array | None,
 ) -> Frame:
     order_key, *branch_keys = jax.random.split(key, len(logits) + 1)
-    tokens, confidence = {}, jnp.zeros(frame.mask.shape)
+    tokens, confidence, entropy = {}, jnp.zeros(frame.mask.shape), frame.entropy
+    temperature = config.temperature if temperature is None else temperature
+    if entropy is not None:
+        entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
     for branch_key, (branch, branch_logits) in zip(branch_keys, logits.items(), strict=True):
-        drawn, log_p = sample_tokens(branch_key, branch_logits, config.temperature, code_bits, config.top_k)
+        drawn, log_p = sample_tokens(branch_key, branch_logits, temperature, code_bits, config.top_k)
         tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
         confidence += log_p if branch == "rgb" or no_depth is None else jnp.where(no_depth, 0.0, log_p)
     if config.unmask == "random":
         confidence = jax.random.uniform(order_key, frame.mask.shape)
     # Cells that are already decided stay decided: they get the highest rank.
     rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
-    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step])
+    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step], entropy)

@@ -24,6 +24,7 @@ from rsjax.data.store import Store
 from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
 from rsjax.models.roboscape import masking, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.branching import TokenBranching
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.imagine import Imagined
@@ -236,6 +237,10 @@ class RoboScape(WorldModel[Batch]):
 
     def imagine(self, params: Params, assets: Assets, clips: int) -> Imagined:
         return Imagined(self.config, self.architecture, self._codec(assets), params, clips)
+
+    def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> TokenBranching:
+        codec = self._codec(assets)
+        return TokenBranching(self.config, self.architecture, codec, params, has_depth, lanes)
 
     def reconstruct(self, assets: Assets, video: Video) -> Video:
         codec = self._codec(assets)

@@ -32,6 +32,17 @@ class Network(NamedTuple):
     arch: Architecture
     sample: SampleConfig
     has_depth: bool  # False: no clip has depth, and a depth branch sees it masked
+    entropy: bool = False  # whether a state has that of its last frame's tokens
+
+
+class Dials(NamedTuple):
+    """Settings of each clip in place of those of ``Network.sample``, so that other values need no other program.
+
+    They cannot switch on what the program leaves out: drawing if the temperature is 0, guidance if it is 1.
+    """
+
+    temperature: Float[Array, " B"]
+    guidance: Float[Array, " B"]
 
 
 @struct.dataclass
@@ -46,6 +57,7 @@ class State:
         position: the next frame's in its window.
         frame: the next frame's number in its clip.
         key: decides each clip's draws.
+        entropy: of the last frame's RGB tokens in nats; None unless the network says so.
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -55,9 +67,10 @@ class State:
     position: Int[Array, " B"]
     frame: Int[Array, " B"]
     key: Key[Array, " B"]
+    entropy: Float[Array, "B S"] | None = None
 
 
-AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0)  # type: ignore[arg-type]  # of clips
+AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, entropy=0)  # type: ignore[arg-type]  # of clips
 
 
 def remembered_frames(net: Network) -> int:
@@ -84,6 +97,7 @@ def begin(net: Network, clips: int) -> State:
         position=numbers,
         frame=numbers,
         key=jax.random.split(jax.random.key(0), clips),
+        entropy=jnp.zeros((clips, arch.grid**2)) if net.entropy else None,
     )
 
 
@@ -114,33 +128,40 @@ def restart(
     )
 
 
-def advance(net: Network, params: Params, state: State, actions: Float[Array, "B A"]) -> State:
+def advance(
+    net: Network, params: Params, state: State, actions: Float[Array, "B A"], dials: Dials | None = None
+) -> State:
     """Decodes the next frame of every clip; its tokens are ``state.tokens[name][:, -1]`` then.
 
     Args:
         actions: the row into that frame, as in a whole clip's inputs.
+        dials: each clip's settings; None: those of the network.
     """
     if net.arch.positions == "learned":
         full = state.position == net.arch.frames
         moved = jax.vmap(partial(_move_window, net, params), in_axes=(AXES, 0), out_axes=AXES)
         state = jax.lax.cond(full.any(), moved, lambda kept, full: kept, state, full)
-    return jax.vmap(partial(_decode, net, params), in_axes=(AXES, 0), out_axes=AXES)(state, actions)
+    return jax.vmap(partial(_decode, net, params), in_axes=(AXES, 0, 0), out_axes=AXES)(state, actions, dials)
 
 
-def _decoder(net: Network, params: Params) -> Decoder:
+def _decoder(net: Network, params: Params, dials: Dials | None = None) -> Decoder:
+    """Returns a decoder of one clip."""
     hidden = jnp.ones(1, bool) if net.arch.use_depth and not net.has_depth else None
     unread: Any = None  # decode_pair takes one frame's actions and keys itself
-    apply = partial(apply_guided, net.arch, net.sample, params, no_depth=hidden)
-    return Decoder(net.arch, net.sample, apply, unread, unread, hidden)
+    guided, drawn = net.sample.guidance != 1, net.sample.temperature != 0
+    strength = dials.guidance[None] if dials is not None and guided else None
+    temperature = dials.temperature[None] if dials is not None and drawn else None
+    apply = partial(apply_guided, net.arch, net.sample, params, no_depth=hidden, strength=strength)
+    return Decoder(net.arch, net.sample, apply, unread, unread, hidden, temperature, net.entropy)
 
 
-def _decode(net: Network, params: Params, state: State, actions: Float[Array, " A"]) -> State:
+def _decode(net: Network, params: Params, state: State, actions: Float[Array, " A"], dials: Dials | None) -> State:
     """Decodes one clip's next frame; without the axis over clips."""
     pair = {name: jnp.stack([grid[-1], grid[-1]])[None] for name, grid in state.tokens.items()}
     rows = _window_rows(net.arch, jnp.stack([state.actions[-1], actions]), state.base, state.position - 1)[None]
     keys = step_keys(net.sample, state.key, state.frame)[None]
     before = {name: grid[-2:-1] if len(grid) > 1 else grid for name, grid in state.tokens.items()}
-    frame, cache = _decoder(net, params).decode_pair(pair, before, rows, state.position, keys, state.cache)
+    frame, cache = _decoder(net, params, dials).decode_pair(pair, before, rows, state.position, keys, state.cache)
     return replace(
         state,
         tokens={name: jnp.append(grid[1:], frame.tokens[name], axis=0) for name, grid in state.tokens.items()},
@@ -148,6 +169,7 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
         cache=cache,
         position=state.position + 1,
         frame=state.frame + 1,
+        entropy=None if frame.entropy is None else frame.entropy[0],
     )
 
 

@@ -1,0 +1,60 @@
+"""Steers the robot inside generated video, in a browser. ``python -m experiments.play runs/tiny``"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from experiments.cli import main_errors, parse_options
+from rsjax.runtime import tune_process
+
+
+@dataclass(frozen=True)
+class Options:
+    """Opens a page in which a person drives the robot, and the run's model dreams what follows (docs/play.md)."""
+
+    run: tyro.conf.Positional[Path] = tyro.MISSING
+    """A run directory, made by experiments.train."""
+    data_dir: Path = Path("data")
+    """Directory of simulated data sets."""
+    store: Path | None = None
+    """The new path of the run's store of ingested clips, if it was moved."""
+    split: Literal["test", "train"] = "test"
+    """The clips to begin with."""
+    policy: Path | None = None
+    """A policy that can take the stick, made by experiments.policy_learning."""
+    host: str = "127.0.0.1"
+    """The address to listen at; any but this machine's own demands a token, which is printed with the address."""
+    port: int = 8642
+    """The port; 0: a free one."""
+    sessions: int = 8
+    """Viewers at a time."""
+    idle_minutes: float = 10.0
+    """Minutes after which a session that nobody uses is freed."""
+    lanes: int = 1
+    """Frames of different sessions that one pass generates: more on a GPU. Other numbers give other last bits."""
+    browser: bool = True
+    """Open the page in a browser, where there is a display."""
+
+
+@main_errors()
+def main() -> None:
+    """Serves the page until Ctrl-C."""
+    tune_process()
+    options = parse_options(sys.argv[1:], "python -m experiments.play", Options.__doc__ or "", Options())
+    try:
+        from rsjax.play.serve import ServeSettings, serve
+    except ModuleNotFoundError as error:
+        from rsjax.errors import UserError
+
+        raise UserError(f"{error.name} is not installed; make setup installs it, or pip install rsjax[play]") from error
+    from rsjax.policies.run_data import RunData
+
+    how = (options.host, options.port, options.sessions, options.idle_minutes, options.lanes, options.browser)
+    serve(RunData(options.run, options.data_dir, options.store), options.policy, options.split, ServeSettings(*how))
+
+
+if __name__ == "__main__":
+    main()

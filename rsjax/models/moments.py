@@ -1,0 +1,87 @@
+"""The interface of models that go on from any frame of a clip, in several ways: what ``experiments.play`` needs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from rsjax.clip import Video
+
+
+@dataclass(frozen=True)
+class Decoding:
+    """How one frame is decoded.
+
+    Attributes:
+        steps, temperature, guidance, top_k: as in :class:`rsjax.config.SampleConfig`.
+        seed, draw: decide the random draws together with the frame's number, each from 0 to 2³² - 1. With the seed of
+            the model's settings and a clip's number as draw, they are those of :meth:`WorldModel.generate`.
+    """
+
+    steps: int
+    temperature: float = 0.0
+    guidance: float = 1.0
+    top_k: int = 0
+    seed: int = 0
+    draw: int = 0
+
+    @property
+    def program(self) -> tuple[int, int, bool]:
+        """What frames must have in common to be made in one pass."""
+        return self.steps, self.top_k, self.temperature > 0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A frame of a clip, and what the next one is generated from.
+
+    Attributes:
+        rgb: the frame.
+        tokens: its tokens by branch, (S,).
+        entropy: of each RGB token when it was decided, in nats, (S,); None for a first frame.
+        memory: the family's own; None if it was used up.
+        size: bytes of the part of it that :meth:`Branching.lightened` leaves out.
+    """
+
+    rgb: UInt8[np.ndarray, "H W 3"]
+    tokens: dict[str, Int[np.ndarray, " S"]]
+    entropy: Float[np.ndarray, " S"] | None
+    memory: Any
+    size: int = 0
+
+
+class Branching(Protocol):
+    """Generates clips frame by frame, each of which may go on from any of its frames in several ways."""
+
+    lanes: int  # clips that one pass generates
+
+    def begin(self, first: Video) -> Moment:
+        """Returns the first frame of a clip, (1, 1, …), as the model sees it."""
+        ...
+
+    def advance(
+        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[Moment]:
+        """Generates the frames after these, at most ``lanes``, and uses up their memories.
+
+        A frame has the same bits whatever else is in its pass.
+
+        Args:
+            moments: with memories.
+            actions: in the recording's units.
+            decodings: with the same ``program``.
+        """
+        ...
+
+    def lightened(self, moment: Moment) -> Moment:
+        """Returns a moment with a small memory, which :meth:`advance` does not use up, or with none.
+
+        A first frame has one, and later ones now and then; what follows has the same bits.
+        """
+        ...
+
+    def depth(self, tokens: dict[str, Int[np.ndarray, " S"]]) -> Float32[np.ndarray, "H W"] | None:
+        """Returns a frame's depth in metres; None if its clip has none."""
+        ...

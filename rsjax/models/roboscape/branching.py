@@ -1,0 +1,161 @@
+"""Goes on from any frame of any clip: implements :class:`rsjax.models.moments.Branching` for models of tokens.
+
+Every pass is of one number of clips, the lanes, filled up by repetition: floating-point sums of another number differ
+in their last bit, and here a frame has the same bits whoever shares its pass.
+
+Axes: N clips, S cells, A action dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, Int, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import TokenizerConfig, TokenModelConfig
+from rsjax.data.normalization import with_sums
+from rsjax.models.moments import Decoding, Moment
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.stepping import Dials, Network, State, advance, begin, restart
+from rsjax.models.roboscape.transformer import Cache
+from rsjax.tokenizers.codec import Codec
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """What a moment goes on from.
+
+    Attributes:
+        state: of one clip, without its cache.
+        cache: None stands for an empty one.
+        sums: of its scaled actions.
+    """
+
+    state: State
+    cache: Cache | None
+    sums: Float[np.ndarray, " A"]
+
+
+class TokenBranching:
+    """Implements :class:`rsjax.models.moments.Branching`.
+
+    Args:
+        has_depth: whether its clips have depth; a depth branch sees it masked otherwise.
+        lanes: clips of a pass.
+    """
+
+    def __init__(
+        self,
+        config: TokenModelConfig,
+        arch: Architecture,
+        codec: Codec,
+        params: Params,
+        has_depth: bool,
+        lanes: int,
+    ) -> None:
+        self.lanes = lanes
+        self._config, self._arch, self._codec, self._params = config, arch, codec, params
+        self._has_depth = arch.use_depth and has_depth and codec.normalization.depth_range is not None
+        # What a clip begins with. It is where the parameters are, as what passes return is: one program for both.
+        where = getattr(jax.tree.leaves(params)[0], "sharding", None) or jax.local_devices()[0]
+        self._place = partial(jax.device_put, device=where)
+        self._empty = self._place(begin(self._network(Decoding(steps=1)), 1))
+
+    def begin(self, first: Video) -> Moment:
+        video = first if self._has_depth else Video(first.rgb)
+        grids = self._codec.encode(video)
+        tokens = {name: grid.reshape(-1) for name, grid in grids.items()}
+        cells = {name: jnp.asarray(row[None], jnp.int32) for name, row in tokens.items()}
+        if self._arch.use_depth:
+            cells.setdefault("depth", jnp.zeros_like(cells["rgb"]))
+        state = self._place(replace(restart(self._empty, jnp.ones(1, bool), cells, self._empty.key), cache={}))
+        seen = self._codec.decode_rgb(grids["rgb"])[0, 0]
+        sums = np.zeros(len(self._codec.normalization.action_mean))
+        return Moment(seen, tokens, None, _Memory(state, None, sums))
+
+    def advance(
+        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[Moment]:
+        count, full = len(moments), [*range(len(moments)), *[0] * (self.lanes - len(moments))]
+        memories = [cast(_Memory, moments[i].memory) for i in full]
+        scaled = self._codec.normalization.scaled(actions[full])
+        sums = np.stack([memory.sums for memory in memories]) + scaled
+        rows = with_sums(scaled, sums if self._config.integrate_actions else None)
+        net, chosen = self._network(decodings[0]), [decodings[i] for i in full]
+        dials = Dials(
+            np.array([each.temperature for each in chosen], np.float32),
+            np.array([each.guidance for each in chosen], np.float32),
+        )
+        seeds = np.array([(each.seed, each.draw) for each in chosen], np.uint32)
+        own = [memory.cache for memory in memories[:count]] + [None] * (self.lanes - count)
+        caches = tuple(self._empty_cache() if cache is None else cache for cache in own)
+        states = tuple(memory.state for memory in memories)
+        codec = self._codec
+        made, caches, rgb = _advance(net, codec.config, self._params, codec.params, caches, states, rows, seeds, dials)
+        pictures = np.asarray(rgb)
+        return [self._moment(_Memory(made[i], caches[i], sums[i]), pictures[i]) for i in range(count)]
+
+    def lightened(self, moment: Moment) -> Moment:
+        """A window that is full is encoded again before it is read, so its cache need not be kept."""
+        memory = moment.memory
+        if memory is None or memory.cache is None:
+            return moment
+        full = self._arch.positions == "learned" and int(memory.state.position[0]) == self._arch.frames
+        return replace(moment, memory=replace(memory, cache=None) if full else None)
+
+    def depth(self, tokens: dict[str, Int[np.ndarray, " S"]]) -> Float32[np.ndarray, "H W"] | None:
+        if "depth" not in tokens:
+            return None
+        return self._codec.decode_depth(tokens["depth"].reshape(1, self._arch.grid, self._arch.grid))[0]
+
+    def _network(self, decoding: Decoding) -> Network:
+        """Returns the settings of the program for a decoding, whose temperature and guidance are arguments of it.
+
+        A model that can be guided always is, so that its cache is of one shape.
+        """
+        drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.action_dropout else 1.0
+        sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
+        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k)
+        return Network(self._arch, sample, self._has_depth, True)
+
+    def _empty_cache(self) -> Cache:
+        return jax.tree.map(jnp.copy, self._empty.cache)  # a pass uses up what it gets
+
+    def _moment(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> Moment:
+        tokens = {name: np.asarray(grid[0, -1]) for name, grid in memory.state.tokens.items()}
+        if not self._has_depth:
+            tokens.pop("depth", None)
+        size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
+        return Moment(rgb, tokens, np.asarray(cast(Array, memory.state.entropy)[0]), memory, size)
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(4,))
+def _advance(
+    net: Network,
+    tokenizer: TokenizerConfig,
+    params: Params,
+    tokenizer_params: Params,
+    caches: tuple[Cache, ...],
+    states: tuple[State, ...],
+    actions: Float[Array, "N A"],
+    seeds: Int[Array, "N 2"],
+    dials: Dials,
+) -> tuple[tuple[State, ...], tuple[Cache, ...], UInt8[Array, "N H W 3"]]:
+    """Returns the states and caches after the next frame, and the frames."""
+    keys = jax.vmap(lambda row: jax.random.fold_in(jax.random.key(row[0]), row[1]))(seeds)
+    state: State = jax.tree.map(lambda *rows: jnp.concatenate(rows), *states)
+    cache: Cache = jax.tree.map(lambda *clips: jnp.concatenate(clips, axis=1), *caches)
+    state = advance(net, params, replace(state, cache=cache, key=keys), actions, dials)
+    grid = state.tokens["rgb"][:, -1].reshape(-1, net.arch.grid, net.arch.grid)
+    pixels = cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode"))
+    numbers = [slice(i, i + 1) for i in range(len(states))]
+    parts = tuple(jax.tree.map(lambda x, at=at: x[at], replace(state, cache={})) for at in numbers)
+    kept = tuple(jax.tree.map(lambda x, at=at: x[:, at], state.cache) for at in numbers)
+    return parts, kept, jnp.round(pixels).astype(jnp.uint8)

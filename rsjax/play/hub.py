@@ -1,0 +1,136 @@
+"""The sessions of a server: at most so many, freed when nobody uses them."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rsjax.play import messages
+from rsjax.play.engine import Engine
+from rsjax.play.errors import Refused
+from rsjax.play.memory import Memories
+from rsjax.play.run_data import PlayRun
+from rsjax.play.session import Session
+from rsjax.play.shown import Side
+from rsjax.play.sources import reasons
+from rsjax.play.viewer import Viewer
+
+VERSION = 1  # of the protocol
+IN_FLIGHT = 4  # steps of a session that are not answered
+GRACE = 20.0
+
+
+@dataclass(eq=False)
+class Seat:
+    """A session's place.
+
+    Attributes:
+        close: ends the connection with a code and a reason; None while no page is connected.
+        left: when the page went, in seconds of :func:`time.monotonic`.
+    """
+
+    viewer: Viewer
+    close: Callable[[int, str], None] | None = None
+    left: float = 0.0
+
+
+class Hub:
+    """All sessions of one run.
+
+    Args:
+        run: what is played.
+        engine: generates the frames of all.
+        most: sessions at a time.
+        idle: seconds after which a session that nobody uses is freed.
+        grace: seconds for which one whose page is gone keeps its place when all are taken.
+    """
+
+    def __init__(self, run: PlayRun, engine: Engine, most: int, idle: float, grace: float = GRACE) -> None:
+        self.run, self.engine, self.most, self.idle, self._grace = run, engine, most, idle, grace
+        self._memories, self._side = Memories(most), Side()
+        self._seats: dict[str, Seat] = {}
+
+    def __len__(self) -> int:
+        return len(self._seats)
+
+    def open(self, name: str | None, close: Callable[[int, str], None]) -> tuple[Seat, bool]:
+        """Returns a seat and whether it is one that its viewer returns to.
+
+        Args:
+            name: of the session to return to; a new one is made if it is not there any more.
+            close: ends the connection.
+
+        Raises:
+            Refused: all places are taken.
+        """
+        seat = self._seats.get(name or "")
+        if seat is not None:
+            if seat.close is not None:
+                seat.close(4409, "this session was opened in another page")
+            seat.close = close
+            seat.viewer.session.used = time.monotonic()
+            return seat, True
+        self._make_room()
+        seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side), close)
+        self._seats[seat.viewer.session.name] = seat
+        return seat, False
+
+    def leave(self, seat: Seat, close: Callable[[int, str], None]) -> None:
+        """Says that a page is gone; its session stays for a while."""
+        if seat.close == close:  # otherwise another page has taken the session over
+            seat.close, seat.left = None, time.monotonic()
+            seat.viewer.session.out = None
+
+    def sweep(self) -> None:
+        """Frees the sessions that nobody used for long."""
+        now = time.monotonic()
+        for seat in list(self._seats.values()):
+            if now - seat.viewer.session.used > self.idle:
+                if seat.close is not None:
+                    seat.close(4408, f"nobody used this session for {_minutes(self.idle)}; it is freed")
+                self._free(seat)
+
+    def close(self) -> None:
+        """Frees all."""
+        for seat in list(self._seats.values()):
+            self._free(seat)
+        self._side.pool.shutdown(wait=False, cancel_futures=True)
+
+    def welcome(self, seat: Seat, returned: bool) -> dict[str, Any]:
+        """Returns the first message to a page."""
+        session = seat.viewer.session
+        facts = {"version": VERSION, "session": session.name, "returned": returned, "run": self.run.describe()}
+        limits = session.limits | {
+            "text_bytes": messages.TEXT_BYTES,
+            "upload_bytes": messages.UPLOAD_BYTES,
+            "in_flight": IN_FLIGHT,
+            "idle_seconds": self.idle,
+        }
+        facts |= self.run.controls.describe() | {"sources": reasons(self.run), "truth": seat.viewer.no_truth}
+        facts |= {"settings": session.settings.describe(), "seed": session.seed, "limits": limits}
+        return {"type": "welcome"} | facts
+
+    def _make_room(self) -> None:
+        if len(self._seats) < self.most:
+            return
+        gone = [seat for seat in self._seats.values() if seat.close is None]
+        oldest = min(gone, key=lambda seat: seat.left, default=None)
+        if oldest is not None and time.monotonic() - oldest.left > self._grace:
+            self._free(oldest)
+            return
+        waits = [self.idle - (time.monotonic() - seat.viewer.session.used) for seat in self._seats.values()]
+        waits += [self._grace - (time.monotonic() - seat.left) for seat in gone]
+        seconds = max(1, round(min(waits)))
+        raise Refused(
+            "no_session", f"all {self.most} sessions are in use; one is free in {_minutes(seconds)} if nobody uses it"
+        )
+
+    def _free(self, seat: Seat) -> None:
+        self._seats.pop(seat.viewer.session.name, None)
+        seat.viewer.close()
+
+
+def _minutes(seconds: float) -> str:
+    if seconds < 90:
+        return f"{round(seconds)} seconds"
+    return f"{round(seconds / 60)} minutes"

@@ -1,0 +1,42 @@
+"""What is to be sent to one page; a slow one loses pictures that it can ask for again, in the end its connection."""
+
+import asyncio
+from collections import deque
+from typing import Any
+
+UNSENT = 32  # messages from which on what can be asked for again is dropped
+MOST = 256  # messages with which a page is too slow to be served
+
+
+class Outbox:
+    """Messages in their order, from any coroutine to the one that sends them."""
+
+    def __init__(self) -> None:
+        self._items: deque[bytes | dict[str, Any]] = deque()
+        self._changed = asyncio.Event()
+        self.overflowed = False
+
+    def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None:
+        """Adds a message, or drops it."""
+        if droppable and len(self._items) >= UNSENT:
+            return
+        self.overflowed |= len(self._items) >= MOST
+        if not self.overflowed:
+            self._items.append(item)
+        self._changed.set()
+
+    async def next(self) -> bytes | dict[str, Any] | None:
+        """Returns the message to send next; None if the page is too slow."""
+        while not self._items and not self.overflowed:
+            self._changed.clear()
+            await self._changed.wait()
+        if self.overflowed:
+            return None
+        item = self._items.popleft()
+        self._changed.set()
+        return item
+
+    async def room(self) -> None:
+        """Waits until few messages are unsent."""
+        while len(self._items) >= UNSENT // 2 and not self.overflowed:
+            await asyncio.sleep(0.005)

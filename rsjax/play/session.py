@@ -1,0 +1,197 @@
+"""One viewer's session: a start, settings, and a tree of branches that grows frame by frame."""
+
+import asyncio
+import secrets
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.clip import Video
+from rsjax.data.codec import Record
+from rsjax.models.moments import Decoding, Moment
+from rsjax.play.engine import Engine, Work
+from rsjax.play.errors import Refused
+from rsjax.play.memory import Memories
+from rsjax.play.pictures import Upload
+from rsjax.play.run_data import PlayRun
+from rsjax.play.settings import MOST_SEED, first_settings, settings_limits
+from rsjax.play.tree import Branch, Node, Tree
+
+MOST_BRANCHES = 32
+MOST_FRAMES = 4096
+FRAME_BYTES = 256 * 2**20  # of a session's pictures, which may leave fewer frames
+
+
+class Outbox(Protocol):
+    """Where a session's messages go."""
+
+    def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None: ...
+    async def room(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a session's branches begin with: a clip of the run, or an uploaded picture.
+
+    Attributes:
+        number: the clip's.
+        clip: the clip.
+    """
+
+    number: int | None
+    clip: Record | None
+    upload: Upload | None
+
+    def describe(self) -> dict[str, Any]:
+        """Returns what a page needs to know of it."""
+        if self.clip is None:
+            assert self.upload is not None
+            return {"start": {"upload": self.upload.describe()}, "task": "", "clip_frames": None}
+        facts = {"start": {"clip": self.number}, "task": str(self.clip["task"])}
+        return facts | {"clip_frames": len(self.clip["rgb"])}
+
+
+class Session:
+    """One viewer's session. Its coroutines run one after another, in the order of the viewer's messages.
+
+    Args:
+        run: what is played.
+        engine: generates its frames.
+        memories: of all sessions.
+
+    Attributes:
+        name: nobody can guess it.
+        out: where messages go; None while no page is connected.
+        watched: kinds that are pushed with each new frame.
+        used: when the last message came, in seconds of :func:`time.monotonic`.
+    """
+
+    def __init__(self, run: PlayRun, engine: Engine, memories: Memories) -> None:
+        self.name, self.used = secrets.token_urlsafe(16), time.monotonic()
+        self.run, self.engine = run, engine
+        self.out: Outbox | None = None
+        self.watched: list[str] = []
+        self.settings, self.seed = first_settings(run.data.config), 0
+        self.upload: Upload | None = None
+        self.start: Start | None = None
+        self.tree: Tree | None = None
+        self._memories = memories
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What a session can have at most."""
+        frame = 3 * self.run.data.config.clips.image_size**2
+        most = {"frames": min(MOST_FRAMES, FRAME_BYTES // frame), "branches": MOST_BRANCHES}
+        return settings_limits(self.run.data.config) | most
+
+    @property
+    def grown(self) -> Tree:
+        """The tree; :class:`Refused` before the first start."""
+        if self.tree is None:
+            raise Refused("no_start", "begin with a clip or a picture first")
+        return self.tree
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether its frames have depth."""
+        return self.tree is not None and "depth" in self.grown.node(0, 0).moment.tokens
+
+    def describe(self) -> dict[str, Any]:
+        """Returns what a page needs to know of a session that has a start."""
+        assert self.start is not None
+        facts = self.start.describe() | {"seed": self.seed, "settings": self.settings.describe()}
+        branches = [branch.describe() for branch in self.grown.branches.values()]
+        return facts | {"session": self.name, "has_depth": self.has_depth, "branches": branches}
+
+    def send(self, item: bytes | dict[str, Any], droppable: bool = False) -> None:
+        """Sends a message, unless no page is connected."""
+        if self.out is not None:
+            self.out.put(item, droppable)
+
+    async def begin(self, start: Start, seed: int) -> None:
+        """Begins a new tree; the old one is forgotten."""
+        if start.clip is not None:
+            first, draw = self.run.first(start.clip), int(start.number or 0)
+        else:
+            assert start.upload is not None
+            first, draw = Video(start.upload.rgb[None, None]), 0
+        moment = await asyncio.to_thread(self.engine.begin, first)
+        self.forget()
+        self.start, self.seed = start, seed
+        self.tree = Tree(Node(moment), draw)
+
+    def clip_start(self, number: int) -> Start:
+        """Returns a clip as a start."""
+        return Start(number, self.run.clip(number), None)
+
+    def upload_start(self) -> Start:
+        """Returns the last uploaded picture as a start."""
+        if self.upload is None:
+            raise Refused("no_upload", "send a picture first")
+        return Start(None, None, self.upload)
+
+    def fork(self, number: int, frame: int, fresh: bool) -> Branch:
+        """Makes a branch, with draws of its own if it is to be fresh."""
+        if len(self.grown.branches) >= MOST_BRANCHES:
+            raise Refused("full", f"a session can have {MOST_BRANCHES} branches; drop one")
+        draw = secrets.randbelow(MOST_SEED) if fresh else None
+        return self.grown.fork(number, frame, draw)
+
+    def drop(self, number: int) -> None:
+        """Removes a branch from which none forks."""
+        last = self.grown.branch(number).nodes[-1]
+        self.grown.drop(number)
+        self._memories.forget(last)
+        last.moment = self._lighten(last.moment)
+
+    async def step(self, number: int, action: Float32[np.ndarray, " A"], decoding: Decoding | None = None) -> int:
+        """Generates a branch's next frame and returns its number.
+
+        Args:
+            action: within limits.
+            decoding: None: as the session's settings say.
+        """
+        tree = self.grown
+        branch = tree.branch(number)
+        if tree.frames >= self.limits["frames"]:
+            raise Refused("full", f"a session can have {self.limits['frames']} frames; begin again, or drop a branch")
+        how = decoding or self.settings.decoding(self.seed, branch.draw)
+        await self._recall(branch.nodes)
+        moment = await self._advance(branch.nodes[-1], action, how)
+        node = Node(moment, action, how)
+        self._memories.note(node, self._lighten)
+        return tree.append(number, node)
+
+    def forget(self) -> None:
+        """Frees what the tree needs to go on."""
+        if self.tree is not None:
+            for branch in self.tree.branches.values():
+                for node in branch.nodes:
+                    self._memories.forget(node)
+        self.tree = self.start = None
+
+    async def _recall(self, nodes: list[Node]) -> None:
+        """Makes the last of these frames one that can go on, by generating it again from the nearest that can."""
+        known = len(nodes) - 1
+        while nodes[known].moment.memory is None:
+            known -= 1
+        for before, node in zip(nodes[known:], nodes[known + 1 :], strict=False):
+            assert node.action is not None and node.decoding is not None
+            node.moment = await self._advance(before, node.action, node.decoding)
+
+    async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> Moment:
+        moment, loop = node.moment, asyncio.get_running_loop()
+        self._memories.forget(node)
+        node.moment = self._lighten(moment)
+
+        def say(text: str, busy: bool) -> None:
+            loop.call_soon_threadsafe(self.send, {"type": "status", "text": text, "busy": busy})
+
+        work = Work(moment, action, how, self.has_depth, say)
+        return await asyncio.wrap_future(self.engine.submit(work))
+
+    def _lighten(self, moment: Moment) -> Moment:
+        return self.engine.branching(self.has_depth).lightened(moment)

@@ -1,0 +1,113 @@
+"""Frames that go on from any frame: the same bits alone, in company, again and from a lightened memory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rsjax.clip import Video
+from rsjax.config import SampleConfig
+from rsjax.data.store import Store
+from rsjax.models.moments import Branching, Decoding, Moment
+from rsjax.models.trained import TrainedModel
+from tests.pipeline import toy
+
+FRAMES = 10  # the window is 6
+DRAWN = Decoding(steps=2, temperature=1.0, draw=3)
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("branching") / "clips")
+
+
+@pytest.fixture(scope="module")
+def model(clips: Store) -> TrainedModel:
+    sample = SampleConfig(steps=2, temperature=1.0, unmask="greedy")
+    return toy.trained(clips, toy.with_model(toy.config(), sample=sample))
+
+
+@pytest.fixture(scope="module")
+def lanes(model: TrainedModel) -> Branching:
+    return model.model.branching(model.params, model.assets, True, lanes=2)
+
+
+def first(clips: Store, number: int) -> Video:
+    clip = clips.source("test")[number]
+    return Video(clip["rgb"][None, :1], clip["depth"][None, :1])
+
+
+def rows(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (FRAMES, 28)).astype(np.float32)
+
+
+def alone(branching: Branching, moment: Moment, actions: np.ndarray, decoding: Decoding) -> list[Moment]:
+    made = []
+    for row in actions:
+        [moment] = branching.advance([moment], row[None], [decoding])
+        made.append(moment)
+    return made
+
+
+def assert_same(one: Moment, other: Moment) -> None:
+    np.testing.assert_array_equal(one.rgb, other.rgb)
+    assert one.entropy is not None and other.entropy is not None
+    np.testing.assert_array_equal(one.entropy, other.entropy)
+    for name, cells in one.tokens.items():
+        np.testing.assert_array_equal(cells, other.tokens[name])
+
+
+def test_frames_are_those_of_generate(lanes: Branching, model: TrainedModel, clips: Store) -> None:
+    actions, clip = rows(1), clips.source("test")[1]
+    made = alone(lanes, lanes.begin(first(clips, 1)), actions[1:], replace(DRAWN, draw=0))
+    video = model.generate(clip["rgb"][:1], actions, clip["depth"][:1])
+    rgb = np.stack([moment.rgb for moment in made])
+    assert np.abs(rgb.astype(int) - video.rgb[1:]).max() <= 1  # pictures decoded in other numbers differ by a level
+    depth = lanes.depth(made[-1].tokens)
+    assert video.depth is not None and depth is not None
+    np.testing.assert_allclose(depth, video.depth[-1], rtol=0.01)
+
+
+def test_a_frame_has_the_same_bits_whoever_shares_its_pass(lanes: Branching, clips: Store) -> None:
+    """The other clip is at another frame, with other actions, draws and temperature, in either lane."""
+    actions, others = rows(2), rows(3)
+    expected = alone(lanes, lanes.begin(first(clips, 0)), actions, DRAWN)
+    mine, other = lanes.begin(first(clips, 0)), lanes.begin(first(clips, 4))
+    [other] = lanes.advance([other], others[:1], [DRAWN])
+    for number in range(FRAMES):
+        hot = replace(DRAWN, temperature=0.5 + number, draw=7)
+        pair, pair_rows, how = [mine, other], np.stack([actions[number], others[number]]), [DRAWN, hot]
+        if number % 2:
+            other, mine = lanes.advance(pair[::-1], pair_rows[::-1], how[::-1])
+        else:
+            mine, other = lanes.advance(pair, pair_rows, how)
+        assert_same(mine, expected[number])
+
+
+def test_going_on_from_a_lightened_memory_gives_the_same_bits(lanes: Branching, clips: Store) -> None:
+    actions, moment = rows(4), lanes.begin(first(clips, 2))
+    moments, light = [], {0: lanes.lightened(moment)}
+    for number, row in enumerate(actions, 1):
+        [moment] = lanes.advance([moment], row[None], [DRAWN])
+        moments.append(moment)
+        light[number] = lanes.lightened(moment)
+    stops = [number for number, each in light.items() if each.memory is not None]
+    assert stops == [0, 5, 8]  # the first frame, and those that fill the window of 6, which then moves by 3
+    for stop in stops:
+        for _ in range(2):  # a small memory is not used up
+            again = alone(lanes, light[stop], actions[stop:], DRAWN)
+            assert_same(again[-1], moments[-1])
+
+
+def test_draws_follow_from_seed_and_draw_and_temperature_counts(lanes: Branching, clips: Store) -> None:
+    actions, start = rows(5)[:3], lanes.begin(first(clips, 3))
+    base = alone(lanes, start, actions, DRAWN)[-1].rgb
+    for changed in (replace(DRAWN, draw=4), replace(DRAWN, seed=1), replace(DRAWN, temperature=0.3)):
+        assert (alone(lanes, start, actions, changed)[-1].rgb != base).any()
+
+
+def test_entropy_is_that_of_tokens(lanes: Branching, model: TrainedModel, clips: Store) -> None:
+    moment, *_ = lanes.advance([lanes.begin(first(clips, 0))], rows(6)[:1], [DRAWN])
+    bits = model.config.tokenizer.code_bits
+    assert moment.entropy is not None
+    assert moment.entropy.min() > 0 and moment.entropy.max() <= bits * np.log(2) * (1 + 1e-5)
