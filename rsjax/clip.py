@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
 
 Array = Any  # JAX or numpy
 UNKNOWN = "unknown"  # the task or label of a clip whose data set does not name it
@@ -52,10 +52,12 @@ class Video:
     Attributes:
         rgb: frames, 0–255, RGB order, upright.
         depth: z-depth in metres; all NaN for a clip without depth. None: no clip has depth.
+        tasks: the robot's task in each clip, in words; None: unknown.
     """
 
     rgb: UInt8[np.ndarray, "B T H W 3"]
     depth: Float32[np.ndarray, "B T H W"] | None = None
+    tasks: Shaped[np.ndarray, " B"] | None = None
 
     @property
     def has_depth(self) -> Bool[np.ndarray, " B"]:
@@ -70,8 +72,10 @@ class Video:
 
     def __getitem__(self, rows: Any) -> "Video":
         """Returns some of the clips: ``rows`` is an array of numbers, a mask or a slice."""
-        return Video(self.rgb[rows], None if self.depth is None else self.depth[rows])
+        depth, tasks = (None if x is None else x[rows] for x in (self.depth, self.tasks))
+        return Video(self.rgb[rows], depth, tasks)
 
     def frames(self, first: int, last: int | None = None) -> "Video":
         """Returns frames ``first`` to ``last`` - 1 of every clip."""
-        return Video(self.rgb[:, first:last], None if self.depth is None else self.depth[:, first:last])
+        depth = None if self.depth is None else self.depth[:, first:last]
+        return Video(self.rgb[:, first:last], depth, self.tasks)

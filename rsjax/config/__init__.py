@@ -7,6 +7,7 @@ A field made with :func:`runtime` changes the speed or the logging of a run, not
 out, so changing it never invalidates finished work.
 """
 
+from rsjax.config.cogvideox import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
 from rsjax.config.fields import (
@@ -41,7 +42,9 @@ from rsjax.config.train import ComponentConfig, CurriculumStageConfig, LoopConfi
 
 __all__ = [
     "FAMILIES",
+    "CausalVAEConfig",
     "ClipShape",
+    "CogVideoXConfig",
     "ComponentConfig",
     "ConditionalVQConfig",
     "Config",
@@ -52,6 +55,7 @@ __all__ = [
     "DiTConfig",
     "EvalConfig",
     "GenieConfig",
+    "GuidedDenoiseConfig",
     "IRASimConfig",
     "IVideoGPTConfig",
     "KLConfig",
@@ -64,6 +68,7 @@ __all__ = [
     "RoboScapeConfig",
     "SampleConfig",
     "SimConfig",
+    "TextConfig",
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",

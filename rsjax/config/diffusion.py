@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import require, require_range
+from rsjax.config.fields import added, require, require_range
 
 
 @dataclass(frozen=True)
@@ -16,12 +16,20 @@ class NoiseConfig:
     beta_end: float = 0.02
     betas: Literal["linear", "scaled_linear"] = "linear"  # scaled_linear: their roots grow linearly
     prediction: Literal["noise", "velocity"] = "noise"
+    snr_shift: float = added(1.0)  # s in ᾱ ← ᾱ / (s + (1 - s)·ᾱ): the ratio of signal to noise is divided by it
+    zero_terminal: bool = added(False)  # √ᾱ is stretched to 0 after the last step, from where sampling then begins
 
     def __post_init__(self) -> None:
         require_range(self, "model.noise", 2, math.inf, "steps")
         require(
             0 < self.beta_start <= self.beta_end < 1,
             f"model.noise.beta_start is {self.beta_start} and beta_end {self.beta_end}; they grow, above 0 and below 1",
+        )
+        require(self.snr_shift > 0, f"model.noise.snr_shift is {self.snr_shift}; it must be above 0")
+        require(
+            not self.zero_terminal or self.prediction == "velocity",
+            "model.noise.zero_terminal is on, where noise alone says nothing of the clip; set model.noise.prediction "
+            "to velocity",
         )
 
 

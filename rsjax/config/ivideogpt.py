@@ -118,6 +118,10 @@ class IVideoGPTConfig(ModelConfig):
         return self.autoencoder
 
     @property
+    def takes_actions(self) -> bool:
+        return self.use_actions
+
+    @property
     def loss_weights(self) -> dict[str, float]:
         return {"token": 1.0}
 

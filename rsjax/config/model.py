@@ -55,6 +55,11 @@ class ModelConfig:
         return False
 
     @property
+    def takes_actions(self) -> bool:
+        """Whether what the model generates depends on actions; without, ΔPSNR has no meaning."""
+        return True
+
+    @property
     def marked_keypoints(self) -> int:
         """How many keypoints the model selects in each clip, for the report's pictures; 0: none."""
         return 0
@@ -274,6 +279,10 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     shift_pixels: int = added(4)
     mask: MaskConfig = MaskConfig()
     sample: SampleConfig = sampling(SampleConfig())
+
+    @property
+    def takes_actions(self) -> bool:
+        return self.action_encoder != "none"
 
     def frames(self, clips: ClipShape) -> int:
         """Returns the number of positions in time for such clips."""

@@ -17,9 +17,11 @@ from rsjax.config import (
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
+    cogvideox_presets,
     irasim_presets,
     ivideogpt_presets,
 )
+from rsjax.config.cogvideox_presets import cogvideox_2b, cogvideox_5b_i2v
 from rsjax.config.curriculum import parse_stage
 from rsjax.config.irasim_presets import irasim_b, irasim_l, irasim_s, irasim_xl
 from rsjax.config.ivideogpt_presets import ivideogpt_64, ivideogpt_256
@@ -178,6 +180,11 @@ def irasim_tiny() -> Config:
     return irasim_presets.irasim_tiny(tiny())
 
 
+def cogvideox_tiny() -> Config:
+    """Returns CogVideoX on the clips of :func:`tiny`, in about its time."""
+    return cogvideox_presets.cogvideox_tiny(tiny())
+
+
 def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
 
@@ -242,7 +249,8 @@ ROBOSCAPE = (debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l)
 GENIE = (genie_35m, genie_138m, genie_35m_actions)
 IVIDEOGPT = (ivideogpt_64, ivideogpt_256, ivideogpt_tiny)
 IRASIM = (irasim_s, irasim_b, irasim_l, irasim_xl, irasim_tiny)
-PRESETS = collect(*ROBOSCAPE, *GENIE, *IVIDEOGPT, *IRASIM)
+COGVIDEOX = (cogvideox_2b, cogvideox_5b_i2v, cogvideox_tiny)
+PRESETS = collect(*ROBOSCAPE, *GENIE, *IVIDEOGPT, *IRASIM, *COGVIDEOX)
 
 
 def get(name: str) -> Config:

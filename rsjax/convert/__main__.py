@@ -16,6 +16,8 @@ KINDS = {
     "ivideogpt": "iVideoGPT's tokenizer or transformer, whichever IN holds",
     "irasim": "IRASim's transformer, Frame-Ada or Video-Ada",
     "sdxl": "the autoencoder of Stable Diffusion XL; reads the config.json beside IN",
+    "cogvideox": "CogVideoX's autoencoder or transformer, whichever IN holds; reads the config.json beside IN",
+    "text": "texts: IN is a local directory with CogVideoX's text_encoder and tokenizer, OUT their embeddings",
     "lpips": "the perceptual distance: torchvision's backbone and the published heads",
 }
 
@@ -34,6 +36,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--heads", type=int, help="attention heads, if there is no config.json")
         if kind == "ivideogpt":
             command.add_argument("--heads", type=int, help="attention heads of the transformer, if not of 64 channels")
+        if kind == "text":
+            command.add_argument("--task", action="append", default=[], help="a task, in words; as often as needed")
+            command.add_argument("--store", type=Path, help="a store of clips, whose tasks are embedded")
+            command.add_argument("--tokens", type=int, default=226, help="tokens of each text")
+        if kind in ("ivideogpt", "cogvideox"):
             command.add_argument(
                 "--part", choices=("tokenizer", "world_model"), help="to export; default: all there is"
             )
@@ -50,10 +57,10 @@ def parser() -> argparse.ArgumentParser:
 @main_errors()
 def main(argv: Sequence[str]) -> None:
     """Converts and prints what was written."""
-    refuse_repeated(argv)
+    refuse_repeated(argv, repeatable=("task",))
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.convert import commands, diffusion_commands, ivideogpt
+    from rsjax.convert import cogvideox_commands, commands, diffusion_commands, ivideogpt
 
     if options.kind == "tokenizer":
         lines = commands.convert_tokenizer(options.source, options.out, options.weights)
@@ -61,6 +68,11 @@ def main(argv: Sequence[str]) -> None:
         lines = commands.convert_genie(options.source, options.out, options.heads)
     elif options.kind == "ivideogpt":
         lines = ivideogpt.convert(options.source, options.out, options.heads, options.part)
+    elif options.kind == "cogvideox":
+        lines = cogvideox_commands.convert(options.source, options.out, options.part)
+    elif options.kind == "text":
+        texts = (options.task, options.store, options.tokens)
+        lines = cogvideox_commands.embed_texts(options.source, options.out, *texts)
     elif options.kind == "irasim":
         lines = diffusion_commands.convert_irasim(options.source, options.out, options.weights, options.heads)
     elif options.kind == "sdxl":

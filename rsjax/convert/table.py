@@ -15,7 +15,7 @@ from jax import dtypes
 
 from rsjax.convert.files import ConvertError, Tensors
 
-Layout = Literal["same", "linear", "conv", "lead"]
+Layout = Literal["same", "linear", "conv", "lead", "conv3d", "linear3d"]
 Shape = tuple[int, ...]
 Names = Mapping[str, str]  # a tensor's name in its file, by its name here
 
@@ -27,6 +27,8 @@ LAYOUTS: dict[Layout, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.nda
     "linear": (lambda x: x.T, lambda x: x.T),  # (out, in) ↔ (in, out)
     "conv": (lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1)),  # OIHW ↔ HWIO
     "lead": (lambda x: x[0], lambda x: x[None]),  # torch keeps a leading axis of one
+    "conv3d": (lambda x: x.transpose(2, 3, 4, 1, 0), lambda x: x.transpose(4, 3, 0, 1, 2)),  # OITHW ↔ THWIO
+    "linear3d": (lambda x: x[..., 0, 0, 0].T, lambda x: x.T[..., None, None, None]),  # a convolution of one cell
 }
 NAMED = 8  # names of each kind in an error; the others are counted
 

@@ -66,7 +66,7 @@ class Clips:
     def video(self) -> Video:
         """Frames and depth; NaN in clips without depth."""
         if not self.has_depth.any():
-            return Video(self.rgb)
+            return Video(self.rgb, tasks=np.array(self.task))
         return self._video(self.has_depth)
 
     @property
@@ -75,7 +75,8 @@ class Clips:
         return self._video(self.metric)
 
     def _video(self, has_depth: Bool[np.ndarray, " B"]) -> Video:
-        return Video(self.rgb, np.where(has_depth[:, None, None, None], self.depth, np.float32(np.nan)))
+        depth = np.where(has_depth[:, None, None, None], self.depth, np.float32(np.nan))
+        return Video(self.rgb, depth, np.array(self.task))
 
 
 def spread(source: Sized, count: int) -> list[int]:

@@ -160,13 +160,14 @@ def evaluate(
     generation = plan(trained, store, held_out, folder)
     generation.make()
     trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
+    takes_actions = trained.config.model.takes_actions
     locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
     taught = teacher_forced(trained, protocol, clips)
     repetitions: list[tuple[Scored, Curves]] = []
     first: dict[str, Scene] = {}
     for run in range(protocol.repetitions):
         scenes = make_scenes(trained, protocol, clips, generation.videos(run), estimator, locate, taught)
-        scored = with_best(score_all(scenes, protocol), scenes[""], generation.samples(run), protocol)
+        scored = with_best(score_all(scenes, protocol, takes_actions), scenes[""], generation.samples(run), protocol)
         repetitions.append((scored, frame_curves(scenes)))
         first = first or scenes
     scored = mean_scores([scored for scored, _ in repetitions])
@@ -195,7 +196,7 @@ def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | 
         trained,
         protocol,
         clips,
-        _draws(clips.actions, protocol.action_draws, store),
+        _draws(clips.actions, protocol.action_draws * trained.config.model.takes_actions, store),
         len(held_out.store.source(held_out.split)),
         lambda rows, video: sample_scores(truth[rows], video, protocol, trained.config.eval),
         folder,

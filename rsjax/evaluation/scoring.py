@@ -41,11 +41,17 @@ class Scored:
         return {name: each for name, each in (*every, *self.best.items()) if each.ndim}
 
 
-def score_all(scenes: Mapping[str, Scene], protocol: Protocol) -> Scored:
-    """Scores the prediction and both baselines with all registered metrics."""
+def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bool = True) -> Scored:
+    """Scores the prediction and both baselines with all registered metrics.
+
+    Args:
+        takes_actions: False for a model that has none, which no metric of other actions can score.
+    """
     values, reasons = {}, {}
     for metric in metrics().values():
         try:
+            if metric.needs and not takes_actions:
+                raise Unavailable("the model takes no actions")
             values[metric.name] = _score(metric, scenes, protocol)
         except Unavailable as reason:
             reasons[metric.name] = str(reason)

@@ -1,6 +1,7 @@
 """The public interface of a trained world model: numpy arrays in, numpy arrays out."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class TrainedModel:
         frames: UInt8[np.ndarray, "*B P H W 3"],
         actions: Float[np.ndarray, "*B T A"],
         depth: Float[np.ndarray, "*B P H W"] | None = None,
+        task: str | Sequence[str] | None = None,
     ) -> Video:
         """Generates the video that follows these frames under these actions.
 
@@ -40,6 +42,7 @@ class TrainedModel:
             actions: in the recording's units; row t leads into frame t, and row 0 is ignored. T may exceed the length
                 of the training clips.
             depth: z-depth of the frames in metres; None if unknown.
+            task: the robot's task in words, one for all clips or one for each; only CogVideoX reads it.
 
         Returns:
             All T frames with their depth (None without a depth branch or ``depth``); without a leading axis for one
@@ -49,6 +52,11 @@ class TrainedModel:
             ShapeError: an argument has the wrong shape or type for this model; the message says which.
         """
         prompt, single = self._video(frames, depth)
+        if task is not None:
+            tasks = np.array([task] * len(prompt) if isinstance(task, str) else list(task))
+            if tasks.shape != (len(prompt),):
+                raise ShapeError(f"task has {len(tasks)} texts; expected one, or {len(prompt)}, one for each clip")
+            prompt = replace(prompt, tasks=tasks)
         sequences = self._actions(actions, prompt, () if single else (len(prompt),))
         video = self.model.generate(self.params, self.assets, prompt, sequences[None] if single else sequences)
         return _first(video) if single else video

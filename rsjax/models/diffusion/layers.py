@@ -18,9 +18,9 @@ def positions(count: int, width: int) -> Float32[np.ndarray, "count width"]:
     return _waves(np.arange(count), width).astype(np.float32)
 
 
-def grid_positions(rows: int, columns: int, width: int) -> Float32[np.ndarray, "S width"]:
-    """Returns the positions of a grid's cells, row by row: the column in the first half of the channels."""
-    row, column = np.divmod(np.arange(rows * columns), columns)
+def grid_positions(rows: int, columns: int, width: int, scale: float = 1.0) -> Float32[np.ndarray, "S width"]:
+    """Returns the positions of a grid's cells ÷ ``scale``, row by row: the column in the first half of the channels."""
+    row, column = (x / scale for x in np.divmod(np.arange(rows * columns), columns))
     return np.concatenate([_waves(column, width // 2), _waves(row, width // 2)], axis=1).astype(np.float32)
 
 
@@ -37,14 +37,15 @@ def time_waves(t: Int[Array, " B"], width: int = TIME_CHANNELS) -> Float[Array, 
 
 
 class TimeEmbedding(nn.Module):
-    """An MLP on :func:`time_waves`."""
+    """An MLP on :func:`time_waves`, as many as ``channels``."""
 
     width: int
+    channels: int = TIME_CHANNELS
 
     @nn.compact
     def __call__(self, t: Int[Array, " B"]) -> Float[Array, "B C"]:
         small = nn.initializers.normal(0.02)
-        x = nn.Dense(self.width, kernel_init=small, name="fc1")(time_waves(t))
+        x = nn.Dense(self.width, kernel_init=small, name="fc1")(time_waves(t, self.channels))
         return nn.Dense(self.width, kernel_init=small, name="fc2")(nn.silu(x))
 
 

@@ -15,12 +15,17 @@ Latents: TypeAlias = Float[Array, "*N"]
 
 
 def alphas(noise: NoiseConfig) -> Float64[np.ndarray, " steps"]:
-    """Returns ᾱ_t, the share of the signal's power that is left after step t, falling with t."""
+    """Returns ᾱ_t, the share of the signal's power that is left after step t, falling with t; in the end perhaps 0."""
     if noise.betas == "linear":
         betas = np.linspace(noise.beta_start, noise.beta_end, noise.steps)
     else:
         betas = np.linspace(noise.beta_start**0.5, noise.beta_end**0.5, noise.steps) ** 2
-    return np.cumprod(1.0 - betas)
+    left = np.cumprod(1.0 - betas)
+    left = left / (noise.snr_shift + (1 - noise.snr_shift) * left)
+    if not noise.zero_terminal:
+        return left
+    signal = np.sqrt(left)  # https://arxiv.org/abs/2305.08891, algorithm 1
+    return np.square((signal - signal[-1]) * signal[0] / (signal[0] - signal[-1]))
 
 
 def scales(noise: NoiseConfig, t: Int[Array, " B"], axes: int) -> tuple[Latents, Latents]:

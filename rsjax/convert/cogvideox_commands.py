@@ -1,0 +1,160 @@
+"""Converts CogVideoX and makes files of text embeddings, for ``python -m rsjax.convert``. Functions return lines."""
+
+import importlib
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.clip import UNKNOWN
+from rsjax.config import CogVideoXConfig
+from rsjax.convert import cogvideox
+from rsjax.convert.commands import REPLACES, check_file
+from rsjax.convert.directory import Part, save_part, saved_part
+from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
+from rsjax.convert.table import to_tensors
+from rsjax.data.store import open_store
+from rsjax.errors import first_line
+from rsjax.files import read_json, write_file, write_json
+from rsjax.models.cogvideox import autoencoder
+from rsjax.models.cogvideox.pretrained import saved_architecture
+from rsjax.models.cogvideox.text import EMPTY, write_texts
+from rsjax.models.cogvideox.transformer import shapes
+from rsjax.models.saved import Inputs, read_model
+from rsjax.training.checkpoint import load_weights
+
+PARTS: tuple[Part, Part] = ("tokenizer", "world_model")
+_SHARD = re.compile(r"(.*)-(\d{5})-of-(\d{5})\.safetensors")
+TOKENS = 226
+
+
+def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
+    """Imports a public autoencoder or transformer into a directory, or exports a directory's to a safetensors file.
+
+    Args:
+        source: of a network in several files, such as ``…-00001-of-00003.safetensors``, any one.
+        part: to export; None: the only one.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        return [_export(source, out, part)]
+    tensors, names = _read(source)
+    settings, vae = cogvideox.read_settings(source), cogvideox.is_autoencoder(source, tensors)
+    part, other = PARTS if vae else PARTS[::-1]
+    if settings.get("_class_name", cogvideox.CLASSES[part]) != cogvideox.CLASSES[part]:
+        raise ConvertError(f"{source}: is no {settings['_class_name']}, as {cogvideox.CONFIG} beside it says")
+    saved = saved_part(out, CogVideoXConfig, other)
+    before, inputs = saved or (None, Inputs(0, 0))
+    if vae:
+        network, params = cogvideox.autoencoder_from_public(source, tensors, settings, names)
+        model = replace(before or CogVideoXConfig(), autoencoder=network)
+        lines = [f"{out}: an autoencoder of {len(tensors)} tensors, none left aside, {network}"]
+        if "scaling_factor" not in settings:
+            lines.append(f"no {cogvideox.CONFIG} with scaling_factor beside {source.name}: 5B-I2V's 0.7 is taken")
+    else:
+        model, params, aside = cogvideox.transformer_from_public(source, tensors, settings, names)
+        network = model.autoencoder
+        model = replace(model, autoencoder=before.autoencoder if before else network)
+        lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {model}"]
+        lines += [f"left aside: {aside} tensor of fixed positions, which the network computes"] * aside
+    if before and before.autoencoder.latent_channels != network.latent_channels:
+        there, here = before.autoencoder.latent_channels, network.latent_channels
+        raise ConvertError(f"{out}: holds a part with {there} latent channels, this one has {here}; choose another OUT")
+    lines[0] += REPLACES * save_part(out, part, model, inputs, params)
+    return lines
+
+
+def _read(source: Path) -> tuple[Tensors, dict[str, str]]:
+    """Returns the tensors of a file, or of all files of a network of which it is one."""
+    match = _SHARD.fullmatch(source.name)
+    numbers = range(1, int(match[3]) + 1) if match else ()
+    paths = [source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}") for i in numbers] if match else [source]
+    tensors: Tensors = {}
+    names: dict[str, str] = {}
+    for file in map(read_tensors, paths):
+        tensors |= file.tensors
+        names |= file.names
+    return tensors, names
+
+
+def _export(source: Path, out: Path, part: Part | None) -> str:
+    replaces, parts = check_file(out), [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
+    if part not in parts and len(parts) != 1:
+        raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of a CogVideoX'}; name one with --part")
+    part = part if part in parts else parts[0]
+    model = read_model(source, CogVideoXConfig, part)
+    if part == "tokenizer":
+        of = jax.eval_shape(lambda key: autoencoder.init(model.autoencoder, key), jax.random.key(0))
+        params = load_weights(source / part / "weights", of)
+        settings = cogvideox.autoencoder_settings(model.autoencoder, params)
+        params = {name: params[name] for name in ("encoder", "decoder")}
+        entries = cogvideox.autoencoder_table(params)
+    else:
+        params = load_weights(source / part / "weights", shapes(saved_architecture(model)))
+        settings, entries = cogvideox.transformer_settings(model), cogvideox.transformer_table(model)
+    tensors = to_tensors(params, entries)
+    beside, cure = out.parent / cogvideox.CONFIG, "write to an empty directory"
+    if beside.exists() and read_json(beside, cure=cure) != settings:
+        raise ConvertError(f"{beside}: exists with other settings; {cure}")
+    write_safetensors(out, tensors, {})
+    write_json(beside, settings)
+    text = f"under their public names; settings in {cogvideox.CONFIG}{replaces}"
+    return f"{out}: {len(tensors)} tensors of CogVideoX's {part}, {text}"
+
+
+def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | None, tokens: int = TOKENS) -> list[str]:
+    """Embeds the empty text and tasks with a T5 encoder from a local directory; padding is not masked, as in public.
+
+    Args:
+        source: a directory with ``text_encoder`` (safetensors) and ``tokenizer``, as the public models have.
+        tasks: in words.
+        store: a store of clips whose tasks are embedded too.
+        tokens: of each text, which is padded or cut.
+
+    Raises:
+        UserError: the directory holds no such encoder, ``transformers`` is not installed, or there are no tasks.
+    """
+    replaces = check_file(out)
+    names = [EMPTY, *dict.fromkeys([*tasks, *(_tasks(store) if store else ())])]
+    if len(names) == 1:
+        raise ConvertError(f"{out}: there are no tasks to embed; name them with --task, or a store with --store")
+    try:
+        torch, transformers = (importlib.import_module(name) for name in ("torch", "transformers"))
+    except ImportError as error:
+        raise ConvertError(
+            f"{source}: embedding texts needs transformers and PyTorch ({error}); pip install -e '.[text]'"
+        ) from None
+    for folder in ("text_encoder", "tokenizer"):
+        if not (source / folder).is_dir():
+            raise ConvertError(f"{source}: has no directory {folder}; pass that of a public CogVideoX")
+    local: dict[str, Any] = {"local_files_only": True}
+    try:
+        tokenizer = transformers.AutoTokenizer.from_pretrained(source / "tokenizer", **local)
+        encoder = transformers.T5EncoderModel.from_pretrained(source / "text_encoder", use_safetensors=True, **local)
+    except Exception as error:  # transformers raises many types, for missing and damaged files
+        raise ConvertError(f"{source}: holds no T5 encoder with its tokenizer ({first_line(error)})") from error
+    made, fixed = [], {"padding": "max_length", "max_length": tokens, "truncation": True, "return_tensors": "pt"}
+    with torch.no_grad():
+        for name in names:
+            made.append(encoder.eval()(tokenizer(name, **fixed).input_ids)[0].float().numpy())
+    embeddings = np.concatenate(made)
+    write_file(out, write_texts(names, embeddings))
+    return [
+        f"{out}: {len(names)} texts of {tokens} tokens of {embeddings.shape[2]} numbers, the empty one first{replaces}"
+    ]
+
+
+def _tasks(store: Path) -> list[str]:
+    """Returns the tasks of a store's clips, in words."""
+    opened = open_store(store)
+    splits = [split for split in opened.splits if opened.labelled(split)]
+    tasks = [word for split in splits for word in opened.labels(split).words.get("task", ())]
+    if not splits:
+        tasks = [opened.source(split)[i]["task"] for split in opened.splits for i in range(len(opened.source(split)))]
+    return [task for task in dict.fromkeys(tasks) if task != UNKNOWN]

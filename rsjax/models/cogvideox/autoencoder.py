@@ -1,0 +1,189 @@
+"""Trains CogVideoX's autoencoder on the frames of clips, and encodes and decodes videos with the trained one.
+
+Videos are filled up to 8k + 1 frames by repeating the last, as in the public fine-tuner: of other lengths the public
+code loses frames. Latents are standardised channel by channel by numbers in the parameters ("latents"): the public
+factor for public weights, and for a trained autoencoder what its training fits to its latents.
+
+Axes: B videos, T frames, H×W pixels, t latent frames of h×w cells, z latent channels, D draws.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import CausalVAEConfig, CogVideoXConfig, Config, TokenizerTrainConfig, require
+from rsjax.config.cogvideox import padded_frames
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.devices import divide
+from rsjax.models.diffusion import latents as distributions
+from rsjax.models.saved import check_alike, read_model
+from rsjax.tokenizers import causal_vae as vae
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.lpips import lpips
+from rsjax.tokenizers.magvit2 import to_pixels, to_unit
+from rsjax.tokenizers.training import lpips_weights
+from rsjax.trainable import Extra, Params, StepContext, Term
+
+Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's noise
+
+CHUNK_PIXELS = CHUNK * 64**2  # of frames per pass, to bound memory
+FREE = {"kl_weight", "image_draws", "image_noise"}
+
+
+def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
+    """Returns fresh parameters of "encoder", "decoder" and "latents"."""
+    z, size = config.latent_channels, 2 * config.downsampling
+    return {
+        "encoder": vae.Encoder(config).init(key, jnp.zeros((1, 1, size, size, 3)))["params"],
+        "decoder": vae.Decoder(config).init(jax.random.fold_in(key, 1), jnp.zeros((1, 1, 2, 2, z)))["params"],
+        "latents": {"mean": jnp.zeros(z), "log_deviation": jnp.zeros(z)},
+    }
+
+
+@dataclass(frozen=True)
+class CausalVAETraining(Autoencoder[Batch]):
+    """Learns to reconstruct consecutive frames from a sample of their posterior."""
+
+    config: CausalVAEConfig
+    train: TokenizerTrainConfig
+    image_size: int
+
+    def __post_init__(self) -> None:
+        require(
+            not self.train.adversarial_weight,
+            "tokenizer_train.adversarial_weight is above 0, but CogVideoX's autoencoder has no discriminator here; "
+            "set it to 0",
+        )
+        require(
+            self.train.steps > 0 or bool(self.train.start_from),
+            "tokenizer_train.steps is 0, so the autoencoder stays as it is saved, but tokenizer_train.start_from is "
+            "empty; name the directory that python -m rsjax.convert cogvideox made",
+        )
+
+    @classmethod
+    def create(cls, config: Config) -> "CausalVAETraining":
+        """Returns the training of the autoencoder of a configuration whose model is CogVideoX."""
+        assert isinstance(config.model, CogVideoXConfig)
+        return cls(config.model.autoencoder, config.tokenizer_train, config.clips.image_size)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        weights = {name: w for name, w in self.train.loss_weights.items() if name in ("l1", "l2", "perceptual")}
+        return weights | {"kl": self.config.kl_weight, "standard": 1.0}
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return init(self.config, key)
+
+    def init_extra(self) -> Extra:
+        return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
+
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and perhaps "perceptual"."""
+        frames = to_unit(batch["frames"])
+        mean, log_variance = distributions.posterior(vae.encode(self.config, params, frames))
+        latents = distributions.draw(mean, log_variance, key, batch["index"])
+        output = vae.decode(self.config, params, latents)
+        means = distributions.means_of_terms(frames, output, mean, log_variance, latents, params["latents"])
+        if "perceptual" in self.loss_weights:
+            assert context.extra is not None
+            images = (x.reshape(-1, *x.shape[2:]) for x in (frames, output))
+            means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], *images))
+        count = jnp.float32(len(frames))
+        return {name: (means[name] * count, count) for name in self.loss_weights}
+
+    def transform(self) -> Transform:
+        return partial(_window, self.train.frames_per_clip, self.train.flip)
+
+    def batch(self, arrays: Arrays) -> Batch:
+        return {"frames": arrays["frames"], "index": np.arange(len(arrays["frames"]), dtype=np.int32)}
+
+    def codec(self, params: Params, normalization: Normalization) -> "CausalCodec":
+        return CausalCodec(self.config, params)
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        """Returns the shapes of saved weights.
+
+        Raises:
+            UserError: they are missing or of another network; the message names the differing fields.
+        """
+        saved = read_model(directory, CogVideoXConfig, "tokenizer").autoencoder
+        check_alike(directory, saved, self.config, FREE, "model.autoencoder")
+        return jax.eval_shape(partial(init, saved), jax.random.key(0))
+
+
+def filled(frames: np.ndarray, axis: int) -> np.ndarray:
+    """Repeats the last frame until there are 8k + 1."""
+    count = frames.shape[axis]
+    return frames.take(np.minimum(np.arange(padded_frames(count)), count - 1), axis)
+
+
+def _window(count: int, flip: bool, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns ``frames``: consecutive ones of a clip, at most ``count``, filled up to 8k + 1."""
+    rgb = record["rgb"]
+    first = rng.integers(0, max(0, len(rgb) - count) + 1)
+    frames = filled(rgb[first : first + count], 0)
+    return {"frames": np.ascontiguousarray(frames[:, :, ::-1]) if flip and rng.random() < 0.5 else frames}
+
+
+@dataclass(frozen=True)
+class CausalCodec:
+    """A trained autoencoder that takes and returns numpy arrays. Its latents are standardised."""
+
+    config: CausalVAEConfig
+    params: Params
+
+    def encode(self, video: Video) -> dict[str, np.ndarray]:
+        """Returns the posterior's "mean" and "deviation", (B, t, h, w, z), and the number of "frames", (B,)."""
+        count = np.full(len(video), video.rgb.shape[1], np.int32)
+        return self._encode(filled(video.rgb, 1)) | {"frames": count}
+
+    def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
+        """Returns the frames of latents "mean", an odd number of latent frames, cut to "frames" if there are any."""
+        latents = np.asarray(tokens["mean"])
+        pixels = latents.shape[1] * 4 * (latents.shape[-2] * self.config.downsampling) ** 2
+        frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, CHUNK_PIXELS // pixels))
+        return Video(np.round(frames[:, : tokens["frames"][0] if "frames" in tokens else None]).astype(np.uint8))
+
+    def images(
+        self, rgb: UInt8[np.ndarray, "B H W 3"], rng: np.random.Generator | None = None
+    ) -> dict[str, np.ndarray]:
+        """Returns the latents of images that a video begins with, "mean" and "deviation", (B, D, h, w, z).
+
+        Args:
+            rng: draws the noise of ``config.image_draws`` noisy images; None: of the images as they are, D = 1.
+        """
+        draws = self.config.image_draws if rng is not None else 0
+        pixels = np.repeat(rgb[:, None], max(1, draws), axis=1).astype(np.float32)
+        if rng is not None and draws:
+            spread = np.exp(rng.normal(*self.config.image_noise, pixels.shape[:2]))[..., None, None, None]
+            pixels += 127.5 * spread * rng.standard_normal(pixels.shape, np.float32)
+        made = self._encode(pixels.astype(np.float32).reshape(-1, 1, *rgb.shape[1:]))
+        return {name: x.reshape(*pixels.shape[:2], *x.shape[2:]) for name, x in made.items()}
+
+    def _encode(self, frames: np.ndarray) -> dict[str, np.ndarray]:
+        most = max(1, CHUNK_PIXELS // (frames.shape[1] * frames.shape[2] ** 2))
+        made = in_chunks(partial(self._run, _encode), frames, 4, most)
+        return dict(zip(("mean", "deviation"), np.split(made, 2, axis=-1), strict=True))
+
+    def _run(self, function: Any, chunk: np.ndarray) -> Any:
+        return function(self.config, self.params, divide(chunk, self.params))
+
+
+@partial(jax.jit, static_argnums=0)
+def _encode(config: CausalVAEConfig, params: Params, frames: Any) -> Float[Array, "B t h w z2"]:
+    return distributions.standardised(vae.encode(config, params, to_unit(frames)), params["latents"])
+
+
+@partial(jax.jit, static_argnums=0)
+def _decode(config: CausalVAEConfig, params: Params, latents: Any) -> Float[Array, "B T H W 3"]:
+    return to_pixels(vae.decode(config, params, distributions.original(latents, params["latents"])))

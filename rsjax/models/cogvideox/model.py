@@ -1,0 +1,173 @@
+"""CogVideoX as a family: latents of the clips, the error of the velocity, rollouts from pixels to pixels.
+
+Axes: B clips, T frames, F latent frames of h×w cells with C channels, D noisy encodings of an image.
+"""
+
+import zlib
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from rsjax.clip import Video
+from rsjax.config import ClipShape, CogVideoXConfig, Config, TextConfig
+from rsjax.config.cogvideox import padded_frames
+from rsjax.data.codec import Record
+from rsjax.data.normalization import Normalization
+from rsjax.data.order import Arrays, Transform
+from rsjax.data.store import Store
+from rsjax.models.base import Assets, WorldModel, implements
+from rsjax.models.cogvideox import pretrained
+from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining
+from rsjax.models.cogvideox.rollout import rollout
+from rsjax.models.cogvideox.text import check_tasks, empty_texts, texts_of
+from rsjax.models.cogvideox.transformer import Architecture, Transformer, forward_flops
+from rsjax.models.diffusion.schedule import add_noise, target
+from rsjax.progress import note
+from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.tokenize import described, prepare_store
+from rsjax.trainable import Params, StepContext, Term
+
+Batch = dict[str, Any]  # latents (B, F, h, w, C), image (B, h, w, C), text (B, …), weight and index (B,)
+
+
+@implements(CogVideoXConfig)
+@dataclass(frozen=True)
+class CogVideoX(WorldModel[Batch]):
+    """The diffusion transformer on the latents of the causal autoencoder.
+
+    Attributes:
+        config: the family's settings.
+        clips: the shape of the training clips.
+    """
+
+    config: CogVideoXConfig
+    clips: ClipShape
+
+    @classmethod
+    def create(cls, config: Config) -> "CogVideoX":
+        assert isinstance(config.model, CogVideoXConfig)
+        return cls(config.model, config.clips)
+
+    @classmethod
+    def autoencoder(cls, config: Config) -> Autoencoder[Any]:
+        return CausalVAETraining.create(config)
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return self.config.loss_weights
+
+    @property
+    def architecture(self) -> Architecture:
+        """The network's settings."""
+        return Architecture.create(self.config, self.clips)
+
+    def init(self, key: Key[Array, ""]) -> Params:
+        return Transformer(self.architecture).init_params(key)
+
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+        """Returns "error": the mean square error of the velocity in all latent frames that carry noise."""
+        noise, latents, channels = self.config.noise, batch["latents"], self.config.image == "channels"
+
+        def draw(index: Int[Array, ""]) -> tuple[Array, Array]:
+            t_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
+            return jax.random.randint(t_key, (), 0, noise.steps), jax.random.normal(noise_key, latents.shape[1:])
+
+        t, drawn = jax.vmap(draw)(batch["index"])
+        noisy, image = add_noise(noise, latents, drawn, t), batch["image"]
+        noisy = noisy if channels else noisy.at[:, 0].set(image)
+        inputs = (noisy, t, batch["text"], image if channels else None)
+        predicted: Any = Transformer(self.architecture).apply({"params": params}, *inputs)
+        error = jnp.square(predicted - target(noise, latents, drawn, t))[:, 0 if channels else 1 :]
+        weight = batch["weight"].astype(jnp.float32)
+        return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
+
+    def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
+        """Makes the latents of every clip and its image, stored beside the clips for all runs with this autoencoder.
+
+        Raises:
+            UserError: a task of the clips has no text.
+        """
+        codec, frames = self._codec(assets), self.clips.frames
+        check_tasks(self.config.text, ())  # before the long work
+        if padded_frames(frames) != frames:
+            note(f"clips of {frames} frames are encoded as {padded_frames(frames)}, 8k + 1, by repeating the last")
+
+        def encode(clip: Record) -> Record:
+            rng = np.random.default_rng(zlib.crc32(clip["rgb"][0].tobytes()))
+            video, image = codec.encode(Video(clip["rgb"][None])), codec.images(clip["rgb"][:1], rng)
+            latents = {name: video[name] for name in ("mean", "deviation")}
+            latents |= {f"image_{name}": x for name, x in image.items()}
+            return {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
+
+        size = self.clips.image_size
+        store = prepare_store(clips, codec.config, codec.params, encode, size, folder, max_damaged)
+        for split in filter(store.labelled, store.splits):
+            check_tasks(self.config.text, store.labels(split).words["task"])
+        return store
+
+    def transform(self, normalization: Normalization) -> Transform:
+        return partial(latent_arrays, self.config.text, self.config.image_dropout)
+
+    def example(self, rng: np.random.Generator) -> Record:
+        arch, text = self.architecture, self.config.text
+        draws = max(1, self.config.autoencoder.image_draws)
+        cells = (arch.rows, arch.columns, arch.channels)
+        shapes = {"": (arch.frames, *cells), "image_": (draws, *cells)}
+        means = {f"{name}mean": rng.normal(size=shape).astype(np.float16) for name, shape in shapes.items()}
+        record = means | {f"{name}deviation": np.full(shape, 0.1, np.float16) for name, shape in shapes.items()}
+        shown = rng.normal(size=(text.tokens, text.width)).astype(np.float32) if text.file else np.int32(1)
+        return record | {"text": shown}
+
+    def generate(
+        self,
+        params: Params,
+        assets: Assets,
+        prompt: Video,
+        actions: Float[np.ndarray, "B T A"],
+        *,
+        index: Int[np.ndarray, " B"] | None = None,
+        depth: bool = True,
+    ) -> Video:
+        """Generates the videos that follow the prompts' last frames and their tasks; of actions only T counts."""
+        numbers, frames = np.arange(len(prompt)) if index is None else np.asarray(index), actions.shape[1]
+        codec = self._codec(assets)
+        return Video(rollout(self.architecture, codec, self.clips.frames, params, prompt, frames, numbers))
+
+    def reconstruct(self, assets: Assets, video: Video) -> Video:
+        codec = self._codec(assets)
+        return codec.decode(codec.encode(video))
+
+    def pretrained_shapes(self, directory: Path) -> Params:
+        return pretrained.shapes_of(directory, self.config)
+
+    def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
+        return pretrained.completed(fresh, saved)
+
+    def flops(self, frames: int) -> dict[str, int]:
+        forward = forward_flops(self.architecture)
+        return {"forward": forward, "train": 3 * forward}
+
+    def _codec(self, assets: Assets) -> CausalCodec:
+        assert assets.tokenizer is not None
+        return CausalCodec(self.config.autoencoder, assets.tokenizer)
+
+
+def latent_arrays(text: TextConfig, image_dropout: float, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns samples of a record's posteriors, of one of its noisy images or zeros, and its text or the empty one."""
+    latents, images = (
+        record[f"{name}mean"].astype(np.float32)
+        + record[f"{name}deviation"] * rng.standard_normal(record[f"{name}mean"].shape, np.float32)
+        for name in ("", "image_")
+    )
+    image = images[rng.integers(len(images))] * np.float32(rng.random() >= image_dropout)
+    if rng.random() < text.dropout:
+        shown = empty_texts(text, 1)[0]
+    else:  # random records for benchmarks have their own text
+        shown = record["text"] if "text" in record else texts_of(text, [record["task"]], 1)[0]
+    return {"latents": latents, "image": image, "text": shown}

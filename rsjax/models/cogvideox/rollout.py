@@ -1,0 +1,81 @@
+"""Generates videos chunk by chunk: each chunk continues the last frame of the one before it, as an image.
+
+Axes: B clips, T frames, P of the prompt, F latent frames of h×w cells with C channels.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt8
+
+from rsjax.clip import Video
+from rsjax.devices import divide
+from rsjax.models.cogvideox.autoencoder import CausalCodec
+from rsjax.models.cogvideox.text import empty_texts, texts_of
+from rsjax.models.cogvideox.transformer import Architecture, Transformer
+from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.trainable import Params
+
+
+def rollout(
+    arch: Architecture,
+    codec: CausalCodec,
+    clip_frames: int,
+    params: Params,
+    prompt: Video,
+    frames: int,
+    index: Int[np.ndarray, " B"],
+) -> UInt8[np.ndarray, "B T H W 3"]:
+    """Returns T frames, of which the first P are the prompt as the autoencoder sees it; only the last is read.
+
+    Args:
+        clip_frames: of a training clip; a chunk adds one less.
+        index: each clip's number, which decides its noise.
+    """
+    made, image, number = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1], 0
+    count, text = len(prompt), arch.model.text
+    texts, empty = texts_of(text, prompt.tasks, count), empty_texts(text, count)
+    for number in range(-(-(frames - prompt.rgb.shape[1]) // (clip_frames - 1))):
+        key = jax.random.fold_in(jax.random.key(arch.model.sample.seed), number)
+        given = codec.images(image)["mean"][:, 0]
+        latents = np.asarray(_chunk(arch, params, key, *divide((given, texts, empty, index), params)))
+        made.append(codec.decode({"mean": latents}).rgb[:, 1:clip_frames])
+        image = made[-1][:, -1]
+    return np.concatenate(made, axis=1)[:, :frames]
+
+
+@partial(jax.jit, static_argnums=0)
+def _chunk(
+    arch: Architecture,
+    params: Params,
+    key: Key[Array, ""],
+    image: Float[Array, "B h w C"],
+    texts: Any,
+    empty: Any,
+    index: Int[Array, " B"],
+) -> Float[Array, "B F h w C"]:
+    """Returns the latents of a chunk that begins with an image."""
+    cfg = arch.model
+    shape, guidance = (arch.frames, *image.shape[1:]), cfg.sample.guidance
+    start = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), shape))(index)
+    twice = guidance != 1
+    text = jnp.concatenate([texts, empty]) if twice else texts
+
+    def both(x: Array) -> Array:
+        return jnp.concatenate([x, x]) if twice else x
+
+    def predict(x: Float[Array, "B F h w C"], t: Int[Array, ""]) -> Float[Array, "B F h w C"]:
+        given = both(image) if cfg.image == "channels" else None
+        v: Any = Transformer(arch).apply({"params": params}, both(x), jnp.full(len(text), t), text, given)
+        if not twice:
+            return v
+        with_text, without = jnp.split(v, 2)
+        return without + guidance * (with_text - without)
+
+    def restore(x: Float[Array, "B F h w C"]) -> Float[Array, "B F h w C"]:
+        return x if cfg.image == "channels" else x.at[:, 0].set(image)
+
+    return denoise(make_plan(cfg.noise, cfg.sample), predict, start, restore)

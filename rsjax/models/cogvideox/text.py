@@ -1,0 +1,105 @@
+"""Files of text embeddings, and which text each clip has.
+
+A file of ``python -m rsjax.convert text`` has a tensor ``embeddings``, (texts, tokens, width), and in its metadata the
+texts in the same order, the first of which is empty. Learned tokens are numbered alike.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from jaxtyping import Float32
+
+from rsjax.clip import UNKNOWN
+from rsjax.config import TextConfig
+from rsjax.errors import UserError, first_line
+
+EMBEDDINGS, TEXTS = "embeddings", "texts"
+EMPTY = ""
+CURE = "make it with python -m rsjax.convert text, and name it with --model.text.file"
+
+
+class Texts(NamedTuple):
+    """The texts of a file and their embeddings."""
+
+    names: tuple[str, ...]
+    embeddings: Float32[np.ndarray, "texts n w"]
+
+
+@lru_cache(maxsize=1)
+def read_texts(file: str, tokens: int, width: int) -> Texts:
+    """Reads a file of embeddings.
+
+    Raises:
+        UserError: it is missing, damaged, something else, or of another shape.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file of text embeddings; {CURE}")
+    try:
+        with safetensors.safe_open(path, "np") as opened:
+            names = json.loads((opened.metadata() or {}).get(TEXTS, "[]"))
+            made = opened.get_tensor(EMBEDDINGS).astype(np.float32) if EMBEDDINGS in opened.keys() else None  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{path}: not a file of text embeddings, or damaged ({first_line(error)}); {CURE}") from error
+    if made is None or made.ndim != 3 or len(names) != len(made) or names[:1] != [EMPTY]:
+        raise UserError(f"{path}: holds no {EMBEDDINGS} of texts, the empty one first; {CURE}")
+    if made.shape[1:] != (tokens, width):
+        raise UserError(
+            f"{path}: its texts have {made.shape[1]} tokens of {made.shape[2]} numbers, the model takes {tokens} of "
+            f"{width}; set model.text.tokens and width, or name another file"
+        )
+    return Texts(tuple(names), made)
+
+
+def write_texts(names: Sequence[str], embeddings: Float32[np.ndarray, "texts n w"]) -> bytes:
+    """Returns the content of a file of embeddings."""
+    return safetensors.numpy.save(
+        {EMBEDDINGS: np.ascontiguousarray(embeddings)}, {TEXTS: json.dumps(list(names), ensure_ascii=False)}
+    )
+
+
+def texts_of(config: TextConfig, tasks: Iterable[str] | None, count: int) -> np.ndarray:
+    """Returns what the network reads of ``count`` clips' tasks: embeddings (B, n, w), or numbers of learned ones.
+
+    Args:
+        tasks: in words; None: unknown. The text of an unknown task is empty, or the only learned one.
+
+    Raises:
+        UserError: a task has no embedding, or the file is missing or does not fit.
+    """
+    if not (config.file or config.tasks):
+        return np.ones(count, np.int32)
+    wanted = [EMPTY if task in (None, UNKNOWN) else task for task in ([None] * count if tasks is None else tasks)]
+    check_tasks(config, wanted)
+    rows = np.array([_names(config).index(task) for task in wanted], np.int32)
+    return _read(config).embeddings[rows] if config.file else rows
+
+
+def empty_texts(config: TextConfig, count: int) -> np.ndarray:
+    """Returns :func:`texts_of` the empty text."""
+    return texts_of(config, None, count) if config.file else np.zeros(count, np.int32)
+
+
+def check_tasks(config: TextConfig, tasks: Iterable[str]) -> None:
+    """Raises :class:`UserError` if a task has no text of its own, or the file is missing or does not fit."""
+    if not (config.file or config.tasks):
+        return
+    names = _names(config)
+    if missing := sorted(set(tasks) - {*names, UNKNOWN}):
+        where, cure = (config.file, CURE) if config.file else ("model.text.tasks", "name it there")
+        listed = ", ".join(map(repr, names[1:])) or "none"
+        raise UserError(f"{where}: no text of the task {missing[0]!r}, only of {listed}; {cure}")
+
+
+def _names(config: TextConfig) -> tuple[str, ...]:
+    return _read(config).names if config.file else (EMPTY, *config.tasks)
+
+
+def _read(config: TextConfig) -> Texts:
+    return read_texts(config.file, config.tokens, config.width)

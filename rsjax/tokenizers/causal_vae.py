@@ -1,0 +1,184 @@
+"""CogVideoX's autoencoder of videos: convolutions that are causal in time, and pieces that continue each other.
+
+Norms see the frames of one piece (8 frames in the encoder, 2 latent frames in the decoder), so videos must be cut as in
+the public code. Between pieces, every causal convolution keeps its last two frames in the collection "past".
+
+Axes: B videos, T frames of a piece, H×W pixels or cells, C channels, z latent channels.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rsjax.config import CausalVAEConfig
+from rsjax.config.cogvideox import DECODED, ENCODED
+from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
+from rsjax.tokenizers.vae_blocks import Downsample, Upsample, group_norm
+from rsjax.trainable import Params
+
+Video = Float[Array, "B T H W C"]
+
+SIZE = 3  # frames, rows and columns that a convolution covers
+TIME_LEVELS = 2  # levels that halve or double time
+PAST = "past"
+
+
+class CausalConv(nn.Module):
+    """A convolution over 3 frames of 3×3 cells: this one and the two before; before the first frame stands itself."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Video) -> Video:
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (SIZE, SIZE, SIZE, x.shape[-1], self.features))
+        known = self.has_variable(PAST, "frames")
+        past = self.get_variable(PAST, "frames") if known else jnp.repeat(x[:, :1], SIZE - 1, axis=1)
+        frames = jnp.concatenate([past, x], axis=1)
+        if self.is_mutable_collection(PAST):
+            self.put_variable(PAST, "frames", frames[:, 1 - SIZE :])
+        return convolve(frames, kernel) + self.param("bias", nn.initializers.zeros, (self.features,))
+
+
+def convolve(frames: Video, kernel: Float[Array, "3 3 3 C D"]) -> Video:
+    """Returns the 3-D convolution, padded by zeros in space alone, by the fastest implementation on this platform."""
+    around = ((1, 1), (1, 1))
+    if jax.default_backend() != "cpu":
+        names = ("NTHWC", "THWIO", "NTHWC")
+        return jax.lax.conv_general_dilated(frames, kernel, (1, 1, 1), ((0, 0), *around), dimension_numbers=names)
+    count, names = frames.shape[1] - SIZE + 1, ("NHWC", "HWIO", "NHWC")
+    stacked = jnp.concatenate([frames[:, i : i + count] for i in range(SIZE)], axis=-1)
+    flat = kernel.transpose(1, 2, 0, 3, 4).reshape(SIZE, SIZE, -1, kernel.shape[-1])
+    return by_frame(stacked, lambda x: jax.lax.conv_general_dilated(x, flat, (1, 1), around, dimension_numbers=names))
+
+
+def by_frame(x: Video, function: Any) -> Video:
+    """Applies a function of images to all frames."""
+    made = function(x.reshape(-1, *x.shape[2:]))
+    return made.reshape(*x.shape[:2], *made.shape[1:])
+
+
+class CellNorm(nn.Module):
+    """GroupNorm, then a scale and a shift of each cell that depend on the latents there."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Video, latents: Float[Array, "B t h w z"]) -> Video:
+        # Repeating cells after the layers gives the same as before them, with less work.
+        scale, shift = (spread(nn.Dense(x.shape[-1], name=f"conv_{name}")(latents), x) for name in "yb")
+        return group_norm(self.groups, name="norm_layer")(x) * scale + shift
+
+
+def spread(cells: Video, like: Video) -> Video:
+    """Repeats cells to the frames, rows and columns of another video; the first of an odd number stays alone."""
+    frames, times, alone = like.shape[1], like.shape[2] // cells.shape[2], cells.shape[1] % 2
+    if cells.shape[1] != frames:
+        cells = _repeat(cells, (frames - alone) // (cells.shape[1] - alone))
+    return cells.repeat(times, axis=2).repeat(times, axis=3)
+
+
+def _repeat(x: Video, times: int) -> Video:
+    """Repeats frames; the first of an odd number stays alone."""
+    alone = x.shape[1] % 2
+    return jnp.concatenate([x[:, :alone], x[:, alone:].repeat(times, axis=1)], axis=1)
+
+
+def _halve(x: Video) -> Video:
+    """Averages pairs of frames; the first of an odd number stays alone."""
+    alone = x.shape[1] % 2
+    pairs = x[:, alone:].reshape(len(x), -1, 2, *x.shape[2:])
+    return jnp.concatenate([x[:, :alone], pairs.mean(axis=2)], axis=1)
+
+
+class ResBlock(nn.Module):
+    """Norm → SiLU → causal convolution, twice, plus the input, through a linear layer where the width changes."""
+
+    features: int
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Video, latents: Float[Array, "B t h w z"] | None = None) -> Video:
+        h = x
+        for i in (1, 2):
+            if latents is None:
+                h = group_norm(self.groups, name=f"norm{i}")(h)
+            else:
+                h = CellNorm(self.groups, name=f"norm{i}")(h, latents)
+            h = CausalConv(self.features, name=f"conv{i}")(nn.silu(h))
+        if x.shape[-1] != self.features:
+            x = nn.Dense(self.features, name="conv_shortcut")(x)
+        return x + h
+
+
+class Encoder(nn.Module):
+    """Maps a piece of a video to the posterior's mean and log-variance, (B, t, h, w, 2 z)."""
+
+    config: CausalVAEConfig
+
+    @nn.compact
+    def __call__(self, frames: Float[Array, "B T H W 3"]) -> Video:
+        cfg, last = self.config, len(self.config.widths) - 1
+        x = frames if cfg.patch_size == 1 else by_frame(frames, lambda x: space_to_depth(x, cfg.patch_size))
+        x = CausalConv(cfg.widths[0], name="conv_in")(x)
+        for level, width in enumerate(cfg.widths):
+            for i in range(cfg.res_blocks):
+                x = ResBlock(width, cfg.norm_groups, name=f"down_{level}_block_{i}")(x)
+            if level < last:
+                x = _halve(x) if level < TIME_LEVELS and x.shape[1] > 1 else x
+                x = by_frame(x, Downsample(name=f"down_{level}_downsample"))
+        for i in range(2):
+            x = ResBlock(cfg.widths[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
+        x = nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))
+        return CausalConv(2 * cfg.latent_channels, name="conv_out")(x)
+
+
+class Decoder(nn.Module):
+    """Maps a piece of latents to frames, not clipped."""
+
+    config: CausalVAEConfig
+
+    @nn.compact
+    def __call__(self, latents: Float[Array, "B t h w z"]) -> Float[Array, "B T H W 3"]:
+        cfg, last = self.config, len(self.config.widths) - 1
+        x = CausalConv(cfg.widths[-1], name="conv_in")(latents)
+        for i in range(2):
+            x = ResBlock(cfg.widths[-1], cfg.norm_groups, name=f"mid_block_{i}")(x, latents)
+        for level, width in enumerate(reversed(cfg.widths)):
+            for i in range(cfg.res_blocks + 1):
+                x = ResBlock(width, cfg.norm_groups, name=f"up_{level}_block_{i}")(x, latents)
+            if level < last:
+                x = _repeat(x, 2) if level < TIME_LEVELS and x.shape[1] > 1 else x
+                x = by_frame(x, Upsample(name=f"up_{level}_upsample"))
+        x = nn.silu(CellNorm(cfg.norm_groups, name="norm_out")(x, latents))
+        x = CausalConv(3 * cfg.patch_size**2, name="conv_out")(x)
+        return x if cfg.patch_size == 1 else by_frame(x, lambda x: depth_to_space(x, cfg.patch_size))
+
+
+def encode(config: CausalVAEConfig, params: Params, frames: Float[Array, "B T H W 3"]) -> Float[Array, "B t h w z2"]:
+    """Returns the posterior's mean and log-variance of whole videos of 8k + 1 frames, piece by piece."""
+    return _in_pieces(Encoder(config), params["encoder"], frames, ENCODED)
+
+
+def decode(config: CausalVAEConfig, params: Params, latents: Float[Array, "B t h w z"]) -> Float[Array, "B T H W 3"]:
+    """Returns the frames of whole videos' latents, an odd number of latent frames, piece by piece."""
+    return _in_pieces(Decoder(config), params["decoder"], latents, DECODED)
+
+
+def _in_pieces(network: nn.Module, params: Params, x: Video, size: int) -> Video:
+    made: list[Video] = []
+    state: Any = {}
+    for piece in pieces(x.shape[1], size):
+        out, state = network.apply({"params": params, **state}, x[:, piece], mutable=[PAST])
+        made.append(out)
+    return jnp.concatenate(made, axis=1)
+
+
+def pieces(frames: int, size: int) -> Iterator[slice]:
+    """Yields the pieces of a video: of ``size`` frames each, the first with what remains."""
+    rest = frames % size
+    for i in range(max(1, frames // size)):
+        yield slice(i * size + rest * (i > 0), (i + 1) * size + rest)
