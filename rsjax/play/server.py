@@ -20,6 +20,7 @@ from rsjax.play.guard import Guard, Guarded
 from rsjax.play.hub import Hub
 
 PAGE = Path(__file__).parent / "page"
+PLAYER = Path(__file__).parents[1] / "report" / "player"  # modules that the page shares with the report, at page/player
 TYPES = {
     ".html": "text/html",
     ".css": "text/css",
@@ -76,8 +77,8 @@ class Routes:
 
     def __init__(self, hub: Hub, guard: Guard) -> None:
         self._hub, self._guard = hub, guard
-        found = (path for path in PAGE.rglob("*") if path.suffix in TYPES and path.is_file())
-        self._page = {path.relative_to(PAGE).as_posix(): path for path in found}
+        own, shared = _files(PAGE), _files(PLAYER)
+        self._page = own | {f"player/{name}": path for name, path in shared.items()}
 
     async def index(self, request: Request) -> Response:
         return self._file("index.html")
@@ -144,6 +145,11 @@ class Routes:
         if self._guard.knows(request.query_params):
             return None
         return _refused(401, "token", "the address lacks the token that the server printed")
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    found = (path for path in folder.rglob("*") if path.suffix in TYPES and path.is_file())
+    return {path.relative_to(folder).as_posix(): path for path in found}
 
 
 _LISTED = (("first", 0), ("count", 48))
