@@ -83,6 +83,8 @@ def _drive(page: Any, key: str, length: int) -> None:
 def test_a_person_drives_rewinds_and_branches(opened: Open, tmp_path: Path) -> None:
     page = opened()
     first = page.evaluate(_PIXELS)
+    page.keyboard.press("r")  # however short
+    page.wait_for_function(_LENGTH, arg=2)
     _drive(page, "w", 21)
     assert page.evaluate(_PIXELS) != first
     slider = page.get_by_role("slider", name="frame")

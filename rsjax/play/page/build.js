@@ -62,6 +62,7 @@ function listen() {
   const { stick } = state.parts;
   setInterval(meter, 500);
   setInterval(measureTrip, 5000);
+  document.addEventListener("rsjax-forget", () => state.pace.clear()); // of measurements (tests/play/latency.py)
   document.addEventListener("keydown", typed);
   document.addEventListener("keyup", stick.key);
   document.addEventListener("visibilitychange", () => ready() && state.pace.pump());

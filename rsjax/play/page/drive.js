@@ -8,6 +8,7 @@ const TOGGLE_KEYS = ["KeyG", "KeyH"];
 const GAMEPAD_AXES = [[1, 0], [0, 1], [3, 2], [2, 5]].map(([axis, control]) => ({ axis, control }));
 const DEAD = 0.12; // share of a stick's way that counts as rest
 const STEPS = 200; // of a slider
+const GENTLE = 0.4; // of the way, with Shift
 
 function letter(code) {
   return code.slice(3);
@@ -20,6 +21,7 @@ function letter(code) {
  */
 export function makeStick({ controls, host, switches, pad, changed }) {
   const down = new Set();
+  const tapped = new Set(); // pressed since the last step, which a short tap must not miss
   const axes = controls.flatMap((each, place) => (each.kind === "axis" ? [place] : []));
   const toggles = controls.flatMap((each, place) => (each.kind === "toggle" ? [place] : []));
   const sliders = controls.map((each) => each.rest); // set by sliders and switches
@@ -81,11 +83,20 @@ export function makeStick({ controls, host, switches, pad, changed }) {
     return controls.map((control, place) => {
       if (control.kind === "toggle") return sliders[place];
       const [more, less] = keysOf(place);
-      const fine = down.has("ShiftLeft") || down.has("ShiftRight") ? 0.4 : 1;
-      const push = fine * (down.has(more) - down.has(less)) + tilt[place] + gamepad[place];
+      const held = (code) => down.has(code) || tapped.has(code);
+      const fine = held("ShiftLeft") || held("ShiftRight") ? GENTLE : 1;
+      const push = fine * (held(more) - held(less)) + tilt[place] + gamepad[place];
       const way = push > 0 ? control.high - control.rest : control.rest - control.low;
       return Math.max(control.low, Math.min(control.high, sliders[place] + push * way));
     });
+  }
+
+  /** Returns the control vector for a step. */
+  function take() {
+    const now = vector();
+    tapped.clear();
+    if (!down.size) rows.forEach(({ show }, place) => show(vector()[place]));
+    return now;
   }
 
   /** Returns whether an axis is away from its rest. */
@@ -101,6 +112,7 @@ export function makeStick({ controls, host, switches, pad, changed }) {
 
   function rest(time = performance.now()) {
     down.clear();
+    tapped.clear();
     for (const place of axes) [sliders[place], tilt[place], gamepad[place]] = [controls[place].rest, 0, 0];
     update(time);
   }
@@ -116,7 +128,7 @@ export function makeStick({ controls, host, switches, pad, changed }) {
     }
     if (event.ctrlKey || event.metaKey || event.altKey || (!held && toggle === undefined && code !== "KeyX")) return false;
     if (repeat) return true;
-    if (held) down.add(code);
+    if (held) [down, tapped].forEach((keys) => keys.add(code));
     else if (code === "KeyX") rest(timeStamp);
     else flip(toggle, timeStamp);
     if (held || toggle !== undefined) update(timeStamp);
@@ -165,7 +177,7 @@ export function makeStick({ controls, host, switches, pad, changed }) {
   };
   pad.hidden = axes.length < 2;
   update(performance.now());
-  return { vector, driving, rest, key, poll, keys: keyList(controls, keysOf, toggles) };
+  return { take, driving, rest, key, poll, keys: keyList(controls, keysOf, toggles) };
 }
 
 function showAxis(control, input, output, value) {

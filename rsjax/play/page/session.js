@@ -97,7 +97,7 @@ export function wants() {
 /** Sends a step. */
 export function send() {
   const { parts, connection, current } = state;
-  const fields = parts.sources.source() ?? { action: parts.stick.vector() };
+  const fields = parts.sources.source() ?? { action: parts.stick.take() };
   const answer = connection.call("step", { branch: current, ...fields });
   answer.then(
     (message) => {
