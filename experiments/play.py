@@ -35,6 +35,8 @@ class Options:
     """Minutes after which a session that nobody uses is freed."""
     lanes: int = 1
     """Frames of different sessions that one pass generates: more on a GPU. Other numbers give other last bits."""
+    out: Path | None = None
+    """Directory of videos and clips that viewers keep; default RUN/play."""
     browser: bool = True
     """Open the page in a browser, where there is a display."""
 
@@ -52,8 +54,11 @@ def main() -> None:
         raise UserError(f"{error.name} is not installed; make setup installs it, or pip install rsjax[play]") from error
     from rsjax.policies.run_data import RunData
 
+    out = options.out or options.run / "play"
     how = (options.host, options.port, options.sessions, options.idle_minutes, options.lanes, options.browser)
-    serve(RunData(options.run, options.data_dir, options.store), options.policy, options.split, ServeSettings(*how))
+    serve(
+        RunData(options.run, options.data_dir, options.store), options.policy, options.split, out, ServeSettings(*how)
+    )
 
 
 if __name__ == "__main__":

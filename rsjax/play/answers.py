@@ -5,10 +5,11 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from rsjax.play import shown
+from rsjax.play import keep, shown
 from rsjax.play.errors import Refused
 from rsjax.play.frames import Place
-from rsjax.play.messages import MOST_ID, choice, kinds, whole
+from rsjax.play.link import Saved, read_state, state_of
+from rsjax.play.messages import MOST_ID, choice, kinds, number, whole, words
 from rsjax.play.pictures import read_picture
 from rsjax.play.settings import MOST_SEED
 from rsjax.play.viewer import Viewer
@@ -19,6 +20,7 @@ Answer = Callable[[Viewer, Message], Awaitable[Message]]
 ANSWERS: dict[str, Answer] = {}
 MOST_NUMBER = 2**16 - 1  # of a branch
 MOST_FRAMES = 64  # of a message "frames"
+MOST_PANES = 6
 
 
 def answers(kind: str) -> Callable[[Answer], Answer]:
@@ -33,14 +35,14 @@ def answers(kind: str) -> Callable[[Answer], Answer]:
 
 async def answer(viewer: Viewer, message: Message) -> Message:
     """Does what a message asks for and returns the final answer, with its id."""
-    number = message["id"] if type(message.get("id")) is int and 0 < message["id"] <= MOST_ID else 0
+    own = message["id"] if type(message.get("id")) is int and 0 < message["id"] <= MOST_ID else 0
     try:
         whole(message, "id", 1, MOST_ID)
         if message["type"] not in ANSWERS:
             raise Refused("bad_message", f"there is no message {message['type']!r:.40}; there are {', '.join(ANSWERS)}")
-        return {"id": number} | await ANSWERS[message["type"]](viewer, message)
+        return {"id": own} | await ANSWERS[message["type"]](viewer, message)
     except Refused as error:
-        return refusal(number, error)
+        return refusal(own, error)
 
 
 def refusal(number: int, error: Refused) -> Message:
@@ -110,9 +112,9 @@ async def _step(viewer: Viewer, message: Message) -> Message:
 
 @answers("fork")
 async def _fork(viewer: Viewer, message: Message) -> Message:
-    number, frame = whole(message, "branch", 0, MOST_NUMBER), whole(message, "frame", 0, MOST_SEED)
+    branch, frame = whole(message, "branch", 0, MOST_NUMBER), whole(message, "frame", 0, MOST_SEED)
     fresh = choice(message, "draw", ("same", "new"), "same") == "new"
-    return {"type": "branch"} | viewer.session.fork(number, frame, fresh).describe()
+    return {"type": "branch"} | viewer.session.fork(branch, frame, fresh).describe()
 
 
 @answers("drop")
@@ -123,11 +125,72 @@ async def _drop(viewer: Viewer, message: Message) -> Message:
 
 @answers("frames")
 async def _frames(viewer: Viewer, message: Message) -> Message:
-    number, chosen = whole(message, "branch", 0, MOST_NUMBER), kinds(message, ("rgb", *shown.KINDS))
+    branch, chosen = whole(message, "branch", 0, MOST_NUMBER), kinds(message, ("rgb", *shown.KINDS))
     first, count = whole(message, "first", 0, MOST_SEED), whole(message, "count", 1, MOST_FRAMES)
-    nodes = viewer.session.grown.branch(number).nodes
+    nodes = viewer.session.grown.branch(branch).nodes
     if first >= len(nodes):
-        raise Refused("no_frame", f"branch {number} has frames 0 to {len(nodes) - 1}, not {first}")
+        raise Refused("no_frame", f"branch {branch} has frames 0 to {len(nodes) - 1}, not {first}")
     for frame in range(first, min(first + count, len(nodes))):
-        await viewer.again(Place(number, frame, message["id"]), nodes[: frame + 1], chosen)
+        await viewer.again(Place(branch, frame, message["id"]), nodes[: frame + 1], chosen)
     return {"type": "ok"}
+
+
+@answers("record")
+async def _record(viewer: Viewer, message: Message) -> Message:
+    kind, branch = choice(message, "format", ("mp4", "gif")), whole(message, "branch", 0, MOST_NUMBER)
+    panes, scale = words(message, "panes", MOST_PANES), whole(message, "scale", 1, 8, 4)
+    fps = number(message, "fps", 1, 60, viewer.session.run.fps)
+    if not panes:
+        raise Refused("bad_message", "panes is empty; choose one at least")
+    path = viewer.files.place(viewer.session, f".{kind}")
+    await viewer.side.run(keep.record, viewer.session, path, branch, panes, fps, scale)
+    return viewer.files.add(path)
+
+
+@answers("export")
+async def _export(viewer: Viewer, message: Message) -> Message:
+    chosen = message.get("branches", list(viewer.session.grown.branches))
+    if not isinstance(chosen, list) or len(chosen) > MOST_NUMBER:
+        raise Refused("bad_message", "branches is a list of numbers")
+    numbers = [whole({"branches": each}, "branches", 0, MOST_NUMBER) for each in chosen]
+    path = viewer.files.place(viewer.session, "-clips")
+    made = viewer.files.add(await viewer.side.run(keep.export, viewer.session, path, list(dict.fromkeys(numbers))))
+    return made | {"path": str(path)}
+
+
+@answers("link")
+async def _link(viewer: Viewer, message: Message) -> Message:
+    state = state_of(viewer.session)
+    return {"type": "link", "state": state, "bytes": len(state)}
+
+
+@answers("load")
+async def _load(viewer: Viewer, message: Message) -> Message:
+    session = viewer.session
+    saved = await asyncio.to_thread(read_state, session, message.get("state"))
+    await session.begin(saved.start, saved.seed)
+    viewer.begun()
+    session.settings = saved.settings
+    await viewer.show(0, 0, message["id"])
+    await _grow(viewer, saved, message["id"])
+    if saved.lanes != session.engine.lanes:
+        text = f"made with --lanes {saved.lanes}, here are {session.engine.lanes}: frames may differ in their last bit"
+        session.send({"type": "status", "text": text, "busy": False})
+    return {"type": "session"} | viewer.describe()
+
+
+async def _grow(viewer: Viewer, saved: Saved, answered: int) -> None:
+    """Makes a saved session's branches again."""
+    session, done, total = viewer.session, 0, sum(len(branch.steps) for branch in saved.branches)
+    for place, branch in enumerate(saved.branches):
+        if branch.parent is not None:
+            session.fork(branch.parent, branch.fork, fresh=False)
+        session.grown.branch(place).draw = branch.draw
+        for action, decoding in branch.steps:
+            frame = await session.step(place, action, decoding)
+            if session.out is not None:
+                await session.out.room()
+            await viewer.show(place, frame, answered)
+            done += 1
+            facts = {"done": done, "total": total, "what": "frames"}
+            session.send({"type": "progress", "id": answered} | facts, droppable=True)

@@ -8,6 +8,7 @@ from typing import Any
 from rsjax.play import messages
 from rsjax.play.engine import Engine
 from rsjax.play.errors import Refused
+from rsjax.play.keep import Files
 from rsjax.play.memory import Memories
 from rsjax.play.run_data import PlayRun
 from rsjax.play.session import Session
@@ -47,7 +48,7 @@ class Hub:
 
     def __init__(self, run: PlayRun, engine: Engine, most: int, idle: float, grace: float = GRACE) -> None:
         self.run, self.engine, self.most, self.idle, self._grace = run, engine, most, idle, grace
-        self._memories, self._side = Memories(most), Side()
+        self._memories, self._side, self.files = Memories(most), Side(), Files(run.out)
         self._seats: dict[str, Seat] = {}
 
     def __len__(self) -> int:
@@ -71,7 +72,7 @@ class Hub:
             seat.viewer.session.used = time.monotonic()
             return seat, True
         self._make_room()
-        seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side), close)
+        seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side, self.files), close)
         self._seats[seat.viewer.session.name] = seat
         return seat, False
 

@@ -4,6 +4,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,11 +34,13 @@ class PlayRun:
         data: the run and where its clips are.
         split: the clips to begin with.
         policy: one that can act, or None.
+        out: the directory of what viewers keep.
     """
 
     data: RunData
     split: str = "test"
     policy: Policy | None = None
+    out: Path = Path("play")
 
     @cached_property
     def trained(self) -> TrainedModel:

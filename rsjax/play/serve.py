@@ -56,13 +56,13 @@ class ServeSettings:
         require(0 < self.idle_minutes <= 1440, f"--idle-minutes is {self.idle_minutes}; it is above 0, to 1440")
 
 
-def serve(data: RunData, policy: Path | None, split: str, settings: ServeSettings) -> None:
+def serve(data: RunData, policy: Path | None, split: str, out: Path, settings: ServeSettings) -> None:
     """Serves a run until Ctrl-C.
 
     Raises:
         UserError: the run is missing or unfinished, cannot generate frame by frame, or the address is taken.
     """
-    run = PlayRun(data, split, load_policy(policy) if policy else None)
+    run = PlayRun(data, split, load_policy(policy) if policy else None, out)
     engine = Engine(run.trained, settings.lanes)
     check_policy(run)
     listener = listen(settings.host, settings.port)

@@ -18,6 +18,7 @@ from rsjax.play.errors import Refused
 from rsjax.play.frames import webp
 from rsjax.play.guard import Guard, Guarded
 from rsjax.play.hub import Hub
+from rsjax.play.keep import TYPES as FILE_TYPES
 
 PAGE = Path(__file__).parent / "page"
 PLAYER = Path(__file__).parents[1] / "report" / "player"  # modules that the page shares with the report, at page/player
@@ -54,6 +55,7 @@ def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
             Route("/api/health", routes.health),
             Route("/api/clips", routes.clips),
             Route("/api/clip/{number:int}.webp", routes.clip),
+            Route("/api/file/{number}", routes.file),
             WebSocketRoute("/ws", routes.socket),
         ],
         exception_handlers={404: _missing, 405: _missing},
@@ -110,6 +112,14 @@ class Routes:
         except Refused as error:
             return _refused(404, error.code, error.message)
         return Response(webp(clip["rgb"][0]), media_type="image/webp")
+
+    async def file(self, request: Request) -> Response:
+        path = self._hub.files[request.path_params["number"]]
+        if refused := self._known(request):
+            return refused
+        if path is None or not path.is_file():
+            return _refused(404, "missing", "this file is not there any more; make it again")
+        return FileResponse(path, media_type=FILE_TYPES[path.suffix], filename=path.name)
 
     async def socket(self, socket: WebSocket) -> None:
         await socket.accept()

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from rsjax.play import shown
 from rsjax.play.frames import Place
+from rsjax.play.keep import Files
 from rsjax.play.session import Session
 from rsjax.play.shown import BACKLOG, Side
 from rsjax.play.sources import Sources
@@ -19,10 +20,11 @@ class Viewer:
 
     Args:
         side: the thread of what may be late.
+        files: where what is kept goes.
     """
 
-    def __init__(self, session: Session, side: Side) -> None:
-        self.session, self._side = session, side
+    def __init__(self, session: Session, side: Side, files: Files) -> None:
+        self.session, self.side, self.files = session, side, files
         self.sources = Sources(session.run)
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -57,8 +59,8 @@ class Viewer:
         shown.send_rgb(session, place, node)
         if "uncertainty" in session.watched:
             shown.send_uncertainty(session, place, node)
-        if "depth" in session.watched and session.has_depth and self._side.waiting < BACKLOG:
-            self._later(shown.send_depth(session, self._side, place, node))
+        if "depth" in session.watched and session.has_depth and self.side.waiting < BACKLOG:
+            self._later(shown.send_depth(session, self.side, place, node))
 
     async def again(self, place: Place, nodes: list[Node], kinds: list[str]) -> None:
         """Sends what there is of an older frame, the last of these."""
@@ -70,7 +72,7 @@ class Viewer:
         if "uncertainty" in kinds:
             shown.send_uncertainty(session, place, node)
         if "depth" in kinds and session.has_depth:
-            await shown.send_depth(session, self._side, place, node)
+            await shown.send_depth(session, self.side, place, node)
 
     def mean_bits(self, node: Node) -> float | None:
         """Returns the mean entropy of a frame's tokens in bits."""

@@ -107,7 +107,7 @@ def play_run(folder: Path, fakes: Fakes, depth: bool = True) -> PlayRun:
     data = RunData(folder)
     data.__dict__["trained"] = SimpleNamespace(config=config, model=fakes, params={"a": np.ones(3)}, assets=assets)
     data.__dict__["config"], data.__dict__["clips"] = config, clips
-    return PlayRun(data)
+    return PlayRun(data, out=folder / "kept")
 
 
 def hub_of(run: PlayRun, most: int = 3, idle: float = 600.0, lanes: int = 2, grace: float = 0.0) -> Hub:
