@@ -136,6 +136,26 @@ def test_a_picture_is_uploaded_and_the_page_says_how_it_was_cut(opened: Open, tm
     page.wait_for_selector(".notes.error")
 
 
+def test_a_session_is_recorded_exported_and_linked(opened: Open, server: Server) -> None:
+    page = opened()
+    _drive(page, "d", 6)
+    page.get_by_text("Keep", exact=True).click()
+    for label, ending in (("Record this branch", ".mp4"), ("Export all branches as clips", ".zip")):
+        with page.expect_download() as download:
+            page.get_by_role("button", name=label).click()
+        assert download.value.suggested_filename.endswith(ending)
+        assert Path(download.value.path()).stat().st_size > 100
+    page.get_by_role("button", name="Copy a link").click()
+    page.wait_for_function("() => location.hash.startsWith('#state=')")
+    other = opened(path="/" + page.evaluate("() => location.hash"))
+    other.wait_for_function(_LENGTH, arg=6)
+    length = page.locator(".transport input").get_attribute("max")
+    for each in (page, other):
+        each.keyboard.press("End")
+        each.wait_for_function("max => document.querySelector('.transport input').value === max", arg=length)
+    other.wait_for_function(f"pixels => ({_PIXELS})()[0] === pixels", arg=page.evaluate(_PIXELS)[0])
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_page_is_legible_in_both_themes_and_on_a_phone(
