@@ -30,12 +30,13 @@ export function build() {
   at("run").textContent = `${run.name} · ${run.image_size} × ${run.image_size} · ${run.device}`;
   const view = (title, kinds) => makeView({ title, kinds, size: run.image_size, depthRange: run.depth_range ?? FAR });
   const set = (fields) => attempt(connection.call("settings", fields));
+  const facing = run.source?.startsWith("robosuite/");
   const seek = (frame) => (transport.pause(), transport.go(frame));
   state.parts = {
     dream: view("dream", ["rgb", "depth"]),
     truth: view("simulator", ["truth", "truth_depth"]),
     beside: view("branch beside", ["rgb", "depth"]),
-    stick: makeStick({ controls, host: at("controls"), switches: at("toggles"), pad: at("pad"), changed: touched }),
+    stick: makeStick({ controls, facing, host: at("controls"), switches: at("toggles"), pad: at("pad"), changed: touched }),
     sources: makeSources({ host: at("source"), sources, clips: run.clips, changed: sourceChanged }),
     sampling: makeSampling({ host: at("sampling"), limits, settings, changed: set }),
     branches: makeBranches({ host: at("branches"), open: openBranch, compare: compareBranch, drop: dropBranch }),

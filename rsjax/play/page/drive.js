@@ -17,9 +17,12 @@ function letter(code) {
 /**
  * Makes the stick of a robot.
  * @param controls the robot's controls, as in the server's welcome.
+ * @param facing whether the camera looks the robot in the face: then its left is the picture's right, and keys, pad and
+ *   gamepad move the first two axes as the picture shows it.
  * @param changed called with the time of an event that changed the vector.
  */
-export function makeStick({ controls, host, switches, pad, changed }) {
+export function makeStick({ controls, facing, host, switches, pad, changed }) {
+  const turned = facing ? -1 : 1;
   const down = new Set();
   const tapped = new Set(); // pressed since the last step, which a short tap must not miss
   const axes = controls.flatMap((each, place) => (each.kind === "axis" ? [place] : []));
@@ -33,7 +36,9 @@ export function makeStick({ controls, host, switches, pad, changed }) {
   switches.replaceChildren(...toggles.map((place) => rows[place].row));
 
   function keysOf(place) {
-    return AXIS_KEYS[axes.indexOf(place)] ?? [];
+    const number = axes.indexOf(place);
+    const [more, less] = AXIS_KEYS[number] ?? [];
+    return more === undefined ? [] : facing && number < 2 ? [less, more] : [more, less];
   }
 
   function axisRow(control, place) {
@@ -139,13 +144,13 @@ export function makeStick({ controls, host, switches, pad, changed }) {
     const box = pad.getBoundingClientRect();
     const place = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     const [x, y] = place.map((share) => Math.max(-1, Math.min(1, 2.4 * (share - 0.5))));
-    setPad(pressed ? -x : 0, pressed ? -y : 0, event.timeStamp);
+    setPad(pressed ? -x * turned : 0, pressed ? -y * turned : 0, event.timeStamp);
   }
 
   function setPad(second, first, time) {
     if (axes.length < 2) return;
     [tilt[axes[0]], tilt[axes[1]]] = [first, second];
-    pad.firstElementChild.style.transform = `translate(${-second * 90}%, ${-first * 90}%)`;
+    pad.firstElementChild.style.transform = `translate(${-turned * second * 90}%, ${-turned * first * 90}%)`;
     update(time);
   }
 
@@ -156,7 +161,7 @@ export function makeStick({ controls, host, switches, pad, changed }) {
     const before = gamepad.join();
     for (const { axis, control } of GAMEPAD_AXES) {
       const tilted = found.axes[axis] ?? 0;
-      if (control < axes.length) gamepad[axes[control]] = Math.abs(tilted) > DEAD ? -tilted : 0;
+      if (control < axes.length) gamepad[axes[control]] = Math.abs(tilted) > DEAD ? -tilted * (control < 2 ? turned : 1) : 0;
     }
     const button = found.buttons[0]?.pressed ?? false;
     if (button && !poll.held && toggles.length) flip(toggles[0], performance.now());
