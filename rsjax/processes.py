@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from rsjax.errors import UserError
 
@@ -182,3 +182,38 @@ def _end_with(parent: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent died before that
         os._exit(1)
+
+
+class Helper(Generic[Item, Result]):
+    """One worker process that answers items in their order, for as long as the thread lives that starts it.
+
+    Args:
+        make: called once in the process, returns the function that does an item's work. Picklable, as are items and
+            results.
+    """
+
+    def __init__(self, make: Callable[[], Callable[[Item], Result]]) -> None:
+        self._worker = _start(pickle.dumps(make), [])
+
+    def __call__(self, item: Item, seconds: float) -> Result:
+        """Returns an item's result.
+
+        Raises:
+            WorkerDied: the process is gone, or has not answered for so many seconds; it is killed then.
+            Exception: what the work raised.
+        """
+        try:
+            self._worker.pipe.send(item)
+            if not self._worker.pipe.poll(seconds):
+                raise EOFError
+            succeeded, answer = self._worker.pipe.recv()
+        except (EOFError, OSError) as error:
+            self.close()
+            raise WorkerDied from error
+        if not succeeded:
+            raise answer
+        return answer  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        """Kills the process."""
+        _stop([self._worker])

@@ -87,6 +87,8 @@ async def _settings(viewer: Viewer, message: Message) -> Message:
 @answers("watch")
 async def _watch(viewer: Viewer, message: Message) -> Message:
     viewer.session.watched = kinds(message, shown.KINDS)
+    if not {"truth", "truth_depth"} & set(viewer.session.watched):
+        viewer.rest()
     return {"type": "ok"}
 
 

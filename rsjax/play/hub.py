@@ -14,6 +14,7 @@ from rsjax.play.run_data import PlayRun
 from rsjax.play.session import Session
 from rsjax.play.shown import Side
 from rsjax.play.sources import reasons
+from rsjax.play.truth import Truths
 from rsjax.play.viewer import Viewer
 
 VERSION = 1  # of the protocol
@@ -44,11 +45,15 @@ class Hub:
         most: sessions at a time.
         idle: seconds after which a session that nobody uses is freed.
         grace: seconds for which one whose page is gone keeps its place when all are taken.
+        truths: the simulators; by default those of the run's clips.
     """
 
-    def __init__(self, run: PlayRun, engine: Engine, most: int, idle: float, grace: float = GRACE) -> None:
+    def __init__(
+        self, run: PlayRun, engine: Engine, most: int, idle: float, grace: float = GRACE, truths: Truths | None = None
+    ) -> None:
         self.run, self.engine, self.most, self.idle, self._grace = run, engine, most, idle, grace
         self._memories, self._side, self.files = Memories(most), Side(), Files(run.out)
+        self._truths = truths or Truths.of(run.simulator)
         self._seats: dict[str, Seat] = {}
 
     def __len__(self) -> int:
@@ -72,7 +77,7 @@ class Hub:
             seat.viewer.session.used = time.monotonic()
             return seat, True
         self._make_room()
-        seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side, self.files), close)
+        seat = Seat(Viewer(Session(self.run, self.engine, self._memories), self._side, self.files, self._truths), close)
         self._seats[seat.viewer.session.name] = seat
         return seat, False
 
@@ -81,6 +86,7 @@ class Hub:
         if seat.close == close:  # otherwise another page has taken the session over
             seat.close, seat.left = None, time.monotonic()
             seat.viewer.session.out = None
+            seat.viewer.rest()
 
     def sweep(self) -> None:
         """Frees the sessions that nobody used for long."""

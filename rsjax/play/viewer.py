@@ -6,13 +6,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.data.codec import Record
 from rsjax.play import shown
+from rsjax.play.errors import Refused
 from rsjax.play.frames import Place
 from rsjax.play.keep import Files
 from rsjax.play.session import Session
 from rsjax.play.shown import BACKLOG, Side
 from rsjax.play.sources import Sources
 from rsjax.play.tree import Branch, Node
+from rsjax.play.truth import Follower, Truths
+
+_TRUTHS = {"truth", "truth_depth"}
 
 
 class Viewer:
@@ -21,30 +26,45 @@ class Viewer:
     Args:
         side: the thread of what may be late.
         files: where what is kept goes.
+        truths: the simulators of all viewers.
     """
 
-    def __init__(self, session: Session, side: Side, files: Files) -> None:
-        self.session, self.side, self.files = session, side, files
+    def __init__(self, session: Session, side: Side, files: Files, truths: Truths) -> None:
+        self.session, self.side, self.files, self._truths = session, side, files, truths
+        self._follower: Follower | None = None
+        self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator is to reach
+        self._following = False
         self.sources = Sources(session.run)
         self._tasks: set[asyncio.Task[None]] = set()
 
     def describe(self) -> dict[str, Any]:
         """Returns the session for a page."""
-        return self.session.describe() | {"has_truth": not self.no_truth}
+        start = self.session.start
+        has_truth = not self.no_truth and start is not None and start.clip is not None
+        return self.session.describe() | {"has_truth": has_truth}
 
     @property
     def no_truth(self) -> str:
-        """Why the simulator cannot run beside this session; "" if it can."""
-        return "not yet"
+        """Why no simulator can run beside sessions; "" if one can."""
+        return "" if self._truths.make else "the clips are of no simulator that is here"
 
     def begun(self) -> None:
         """Forgets what belonged to the tree before."""
         self.sources.acting.clear()
+        self.rest()
+
+    def rest(self) -> None:
+        """Lets others have the simulator."""
+        self._wanted = None
+        if self._follower is not None:
+            self._follower.close()
+            self._follower = None
 
     def close(self) -> None:
         """Frees everything; the session is over."""
         for task in self._tasks:
             task.cancel()
+        self.rest()
         self.session.forget()
 
     async def sourced(self, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
@@ -61,6 +81,8 @@ class Viewer:
             shown.send_uncertainty(session, place, node)
         if "depth" in session.watched and session.has_depth and self.side.waiting < BACKLOG:
             self._later(shown.send_depth(session, self.side, place, node))
+        if _TRUTHS & set(session.watched):
+            self._follow(number, frame)
 
     async def again(self, place: Place, nodes: list[Node], kinds: list[str]) -> None:
         """Sends what there is of an older frame, the last of these."""
@@ -73,6 +95,37 @@ class Viewer:
             shown.send_uncertainty(session, place, node)
         if "depth" in kinds and session.has_depth:
             await shown.send_depth(session, self.side, place, node)
+        if _TRUTHS & set(kinds):
+            if node.truth is None and _TRUTHS & set(session.watched):
+                self._follow(place.branch, place.frame)
+            shown.send_truth(session, place, node, kinds, shown.mean_psnr(nodes))
+
+    def _follow(self, number: int, frame: int) -> None:
+        """Has the simulator come to a frame; one that it has yet to come to is forgotten, as the way there is shown."""
+        start = self.session.start
+        if start is None or start.clip is None or self.no_truth:
+            return
+        self._wanted = number, frame
+        if not self._following:
+            self._following = True
+            self._later(self._catch_up(start.clip))
+
+    async def _catch_up(self, clip: Record) -> None:
+        session = self.session
+        try:
+            while self._wanted is not None:
+                (number, frame), self._wanted = self._wanted, None
+                nodes = session.grown.branch(number).nodes[: frame + 1]
+                if self._follower is None:
+                    task = str(clip["task"]) if session.run.simulator and session.run.simulator.train_tasks else ""
+                    self._follower = Follower(self._truths, clip["provenance"], task)
+                for each in await self._follower.follow(nodes):
+                    place = Place(number, each, 0)
+                    shown.send_truth(session, place, nodes[each], session.watched, shown.mean_psnr(nodes[: each + 1]))
+        except Refused as error:
+            session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})
+        finally:
+            self._following = False
 
     def mean_bits(self, node: Node) -> float | None:
         """Returns the mean entropy of a frame's tokens in bits."""

@@ -46,7 +46,7 @@ class Client:
     pushed: list[dict[str, Any]] = field(default_factory=list)
     number: int = 0
 
-    def next(self, timeout: float = 20.0) -> dict[str, Any] | Picture:
+    def next(self, timeout: float = 120.0) -> dict[str, Any] | Picture:
         """Returns the next message."""
         raw = self.socket.recv(timeout)
         if isinstance(raw, bytes):
@@ -76,11 +76,21 @@ class Client:
             else:
                 self.pushed.append(message)
 
+    def keep_next(self) -> None:
+        """Waits for the next message, and keeps it with those of its kind."""
+        message = self.next()
+        (self.pictures if isinstance(message, Picture) else self.pushed).append(message)  # type: ignore[arg-type]
+
     def until(self, kind: int, count: int) -> list[Picture]:
         """Waits until so many pictures of a kind have come, and returns them."""
         while len(found := [each for each in self.pictures if each.kind == kind]) < count:
-            message = self.next()
-            (self.pictures if isinstance(message, Picture) else self.pushed).append(message)  # type: ignore[arg-type]
+            self.keep_next()
+        return found
+
+    def until_pushed(self, kind: str, count: int) -> list[dict[str, Any]]:
+        """Waits until so many messages of a type have come beside answers, and returns them."""
+        while len(found := [each for each in self.pushed if each["type"] == kind]) < count:
+            self.keep_next()
         return found
 
     def drive(self, steps: int, branch: int = 0, **fields: Any) -> list[Picture]:
@@ -92,7 +102,7 @@ class Client:
         return [each for each in self.pictures[before:] if each.kind == 1]
 
 
-_PUSHED = ("progress", "truth", "points", "status")
+_PUSHED = ("progress", "truth", "truth_off", "points", "status")
 
 
 @dataclass

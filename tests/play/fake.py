@@ -15,6 +15,7 @@ from rsjax.models.moments import Decoding, Moment
 from rsjax.play.engine import Engine
 from rsjax.play.hub import Hub
 from rsjax.play.run_data import PlayRun
+from rsjax.play.truth import Truths
 from rsjax.policies.run_data import RunData
 from tests.pipeline import toy
 
@@ -110,5 +111,12 @@ def play_run(folder: Path, fakes: Fakes, depth: bool = True) -> PlayRun:
     return PlayRun(data, out=folder / "kept")
 
 
-def hub_of(run: PlayRun, most: int = 3, idle: float = 600.0, lanes: int = 2, grace: float = 0.0) -> Hub:
-    return Hub(run, Engine(run.trained, lanes), most, idle, grace)
+def hub_of(
+    run: PlayRun,
+    most: int = 3,
+    idle: float = 600.0,
+    lanes: int = 2,
+    grace: float = 0.0,
+    truths: Truths | None = None,
+) -> Hub:
+    return Hub(run, Engine(run.trained, lanes), most, idle, grace, truths)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
+from rsjax.play.simulate import Job, simulate
 from rsjax.policies.actions import ActionError
 from rsjax.policies.simulator import LiftEnv, clip_seed, run_episode, skilled_expert
 from rsjax.sim import episode as episodes
@@ -22,9 +24,22 @@ def env(gl: str) -> Iterator[LiftEnv]:
     env.close()
 
 
-def test_replaying_a_clip_gives_its_frames(env: LiftEnv) -> None:
+@pytest.fixture(scope="module")
+def clip(gl: str) -> Clip:
     with LiftSim(CONFIG.camera, CONFIG.image_size) as sim:
-        clip = episodes.run_episode(sim, CONFIG, episodes.EpisodePlan("000002", 2))
+        return episodes.run_episode(sim, CONFIG, episodes.EpisodePlan("000002", 2))
+
+
+def test_the_simulator_beside_the_dream_gives_a_clips_frames(clip: Clip) -> None:
+    work, seed = simulate(CONFIG), clip_seed(clip.provenance)
+    for _ in range(2):  # it begins again for another branch
+        jobs = [Job("", seed, None, True), *(Job("", None, row, True) for row in clip.actions[1:])]
+        frames = [frame for frame in map(work, jobs) if frame is not None]
+        np.testing.assert_array_equal(np.stack([frame.rgb for frame in frames]), clip.rgb)
+        np.testing.assert_array_equal(np.stack([frame.depth for frame in frames]), clip.depth)
+
+
+def test_replaying_a_clip_gives_its_frames(env: LiftEnv, clip: Clip) -> None:
     rows = iter(clip.actions[1:])
     episode = run_episode(env, lambda seen: next(rows), clip_seed(clip.provenance))
     np.testing.assert_array_equal(episode.rgb, clip.rgb)
