@@ -56,7 +56,14 @@ function greeted(message) {
   if (message.returned && (again || !location.hash)) return; // its session follows
   if (again) note("The server knows this session no more: it starts again.", true);
   if (location.hash.startsWith("#state=")) loadLink(starts.last());
-  else start(starts.last());
+  else if (message.run.clips || starts.last().upload) beginAgain();
+  else starts.open(); // without clips, a picture is what can be begun with
+}
+
+/** Starts as before; an upload is forgotten with its session. */
+async function beginAgain() {
+  const begun = await start(starts.last());
+  if (!begun && starts.last().upload && state.welcome.run.clips) start({ clip: 0 });
 }
 
 function received(message) {

@@ -42,6 +42,7 @@ function draw() {
     if (view === parts.dream) drawn.then((done) => done && requestAnimationFrame(() => measured(frame)));
   }
   caption(parts.dream, current, beside === null ? "dream" : `branch ${current}`);
+  parts.truth.note.textContent = tree.frame(current, "truth", frame) ? "" : "catching up …";
   if (beside !== null) caption(parts.beside, beside, `branch ${beside}`);
   later ||= setTimeout(drawAside, APART);
 }
