@@ -5,7 +5,7 @@ class Refused(Exception):
     """A message of a page cannot be done; the session goes on.
 
     Attributes:
-        code: a short word for the page, one of those in docs/play.md.
+        code: a short word for the page, one of those in docs/play_protocol.md.
         message: one plain line for the person.
     """
 

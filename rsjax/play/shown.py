@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from rsjax.play import frames
 from rsjax.play.frames import Place
+from rsjax.play.points import points_of
 from rsjax.play.session import Session
 from rsjax.play.tree import Node
 
@@ -71,8 +71,9 @@ def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mea
     session.send({"type": "truth", "id": place.id, "branch": place.branch, "frame": place.frame} | facts)
 
 
-def send_points(session: Session, place: Place, pane: str, points: Float32[np.ndarray, "K 3"]) -> None:
-    """Sends keypoints of a frame."""
+async def send_points(session: Session, side: Side, place: Place, nodes: list[Node], pane: str) -> None:
+    """Finds and sends the keypoints of the last of a branch's frames."""
+    points = await side.run(points_of, session, nodes, pane)
     rounded = [[round(float(x), 4), round(float(y), 4), int(seen)] for x, y, seen in points]
     facts = {"branch": place.branch, "frame": place.frame, "pane": pane, "points": rounded}
     session.send({"type": "points", "id": place.id} | facts, droppable=True)

@@ -81,6 +81,8 @@ class Viewer:
             shown.send_uncertainty(session, place, node)
         if "depth" in session.watched and session.has_depth and self.side.waiting < BACKLOG:
             self._later(shown.send_depth(session, self.side, place, node))
+        if "points" in session.watched and self.side.waiting < BACKLOG:
+            self._later(shown.send_points(session, self.side, place, nodes[: frame + 1], "rgb"))
         if _TRUTHS & set(session.watched):
             self._follow(number, frame)
 
@@ -95,6 +97,10 @@ class Viewer:
             shown.send_uncertainty(session, place, node)
         if "depth" in kinds and session.has_depth:
             await shown.send_depth(session, self.side, place, node)
+        if "points" in kinds:
+            await shown.send_points(session, self.side, place, nodes, "rgb")
+            if node.truth is not None:
+                await shown.send_points(session, self.side, place, nodes, "truth")
         if _TRUTHS & set(kinds):
             if node.truth is None and _TRUTHS & set(session.watched):
                 self._follow(place.branch, place.frame)
@@ -122,6 +128,8 @@ class Viewer:
                 for each in await self._follower.follow(nodes):
                     place = Place(number, each, 0)
                     shown.send_truth(session, place, nodes[each], session.watched, shown.mean_psnr(nodes[: each + 1]))
+                    if "points" in session.watched:
+                        await shown.send_points(session, self.side, place, nodes[: each + 1], "truth")
         except Refused as error:
             session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})
         finally:
