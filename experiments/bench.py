@@ -23,7 +23,7 @@ class Options:
     horizons: tuple[int, ...] = ()
     """Lengths of rollouts in frames, one prompt frame included; default: the clips' length and three times that."""
     torch: bool = False
-    """Measure the RGB branch in plain PyTorch too (pip install -e '.[torch]')."""
+    """Measure the model in plain PyTorch too (make extras; of RoboScape the RGB branch)."""
     json: Path | None = None
     """Write the numbers to this file, after each part all so far."""
 

@@ -1,21 +1,22 @@
-"""The RGB branch in plain eager PyTorch, as a baseline of speed (architecture: 1xgpt's STMaskGIT).
+"""Genie, or RoboScape's RGB branch, in plain eager PyTorch (architecture: 1xgpt's STMaskGIT), with its tokenizer.
 
-Like the public code it uses ``scaled_dot_product_attention``, ``nn.LayerNorm``, exact GELU and AdamW, without
-compilation and without a cache in sampling. Parameter names are those of the public checkpoints. It needs torch, an
-optional dependency, so import this module only where it is used.
+Like the public code it uses ``scaled_dot_product_attention``, ``nn.LayerNorm`` and exact GELU, without compilation and
+without a cache in sampling. Parameter names are those of the public checkpoints. It needs torch, an optional
+dependency, so import this module only where it is used.
 
-Axes: B clips, T frames, S cells, C width, n vocabularies of V codes.
+Axes: B clips, T frames, S cells, C width, n vocabularies of V codes, A action inputs.
 """
 
 import math
 from collections import OrderedDict
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rsjax.config import OptimizerConfig
+from rsjax.bench.magvit2_torch import Decoder, Encoder
+from rsjax.bench.torch_work import TorchWork
+from rsjax.config import Config, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
 
 
@@ -56,7 +57,7 @@ class STBlock(nn.Module):
 
 
 class GenieTorch(nn.Module):
-    """Maps tokens (B, T, S) to logits (B, T, S, n, V); without actions, as in the public Genie.
+    """Maps tokens (B, T, S) and actions (B, T, A) to logits (B, T, S, n, V); the public Genie reads no actions.
 
     Args:
         config: passes :func:`rsjax.bench.torch_part.check_plain`.
@@ -70,13 +71,19 @@ class GenieTorch(nn.Module):
             nn.Embedding(config.vocabulary_size, config.width) for _ in range(config.vocabularies)
         )
         self.mask_token_embed = nn.Parameter(torch.zeros(1, config.width))
+        if config.action_inputs:
+            first = nn.Linear(config.action_inputs, config.width)
+            more = [nn.GELU(), nn.Linear(config.width, config.width)] if config.action_encoder == "mlp" else []
+            self.action_encoder = nn.Sequential(first, *more)
         self.layers = nn.ModuleList(STBlock(config) for _ in range(config.blocks))
         self.out_x_proj = nn.Linear(config.width, config.vocabularies * config.vocabulary_size)
 
-    def forward(self, tokens: Tensor, mask: Tensor) -> Tensor:
+    def forward(self, tokens: Tensor, mask: Tensor, actions: Tensor | None = None) -> Tensor:
         parts = sub_tokens(tokens, self.config)
         embedded = torch.stack([embed(part) for embed, part in zip(self.factored_embeds, parts, strict=True)]).sum(0)
         x = torch.where(mask[..., None], self.mask_token_embed, embedded) + self.pos_embed_TSC[:, : tokens.shape[1]]
+        if self.config.action_inputs:
+            x = x + self.action_encoder(actions)[:, :, None]
         for layer in self.layers:
             x = layer(x)
         return self.out_x_proj(x).reshape(*tokens.shape, self.config.vocabularies, self.config.vocabulary_size)
@@ -88,40 +95,16 @@ def sub_tokens(tokens: Tensor, config: Architecture) -> list[Tensor]:
     return [(tokens >> (k * bits)) & (2**bits - 1) for k in range(config.vocabularies)]
 
 
-def masked_loss(model: GenieTorch, tokens: Tensor, mask: Tensor) -> Tensor:
+def masked_loss(model: GenieTorch, tokens: Tensor, mask: Tensor, actions: Tensor | None = None) -> Tensor:
     """Returns the mean over masked cells of the sum of the vocabularies' cross-entropies, in nats."""
-    logits = model(tokens, mask).float()
+    logits = model(tokens, mask, actions).float()
     targets = torch.stack(sub_tokens(tokens, model.config), dim=-1)
     cross_entropy = F.cross_entropy(logits.flatten(0, -2), targets.flatten(), reduction="none")
     return (cross_entropy.reshape(targets.shape).sum(-1) * mask).sum() / mask.sum()
 
 
-def make_adamw(model: GenieTorch, optimizer: OptimizerConfig) -> Any:
-    """Returns AdamW with this project's settings."""
-    return torch.optim.AdamW(
-        model.parameters(),
-        lr=optimizer.learning_rate,
-        betas=(optimizer.beta1, optimizer.beta2),
-        weight_decay=optimizer.weight_decay,
-    )
-
-
-def train_step(
-    model: GenieTorch, adamw: Any, tokens: Tensor, mask: Tensor, bf16: bool, grad_clip: float = 1.0
-) -> Tensor:
-    """Does one step, with ``bf16`` under autocast, and returns the loss before it. ``grad_clip`` 0 does not clip."""
-    with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
-        loss = masked_loss(model, tokens, mask)
-    adamw.zero_grad()
-    loss.backward()
-    if grad_clip > 0:
-        nn.utils.clip_grad_norm_(model.parameters(), grad_clip)
-    adamw.step()
-    return loss.detach()
-
-
 @torch.no_grad()
-def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, bf16: bool) -> Tensor:
+def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, actions: Tensor | None = None) -> Tensor:
     """Returns tokens with frame ``t`` decoded by MaskGIT with random unmasking; each step passes over all frames."""
     hidden = torch.ones_like(tokens[:, t], dtype=torch.bool)
     bits = model.config.code_bits // model.config.vocabularies
@@ -129,11 +112,34 @@ def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, bf16: bo
     for step in range(steps):
         mask = torch.zeros_like(tokens, dtype=torch.bool)
         mask[:, t] = hidden
-        with torch.autocast(tokens.device.type, dtype=torch.bfloat16, enabled=bf16):
-            codes = model(tokens, mask)[:, t].argmax(-1)
+        codes = model(tokens, mask, actions)[:, t].argmax(-1)
         drawn = (codes << (bits * torch.arange(codes.shape[-1], device=codes.device))).sum(-1)
         tokens[:, t] = torch.where(hidden, drawn, tokens[:, t])
         left = 0 if step + 1 == steps else math.ceil(math.cos((step + 1) / steps * math.pi / 2) * hidden.shape[-1])
         order = torch.where(hidden, torch.rand(hidden.shape, device=tokens.device), torch.inf)
         hidden = order.argsort(-1).argsort(-1) < left
     return tokens
+
+
+def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
+    """Returns what is timed; sampling is that of one frame, whose steps each pass over its whole window."""
+    arch, model = Architecture.create(config), config.model
+    assert isinstance(model, TokenModelConfig)
+    network = GenieTorch(arch).to(device)
+    encoder, decoder = Encoder(config.tokenizer).to(device), Decoder(config.tokenizer).to(device)
+    frames, window = config.clips.frames, min(horizon, arch.frames)
+    tokens = torch.randint(0, 2**arch.code_bits, (batch, max(frames, window), arch.grid**2), device=device)
+    actions = torch.randn(*tokens.shape[:2], max(1, arch.action_inputs), device=device)
+    mask = torch.rand(tokens[:, :frames].shape, device=device) < 0.5
+    images = torch.randn(batch * frames, 3, config.clips.image_size, config.clips.image_size, device=device)
+    codes = torch.randn(batch * frames, arch.code_bits, arch.grid, arch.grid, device=device).sign()
+    return TorchWork(
+        trained=(network,),
+        frozen=(encoder, decoder),
+        loss=lambda: masked_loss(network, tokens[:, :frames], mask, actions[:, :frames]),
+        sample=lambda: decode_frame(network, tokens[:, :window], window - 1, model.sample.steps, actions[:, :window]),
+        sampled=1,
+        encode=lambda: encoder(images) > 0,
+        decode=lambda: decoder(codes).clamp(-1, 1),
+        frames=batch * frames,
+    )

@@ -99,8 +99,11 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, float]:
             over[f"train_speedup_over_torch_{dtype}"] = (f"torch_train_step_s_{dtype}", "train_step_s")
             over[f"sample_speedup_over_torch_{dtype}"] = (
                 f"torch_sample_s_per_frame_{dtype}",
-                "sample_s_per_frame_cached",
+                "sample_s_per_frame_cached" if "sample_s_per_frame_cached" in numbers else "sample_s_per_frame",
             )
+            for name in ("encode", "decode"):
+                rate = f"tokenizer_{name}_frames_per_s"
+                over[f"tokenizer_{name}_speedup_over_torch_{dtype}"] = (rate, f"torch_{rate}_{dtype}")
     return {name: numbers[a] / numbers[b] for name, (a, b) in over.items() if a in numbers and b in numbers}
 
 

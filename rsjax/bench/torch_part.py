@@ -1,34 +1,68 @@
-"""Measures the PyTorch baseline on the same machine in the same process."""
+"""Measures a family's PyTorch baseline on the same machine in the same process."""
 
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import jax
 
 from rsjax.bench.timing import median_seconds
-from rsjax.config import Config, ConfigError, TokenModelConfig, require
+from rsjax.config import Config, ConfigError, require
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 
-ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup")  # options that the baseline lacks
+ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # options that the plain Genie lacks
 
 
-def check_torch(config: Config) -> Architecture:
-    """Returns the architecture of the PyTorch baseline.
+def check_genie(config: Config) -> None:
+    """Raises :class:`ConfigError` if the model has an option that the plain Genie lacks."""
+    check_plain(Architecture.create(config))
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A family's baseline.
+
+    Attributes:
+        module: has a function ``create``, which returns a :class:`rsjax.bench.torch_work.TorchWork`.
+        packages: that it needs beside torch.
+        check: raises :class:`ConfigError` for settings that it lacks.
+    """
+
+    module: str
+    packages: tuple[str, ...] = ()
+    check: Callable[[Config], None] = lambda config: None
+
+
+FAMILIES = {
+    "roboscape": Baseline("rsjax.bench.genie_torch", check=check_genie),
+    "genie": Baseline("rsjax.bench.genie_torch", check=check_genie),
+    "ivideogpt": Baseline("rsjax.bench.ivideogpt_torch", ("transformers",)),
+    "irasim": Baseline("rsjax.bench.irasim_torch", ("diffusers",)),
+}
+
+
+def check_torch(config: Config) -> Baseline:
+    """Returns the baseline of the model's family.
 
     Raises:
-        UserError: the model has options that the baseline lacks, or torch is not installed.
+        UserError: there is none, the model has options that it lacks, or a package is not installed.
     """
-    if not isinstance(config.model, TokenModelConfig):
-        raise ConfigError(f"--torch times a Genie's network, and this model is of family {config.model.family!r}")
-    arch = Architecture.create(config)
-    check_plain(arch)
+    family = config.model.family
+    if family not in FAMILIES:
+        raise ConfigError(f"--torch has no network of family {family!r}, only of {', '.join(FAMILIES)}")
+    baseline = FAMILIES[family]
+    baseline.check(config)
     if find_spec("torch") is None:
         raise UserError(
             "--torch needs PyTorch, which is not installed; pip install -e '.[torch]', or leave --torch out"
         )
-    return arch
+    for package in baseline.packages:
+        if find_spec(package) is None:
+            raise UserError(f"--torch needs the package {package} for this family; make extras, or leave --torch out")
+    return baseline
 
 
 def check_plain(model: Architecture) -> None:
@@ -41,49 +75,29 @@ def check_plain(model: Architecture) -> None:
 
 
 def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
-    """Measures the RGB branch in eager PyTorch, float32 and bf16 autocast: training step, and decoding without a cache.
+    """Measures the model in eager PyTorch, float32 and bf16 autocast, like the public code of its family.
 
-    It uses the GPU if jax and PyTorch both do, otherwise the CPU (``torch_device``).
+    That is training step, sampling and the autoencoder; of RoboScape the RGB branch. It uses the GPU if jax and PyTorch
+    both do, otherwise the CPU (``torch_device``).
 
     Args:
-        horizon: length in frames of the rollout whose last frame is decoded; each step passes over its whole window.
+        horizon: length in frames of a rollout. Of RoboScape and Genie its last frame alone is decoded.
 
     Raises:
-        UserError: torch is not installed, or the model has options that the baseline lacks.
+        UserError: as :func:`check_torch`.
     """
-    arch = check_torch(config)
+    baseline = check_torch(config)
     import torch
 
-    from rsjax.bench import genie_torch as genie
+    from rsjax.bench.torch_work import measure
 
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
-    torch.manual_seed(0)
-    model = genie.GenieTorch(arch).to(device)
-
-    def draw(frames: int) -> torch.Tensor:
-        return torch.randint(0, 2**arch.code_bits, (batch, frames, arch.grid**2), device=device)
-
-    tokens = draw(config.clips.frames)
-    mask = torch.rand(tokens.shape, device=device) < 0.5
-    window = draw(min(horizon, arch.frames))
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
 
-    def timed(call: Any) -> float:
+    def timed(call: Callable[[], Any]) -> float:
         return median_seconds(lambda: (call(), wait())[:0], budget)  # jax has nothing to wait for
 
-    numbers: dict[str, Any] = {
-        "torch": torch.__version__,
-        "torch_device": device,
-        "torch_threads": torch.get_num_threads(),
-        "torch_parameters": sum(p.numel() for p in model.parameters()),
-    }
-    assert isinstance(config.model, TokenModelConfig)
-    steps = config.model.sample.steps
-    for dtype in ("float32", "bfloat16"):
-        bf16 = dtype == "bfloat16"
-        adamw = genie.make_adamw(model, config.train.optimizer)
-        step = partial(genie.train_step, model, adamw, tokens, mask, bf16, config.train.optimizer.grad_clip)
-        numbers[f"torch_train_step_s_{dtype}"] = timed(step)
-        decode = partial(genie.decode_frame, model, window, window.shape[1] - 1, steps, bf16)
-        numbers[f"torch_sample_s_per_frame_{dtype}"] = timed(decode)
-    return numbers
+    torch.manual_seed(0)
+    work = import_module(baseline.module).create(config, batch, horizon, device)
+    numbers = {"torch": torch.__version__, "torch_device": device, "torch_threads": torch.get_num_threads()}
+    return numbers | measure(work, config.train.optimizer, device, timed)

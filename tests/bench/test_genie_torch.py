@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 from rsjax.bench.torch_part import check_plain
-from rsjax.config import ConfigError, OptimizerConfig
+from rsjax.config import ConfigError, OptimizerConfig, TokenizerConfig
+from rsjax.convert.table import to_tensors
+from rsjax.convert.tokenizer import table
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tokenizers import magvit2
+from rsjax.tokenizers.magvit2 import Tokenizer
 
 torch = pytest.importorskip("torch")
 
@@ -18,11 +22,11 @@ TOY = Architecture(
 )
 
 
-def copied(params: Any) -> Any:
+def copied(params: Any, arch: Architecture = TOY) -> Any:
     """The baseline with the weights of the RGB branch."""
     from rsjax.bench.genie_torch import GenieTorch
 
-    model = GenieTorch(TOY)
+    model = GenieTorch(arch)
     tensor = lambda x: torch.tensor(np.asarray(x))  # noqa: E731
     blocks = params["blocks"]["rgb"]
     state = {
@@ -31,6 +35,10 @@ def copied(params: Any) -> Any:
         "out_x_proj.weight": tensor(params["rgb_head"]["kernel"]).T,
         "out_x_proj.bias": tensor(params["rgb_head"]["bias"]),
     }
+    for i in range(2 * bool(arch.action_inputs)):
+        layer = params[f"action_encoder_fc{i + 1}"]
+        state[f"action_encoder.{2 * i}.weight"] = tensor(layer["kernel"]).T
+        state[f"action_encoder.{2 * i}.bias"] = tensor(layer["bias"])
     for k in range(2):
         state[f"factored_embeds.{k}.weight"] = tensor(params["rgb_embed"][f"factored_embed_{k}"]["embedding"])
     for i in range(TOY.blocks):
@@ -46,46 +54,85 @@ def copied(params: Any) -> Any:
     return model
 
 
-@pytest.fixture(scope="module")
-def params() -> Any:
+def noisy(fresh: Any) -> Any:
     """Random weights, those that start at zero too."""
-    fresh = Transformer(TOY).init_params(jax.random.key(0))
     leaves, tree = jax.tree.flatten(fresh)
     keys = jax.random.split(jax.random.key(1), len(leaves))
-    noisy = [x + 0.1 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
-    return jax.tree.unflatten(tree, noisy)
+    drawn = [x + 0.1 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    return jax.tree.unflatten(tree, drawn)
 
 
-def test_logits_are_those_of_the_rgb_branch(params: Any) -> None:
+@pytest.fixture(scope="module")
+def params() -> Any:
+    return noisy(Transformer(TOY).init_params(jax.random.key(0)))
+
+
+@pytest.mark.parametrize("action_inputs", [0, 5])
+def test_logits_are_those_of_the_rgb_branch(action_inputs: int) -> None:
+    arch = dataclasses.replace(TOY, action_inputs=action_inputs, action_encoder="mlp" if action_inputs else "none")
+    params = noisy(Transformer(arch).init_params(jax.random.key(0)))
     rng = np.random.default_rng(0)
     tokens, mask = rng.integers(0, 256, (2, 3, 4, 4)), rng.random((2, 3, 4, 4)) < 0.4
-    ours, _ = Transformer(TOY).apply({"params": params}, {"rgb": jnp.array(tokens)}, jnp.array(mask), None)
+    actions = rng.normal(size=(2, 3, 5)).astype(np.float32)
+    ours: Any = Transformer(arch).apply({"params": params}, {"rgb": jnp.array(tokens)}, jnp.array(mask), actions)
+    flat = (torch.tensor(tokens.reshape(2, 3, 16)), torch.tensor(mask.reshape(2, 3, 16)))
     with torch.no_grad():
-        theirs = copied(params)(torch.tensor(tokens.reshape(2, 3, 16)), torch.tensor(mask.reshape(2, 3, 16)))
-    np.testing.assert_allclose(ours["rgb"], theirs.numpy(), rtol=1e-4, atol=1e-4)
+        theirs = copied(params, arch)(*flat, torch.tensor(actions))
+    np.testing.assert_allclose(ours[0]["rgb"], theirs.numpy(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("changes", [{"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
+def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
+    from rsjax.bench.magvit2_torch import Decoder, Encoder
+
+    config = TokenizerConfig(
+        channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6, **changes
+    )
+    drawn = noisy(Tokenizer(config).init_params(jax.random.key(0)))
+    encoder, decoder = Encoder(config), Decoder(config)
+    tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(drawn, table(config)).items()}
+    for name, half in (("encoder", encoder), ("decoder", decoder)):
+        half.load_state_dict({key[8:]: x for key, x in tensors.items() if key.startswith(name)})
+    images = np.random.default_rng(0).uniform(-1, 1, (2, 16, 16, 3)).astype(np.float32)
+    with torch.no_grad():
+        latents = encoder(torch.tensor(images).permute(0, 3, 1, 2))
+        made = decoder(latents.sign()).permute(0, 2, 3, 1)
+    own: Any = magvit2.Encoder(config).apply({"params": drawn["encoder"]}, images)
+    np.testing.assert_allclose(own, latents.permute(0, 2, 3, 1), atol=2e-5)
+    codes = latents.sign().permute(0, 2, 3, 1).numpy()
+    decoded: Any = magvit2.Decoder(config).apply({"params": drawn["decoder"]}, codes)
+    np.testing.assert_allclose(decoded, made, atol=2e-5)
 
 
 @pytest.mark.parametrize("bf16", [False, True])
 def test_steps_lower_the_loss_of_the_same_clip(params: Any, bf16: bool) -> None:
-    from rsjax.bench.genie_torch import make_adamw, train_step
+    from rsjax.bench.genie_torch import masked_loss
+    from rsjax.bench.torch_work import make_adamw, train_step
 
     torch.manual_seed(0)
     model = copied(params)
-    adamw = make_adamw(model, OptimizerConfig(learning_rate=1e-2))
+    adamw = make_adamw(model.parameters(), OptimizerConfig(learning_rate=1e-2))
     tokens, mask = torch.randint(0, 256, (1, 3, 16)), torch.rand(1, 3, 16) < 0.5
-    losses = [train_step(model, adamw, tokens, mask, bf16).item() for _ in range(8)]
+
+    def loss() -> Any:
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
+            return masked_loss(model, tokens, mask)
+
+    losses = [train_step(loss, [model], adamw).item() for _ in range(8)]
     assert losses[-1] < 0.8 * losses[0]
 
 
 def test_a_clip_of_zero_clips_nothing(params: Any) -> None:
-    from rsjax.bench.genie_torch import make_adamw, train_step
+    from rsjax.bench.genie_torch import masked_loss
+    from rsjax.bench.torch_work import make_adamw, train_step
 
     torch.manual_seed(0)
     tokens, mask = torch.randint(0, 256, (1, 3, 16)), torch.rand(1, 3, 16) < 0.5
     norms = []
     for grad_clip in (0.0, 1e9, 1e-3):
         model = copied(params)
-        train_step(model, make_adamw(model, OptimizerConfig()), tokens, mask, False, grad_clip)
+        adamw = make_adamw(model.parameters(), OptimizerConfig())
+        train_step(lambda: masked_loss(model, tokens, mask), [model], adamw, grad_clip)  # noqa: B023
         norms.append(torch.stack([p.grad.norm() for p in model.parameters()]).norm().item())
     assert norms[0] == pytest.approx(norms[1], rel=1e-4) and norms[0] > 0.1
     assert norms[2] == pytest.approx(1e-3, rel=1e-2)
@@ -95,7 +142,7 @@ def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(par
     from rsjax.bench.genie_torch import decode_frame
 
     model, tokens = copied(params), torch.randint(0, 256, (2, 3, 16))
-    decoded = decode_frame(model, tokens, t=1, steps=1, bf16=False)
+    decoded = decode_frame(model, tokens, t=1, steps=1)
     mask = torch.zeros_like(tokens, dtype=torch.bool)
     mask[:, 1] = True
     with torch.no_grad():

@@ -1,6 +1,7 @@
 """The LLaMA with actions: its size, its sequences, what depends on what, sampling with the cache, long rollouts."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -56,8 +57,14 @@ def test_sequences_are_those_of_the_public_code() -> None:
     assert two.future(stray)[0, 0, :3].tolist() == [0, 8191, 5]
 
 
-def logits(params: Any, tokens: Any = SEQUENCE, actions: Any = ACTIONS, arch: Architecture = ARCH) -> Any:
-    return LLaMA(arch).apply({"params": params}, tokens, actions)[0]
+@jax.jit
+def logits(params: Any, tokens: Any = SEQUENCE, actions: Any = ACTIONS) -> Any:
+    return LLaMA(ARCH).apply({"params": params}, tokens, actions)[0]
+
+
+@partial(jax.jit, static_argnums=0)
+def token_term(model: IVideoGPT, params: Any, batch: Any) -> Any:
+    return model.loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))["token"]
 
 
 def test_nothing_depends_on_what_comes_later_and_an_action_acts_from_its_slot_on() -> None:
@@ -105,19 +112,15 @@ def test_draws_are_from_the_most_probable_and_follow_the_clips_key() -> None:
 def test_the_loss_is_the_mean_over_numbers_after_the_first_slot_of_clips_that_count() -> None:
     model, params = IVideoGPT(MODEL, CLIPS), llama_params()
     batch: Any = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.array([1, 0], np.float32), "index": np.arange(2)}
-    value, weight = model.loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))["token"]
+    value, weight = token_term(model, params, batch)
     first = ARCH.layout.first_slot
     log_p = jax.nn.log_softmax(logits(params))[0, first:-1]
     expected = -log_p[np.arange(len(log_p)), SEQUENCE[0, first + 1 :]].sum()
     assert (float(value), float(weight)) == (pytest.approx(float(expected), rel=1e-5), len(log_p))
     dropping = IVideoGPT(replace(MODEL, dropout=0.5), CLIPS)
-    context = StepContext(jnp.int32(0), None, None)
     both = batch | {"weight": np.ones(2, np.float32)}
-    whole = dropping.loss_terms(params, both, jax.random.key(0), context)["token"][0]
-    halves = [
-        dropping.loss_terms(params, {k: x[i : i + 1] for k, x in both.items()}, jax.random.key(0), context)["token"][0]
-        for i in range(2)
-    ]
+    whole = token_term(dropping, params, both)[0]
+    halves = [token_term(dropping, params, {k: x[i : i + 1] for k, x in both.items()})[0] for i in range(2)]
     assert float(whole) == pytest.approx(float(sum(halves)), rel=1e-5), "dropout follows the clip, not its place"
     assert abs(float(halves[0]) - float(value)) > 0.1
 
@@ -169,5 +172,5 @@ def test_logits_are_those_of_transformers() -> None:
     assert 0.3 < made.logits.std() < 10
     np.testing.assert_allclose(logits(params), made.logits.numpy(), atol=1e-5)
     batch: Any = {"tokens": SEQUENCE, "actions": ACTIONS, "weight": np.ones(2, np.float32), "index": np.arange(2)}
-    terms = IVideoGPT(MODEL, CLIPS).loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))
-    assert float(terms["token"][0] / terms["token"][1]) == pytest.approx(float(made.loss), abs=1e-5)
+    value, weight = token_term(IVideoGPT(MODEL, CLIPS), params, batch)
+    assert float(value / weight) == pytest.approx(float(made.loss), abs=1e-5)

@@ -103,7 +103,7 @@ def test_images_that_do_not_divide_into_tokens_are_refused() -> None:
 @pytest.mark.parametrize("changes", [{}, {"context_frames": 2, "patch_size": 2}], ids=["plain", "patches-2-context"])
 def test_tokens_and_images_are_those_of_plain_pytorch(changes: dict[str, Any]) -> None:
     torch = pytest.importorskip("torch")
-    from tests.models.ivideogpt.public_torch import ConditionalVQTorch, public_tensors
+    from rsjax.bench.ivideogpt_vq_torch import ConditionalVQTorch, public_tensors
 
     config = replace(VQ, **changes)
     size = SIZE * config.patch_size
@@ -121,7 +121,7 @@ def test_tokens_and_images_are_those_of_plain_pytorch(changes: dict[str, Any]) -
         tokens = [x.numpy() for x in reference.tokenize(images)]
         decoded = reference.detokenize(*map(torch.tensor, tokens)).permute(0, 1, 3, 4, 2).numpy()
     network, variables = ConditionalVQ(config), {"params": params}
-    own = network.apply(variables, jnp.float32(clips) / 255, False, method="_latents")
+    own = network.apply(variables, jnp.float32(clips) / 255, method="_latents")
     for mine, theirs in zip(own, latents, strict=True):
         assert 0.1 < np.std(theirs) < 10
         np.testing.assert_allclose(mine.reshape(theirs.shape), theirs, atol=1e-5)

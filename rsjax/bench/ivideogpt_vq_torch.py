@@ -152,7 +152,7 @@ class Codebook(nn.Module):
 
     def nearest(self, z: Tensor) -> Tensor:
         """Returns numbers (…) of vectors (…, C)."""
-        return torch.cdist(z.reshape(-1, z.shape[-1]), self.embedding.weight).argmin(1).reshape(z.shape[:-1])
+        return torch.cdist(z.reshape(-1, z.shape[-1]).float(), self.embedding.weight).argmin(1).reshape(z.shape[:-1])
 
 
 class ConditionalVQTorch(nn.Module):
