@@ -23,14 +23,14 @@ def read_model(directory: Path, kind: type[M], part: str) -> M:
     """
     path = directory / "config.json"
     settings = read_json(path, cure="make it with python -m rsjax.convert")
+    check_family(path, settings, (kind.family,))
     if "model" not in settings or not (directory / part / "weights").exists():
         raise UserError(f"{directory}: holds no {part}/weights of a model {kind.family!r} with settings in config.json")
     try:
         saved = from_dict(ModelConfig, settings["model"])
     except (ConfigError, TypeError) as error:
         raise UserError(f"{path}: the model's settings cannot be read ({error}); make it again") from error
-    if not isinstance(saved, kind):
-        raise UserError(f"{path}: holds a model of family {saved.family!r}; this one is of family {kind.family!r}")
+    assert isinstance(saved, kind)
     return saved
 
 
@@ -38,6 +38,14 @@ def check_alike(directory: Path, saved: Any, own: Any, free: set[str], section: 
     """Raises :class:`UserError` if two settings differ in fields outside ``free``; the message names them."""
     if differing := differences(saved, own, free):
         raise UserError(f"{directory}: holds another network ({differing}); set these fields of {section} alike")
+
+
+def check_family(path: Path, settings: dict[str, Any], own: tuple[str, ...]) -> None:
+    """Raises :class:`UserError` if the settings in a ``config.json`` are of a model of another family than these."""
+    model = settings.get("model")
+    name = model.get("family") if isinstance(model, dict) else None
+    if name is not None and name not in own:
+        raise UserError(f"{path}: holds a model of family {name!r}; start from one of family {' or '.join(own)}")
 
 
 class Inputs(NamedTuple):

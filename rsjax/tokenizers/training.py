@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt8
 
-from rsjax.config import Config, ConfigError, TokenizerConfig, TokenizerTrainConfig, from_dict, require
+from rsjax.config import Config, ConfigError, ModelConfig, TokenizerConfig, TokenizerTrainConfig, from_dict, require
 from rsjax.config.fields import differences
 from rsjax.data.codec import Record
 from rsjax.data.depth_color import depth_to_color
@@ -203,6 +203,9 @@ def read_tokenizer_config(directory: Path) -> TokenizerConfig:
     if "tokenizer" not in settings:
         raise UserError(f"{directory}: holds no tokenizer/weights with their settings in config.json")
     try:
+        if "model" in settings and from_dict(ModelConfig, settings["model"]).own_autoencoder is not None:
+            name = settings["model"]["family"]
+            raise UserError(f"{directory}: its tokenizer is that of the family {name!r}; start from a MAGVIT-2's")
         return from_dict(TokenizerConfig, settings["tokenizer"])
     except (ConfigError, TypeError) as error:
         raise UserError(f"{path}: the tokenizer's settings cannot be read ({error}); make it again") from error

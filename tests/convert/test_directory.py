@@ -83,7 +83,7 @@ def test_a_run_of_a_family_that_is_not_this_network_is_refused(tmp_path: Path, m
 
     monkeypatch.setitem(FAMILIES, "pixels", Pixels)
     (tmp_path / "config.json").write_text(json.dumps(to_dict(replace(presets.debug(), model=Pixels()))))
-    with pytest.raises(UserError, match="holds a model of family 'pixels'; start from RoboScape or Genie"):
+    with pytest.raises(UserError, match="holds a model of family 'pixels'; start from one of family robo"):
         load_world_model(tmp_path)
 
 

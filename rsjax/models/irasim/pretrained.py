@@ -14,6 +14,7 @@ from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.files import read_json
 from rsjax.models.irasim.dit import Architecture, architecture
+from rsjax.models.saved import check_family
 from rsjax.trainable import Params
 
 AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
@@ -30,16 +31,13 @@ def saved_autoencoder(directory: Path) -> KLConfig:
         UserError: there is none, or its settings are missing, damaged or of another family.
     """
     saved = _section(directory, AUTOENCODER, KLConfig, "tokenizer", "sdxl")
-    return _irasim(directory, saved).autoencoder if isinstance(saved, Config) else saved
+    return saved.autoencoder if isinstance(saved, Config) else saved
 
 
 def saved_network(directory: Path) -> Architecture:
     """Returns the architecture of a directory's transformer. Errors as in :func:`saved_autoencoder`."""
     saved = _section(directory, NETWORK, Architecture, "world_model", "irasim")
-    if not isinstance(saved, Config):
-        return saved
-    _irasim(directory, saved)
-    return architecture(saved)
+    return architecture(saved) if isinstance(saved, Config) else saved
 
 
 def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
@@ -76,15 +74,10 @@ def _section(directory: Path, name: str, kind: type[C], stage: str, command: str
         raise UserError(f"{directory}: holds no {stage}/weights with their settings in config.json; {cure}")
     path = directory / "config.json"
     settings = read_json(path, cure=cure)
+    check_family(path, settings, (IRASimConfig.family,))
     if not settings.keys() & {name, "model"}:
         raise UserError(f"{path}: describes no network of IRASim but {', '.join(settings) or 'nothing'}; {cure}")
     try:
         return from_dict(kind, settings[name]) if name in settings else from_dict(Config, settings)
     except (ConfigError, TypeError) as error:
         raise UserError(f"{path}: the network's settings cannot be read ({error}); make it again") from error
-
-
-def _irasim(directory: Path, config: Config) -> IRASimConfig:
-    if not isinstance(config.model, IRASimConfig):
-        raise UserError(f"{directory}: holds a model of family {config.model.family!r}; start from IRASim")
-    return config.model

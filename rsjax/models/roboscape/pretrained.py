@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from rsjax.config import Config, ConfigError, TokenModelConfig, TransformerConfig, from_dict
+from rsjax.config import Config, ConfigError, GenieConfig, RoboScapeConfig, TransformerConfig, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.models.saved import check_family
 from rsjax.trainable import Params
 
 # Fields that may differ between the saved network and the one to train.
@@ -36,6 +37,7 @@ def read_architecture(directory: Path) -> Architecture:
     """
     path = directory / "config.json"
     settings = read_json(path, cure="make it with python -m rsjax.convert")
+    check_family(path, settings, (RoboScapeConfig.family, GenieConfig.family))
     if not settings.keys() & {"architecture", "model"}:
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
     try:
@@ -44,8 +46,6 @@ def read_architecture(directory: Path) -> Architecture:
         config = from_dict(Config, settings)
     except (ConfigError, TypeError) as error:
         raise UserError(f"{path}: the world model's settings cannot be read ({error}); make it again") from error
-    if not isinstance(config.model, TokenModelConfig):
-        raise UserError(f"{path}: holds a model of family {config.model.family!r}; start from RoboScape or Genie")
     return Architecture.create(config)
 
 
