@@ -11,11 +11,8 @@ from rich.table import Table
 from rich.tree import Tree
 
 from rsjax.bench import inputs
-from rsjax.config import Config, TransformerConfig
+from rsjax.config import Config
 from rsjax.models.base import create_autoencoder, create_model
-from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.transformer import empty_cache
 from rsjax.trainable import Params, StepContext, combine
 from rsjax.training.state import make_optimizer
 
@@ -84,7 +81,7 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
     - ``bytes_activations_per_clip``: what automatic differentiation keeps of forward pass and loss; the compiler may
       keep less. ``…_remat``: each block's input, and all of the block that is being recomputed. The first is for
       ``model.remat`` none, the second for blocks; products is between them.
-    - ``bytes_cache_…``: temporal keys and values of one rollout of a clip's length.
+    - ``bytes_cache_…``: keys and values that one rollout of a clip's length keeps, for a family with a cache.
     """
     model, world = create_model(config), modules["world_model"]
     counts = {part: count(shapes) for part, shapes in world.items()}
@@ -104,20 +101,13 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
         "bytes_activations_per_clip": activations[False],
         "bytes_activations_per_clip_remat": activations[True],
     }
-    if isinstance(model, RoboScape):
-        numbers |= {f"bytes_cache_{name}": cache_bytes(model.architecture, n) for name, n in CACHE_BYTES.items()}
-    return numbers
+    cached = count(model.cache_shapes(config.clips.frames))
+    return numbers | {f"bytes_cache_{name}": cached * n for name, n in CACHE_BYTES.items() if cached}
 
 
 def count(shapes: Shapes) -> int:
     """Returns the number of elements in a tree of arrays or shapes."""
     return sum(x.size for x in jax.tree.leaves(shapes))
-
-
-def cache_bytes(arch: Architecture, bytes_per_number: int) -> int:
-    """Returns the bytes of one rollout's temporal keys and values, all blocks and branches."""
-    cache = jax.eval_shape(lambda: empty_cache(arch, 1, arch.frames))
-    return count(cache) * bytes_per_number
 
 
 def _train_state_bytes(config: Config, params: Shapes) -> int:
@@ -129,14 +119,14 @@ def _train_state_bytes(config: Config, params: Shapes) -> int:
 def activation_bytes(config: Config) -> dict[bool, int]:
     """Returns bytes per clip that training keeps for the backward pass, without remat (False) and with it (True).
 
-    Both are equal for a family without this setting.
+    Both are equal for a family without such blocks (``ModelConfig.scanned``).
     """
-    if not isinstance(config.model, TransformerConfig):
+    blocks = config.model.scanned
+    if not blocks:
         kept = sum(map(_bytes, _kept(config))) // _CLIPS
         return {False: kept, True: kept}
     with_remat = (replace(config, model=replace(config.model, remat=on)) for on in ("none", "blocks"))  # type: ignore[call-arg]
     plain, remat = map(_kept, with_remat)
-    blocks = config.model.blocks
     one_block = sum(_bytes(x) for x in plain if x.shape[0] == blocks) // blocks
     return {False: sum(map(_bytes, plain)) // _CLIPS, True: (sum(map(_bytes, remat)) + one_block) // _CLIPS}
 

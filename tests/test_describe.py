@@ -14,7 +14,7 @@ from rich.console import Console
 from experiments import describe as command
 from rsjax.config import Config, presets
 from rsjax.config.leaves import with_values
-from rsjax.describe import activation_bytes, cache_bytes, count, describe, render
+from rsjax.describe import activation_bytes, count, describe, render
 from rsjax.models import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.records import Batch
@@ -69,7 +69,8 @@ def test_the_state_in_training_has_the_bytes_of_a_whole_one_and_of_its_gradients
 
 
 def test_the_cache_has_the_bytes_of_a_real_one() -> None:
-    assert cache_bytes(NETWORK, 4) == bytes_of(empty_cache(NETWORK, 1, NETWORK.frames))
+    kept = described(DEBUG).figures["bytes_cache_float32"]
+    assert kept == bytes_of(empty_cache(NETWORK, 1, NETWORK.frames))
 
 
 def kept_for(clips: int) -> int:

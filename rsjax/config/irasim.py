@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
-from rsjax.config.fields import require, require_range, runtime, sampling
+from rsjax.config.fields import added, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
 
@@ -20,6 +20,7 @@ class DiTConfig:
     conditioning: Literal["frame", "video"] = "frame"
     # Between the two linear layers of the action encoder; none: as in the public model of Language-Table.
     action_activation: Literal["gelu", "none"] = "gelu"
+    integrate_actions: bool = added(False)  # also the sum of all actions so far; see TransformerConfig
     width: int = 1152
     blocks: int = 28  # half of them within frames, half over time
     heads: int = 16
@@ -83,6 +84,11 @@ class KLConfig:
         )
 
     @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels of each level."""
+        return tuple(self.channels * multiplier for multiplier in self.channel_multipliers)
+
+    @property
     def downsampling(self) -> int:
         """Pixels per cell along each side."""
         return self.convolutions.downsampling
@@ -111,6 +117,10 @@ class IRASimConfig(DiTConfig, ModelConfig):
     @property
     def own_autoencoder(self) -> KLConfig:
         return self.autoencoder
+
+    @property
+    def scanned(self) -> int:
+        return self.blocks // 2  # a pair of blocks each
 
     def check(self, clips: ClipShape) -> None:
         token = self.autoencoder.downsampling * self.patch_size

@@ -70,6 +70,7 @@ def irasim_tiny(base: Config) -> Config:
                 patch_size=4,
                 local_codes=True,
             ),
+            integrate_actions=True,
             width=128,
             blocks=8,
             heads=4,

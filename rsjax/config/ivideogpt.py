@@ -122,6 +122,10 @@ class IVideoGPTConfig(ModelConfig):
         return self.use_actions
 
     @property
+    def scanned(self) -> int:
+        return self.blocks
+
+    @property
     def loss_weights(self) -> dict[str, float]:
         return {"token": 1.0}
 

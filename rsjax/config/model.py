@@ -60,6 +60,14 @@ class ModelConfig:
         return True
 
     @property
+    def scanned(self) -> int:
+        """How many equal parts of the network are computed in turn, for which ``remat`` "blocks" saves memory; 0: none.
+
+        It is the leading axis of their parameters.
+        """
+        return 0
+
+    @property
     def marked_keypoints(self) -> int:
         """How many keypoints the model selects in each clip, for the report's pictures; 0: none."""
         return 0
@@ -283,6 +291,10 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     @property
     def takes_actions(self) -> bool:
         return self.action_encoder != "none"
+
+    @property
+    def scanned(self) -> int:
+        return self.blocks
 
     def frames(self, clips: ClipShape) -> int:
         """Returns the number of positions in time for such clips."""

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from flax.traverse_util import flatten_dict
 
 from rsjax.config import ConditionalVQConfig, ConfigError, IVideoGPTConfig, from_dict, to_dict
 from rsjax.convert.commands import REPLACES, check_file
@@ -30,7 +29,7 @@ from rsjax.convert.table import (
     to_tensors,
     weight_and_bias,
 )
-from rsjax.convert.table import Layout as TensorLayout
+from rsjax.convert.vae_names import vae_table
 from rsjax.files import parse_json
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.networks import ConditionalVQ
@@ -44,34 +43,19 @@ PARTS: tuple[Part, ...] = ("tokenizer", "world_model")
 # Tensors of public transformers that have no place here: heads for rewards and actions, and fixed rotations.
 ASIDE = re.compile(r"^(reward_linear|action_recon_linear)|rotary_emb\.inv_freq$")
 
-# Parts of the tokenizer's paths, and of public names.
+# Parts of the tokenizer's paths that autoencoders of ``diffusers`` do not have, and their public names.
 _PARTS = (
-    (r"(down|up)_(\d+)_block_(\d+)", r"\1_blocks.\2.resnets.\3"),
-    (r"(down|up)_(\d+)_(down|up)sample", r"\1_blocks.\2.\3samplers.0"),
-    (r"mid_block_(\d)", r"mid_block.resnets.\1"),
-    (r"mid_attention", "mid_block.attentions.0"),
-    (r"to_out", "to_out.0"),
-    (r"\bnorm_out", "conv_norm_out"),
     (r"cross_(\d+)", r"cross_att_blocks.\1"),
     (r"in_proj_kernel$", "att.in_proj_weight"),
     (r"in_proj_bias$", "att.in_proj_bias"),
     (r"out_proj", "att.out_proj"),
     (r"\bembedding$", "embedding.weight"),
-    (r"\b(kernel|scale)$", "weight"),
 )
-_LAYOUTS: dict[int, TensorLayout] = {2: "linear", 4: "conv"}
 
 
 def tokenizer_table(shapes: Params) -> Table:
     """Returns an entry for each parameter of the tokenizer."""
-    entries = []
-    for path, x in flatten_dict(shapes, sep="/").items():
-        key = path.replace("/", ".")
-        for own, public in _PARTS:
-            key = re.sub(own, public, key)
-        layout: TensorLayout = _LAYOUTS[x.ndim] if path.endswith("kernel") else "same"
-        entries.append(Entry(key, path, layout))
-    return tuple(entries)
+    return vae_table(shapes, _PARTS)
 
 
 def tokenizer_shapes(config: ConditionalVQConfig, image_size: int) -> Params:

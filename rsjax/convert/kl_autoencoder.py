@@ -14,17 +14,8 @@ import numpy as np
 
 from rsjax.config import ConfigError, KLConfig
 from rsjax.convert.files import ConvertError, Tensors
-from rsjax.convert.table import (
-    SAME_NAMES,
-    Entry,
-    Names,
-    Table,
-    norm,
-    shape_of,
-    to_params,
-    to_tensors,
-    weight_and_bias,
-)
+from rsjax.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors
+from rsjax.convert.vae_names import vae_table
 from rsjax.files import read_json
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
 from rsjax.trainable import Params
@@ -44,42 +35,13 @@ def table(config: KLConfig) -> Table:
     """
     if config.network != "sdxl":
         raise ConvertError(f"the public format cannot express model.autoencoder.network {config.network!r}, only sdxl")
-    last = len(config.channel_multipliers) - 1
-    entries: list[Entry] = [
-        *weight_and_bias("quant_conv", "encoder/quant_conv", "conv"),
-        *weight_and_bias("post_quant_conv", "decoder/post_quant_conv", "conv"),
-    ]
-    for half in ("encoder", "decoder"):
-        for name in ("conv_in", "conv_out"):
-            entries += weight_and_bias(f"{half}.{name}", f"{half}/{name}", "conv")
-        entries += norm(f"{half}.conv_norm_out", f"{half}/conv_norm_out")
-        attention, own = f"{half}.mid_block.attentions.0", f"{half}/mid"
-        entries += norm(f"{attention}.group_norm", f"{own}/group_norm")
-        for public, name in {"to_q": "to_q", "to_k": "to_k", "to_v": "to_v", "to_out.0": "to_out"}.items():
-            entries += weight_and_bias(f"{attention}.{public}", f"{own}/{name}", "linear")
-        for i in range(2):
-            entries += _block(f"{half}.mid_block.resnets.{i}", f"{own}/resnets_{i}", shortcut=False)
-    widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
-    for level, width in enumerate(widths):
-        before, after = widths[max(level - 1, 0)], widths[min(level + 1, last)]
-        down, up = f"encoder.down_blocks.{level}", f"decoder.up_blocks.{last - level}"
-        for i in range(config.res_blocks):
-            entries += _block(f"{down}.resnets.{i}", f"encoder/down_{level}_resnets_{i}", i == 0 and before != width)
-        for i in range(config.res_blocks + 1):
-            entries += _block(f"{up}.resnets.{i}", f"decoder/up_{level}_resnets_{i}", i == 0 and after != width)
-        if level < last:
-            entries += weight_and_bias(f"{down}.downsamplers.0.conv", f"encoder/down_{level}_downsample", "conv")
-        if level > 0:
-            entries += weight_and_bias(f"{up}.upsamplers.0.conv", f"decoder/up_{level}_upsample", "conv")
-    return tuple(entries)
+    return vae_table(_shapes(config), ((r"^encoder\.(quant_conv)", r"\1"), (r"^decoder\.(post_quant_conv)", r"\1")))
 
 
-def _block(public: str, own: str, shortcut: bool) -> list[Entry]:
-    entries: list[Entry] = []
-    for i in (1, 2):
-        entries += norm(f"{public}.norm{i}", f"{own}/norm{i}")
-        entries += weight_and_bias(f"{public}.conv{i}", f"{own}/conv{i}", "conv")
-    return entries + list(weight_and_bias(f"{public}.conv_shortcut", f"{own}/conv_shortcut", "conv")) * shortcut
+def _shapes(config: KLConfig) -> Params:
+    """Returns the shapes of the networks, without the latents' statistics."""
+    shapes = jax.eval_shape(lambda key: init(config, key), jax.random.key(0))
+    return {name: shapes[name] for name in ("encoder", "decoder")}
 
 
 def read_settings(weights: Path) -> dict[str, Any]:
@@ -154,11 +116,10 @@ def from_public(
         raise ConvertError(
             f"{source}: its {CONFIG} has scaling_factor {factor!r} and shift_factor {shift!r}; numbers fit"
         )
-    shapes = jax.eval_shape(lambda key: init(config, key), jax.random.key(0))
-    latents = shapes.pop("latents")
     fixed = {"mean": shift, "log_deviation": -math.log(factor)}
-    params = to_params(source, tensors, table(config), shapes, names)
-    return config, params | {"latents": {n: np.full(x.shape, fixed[n], np.float32) for n, x in latents.items()}}
+    params = to_params(source, tensors, table(config), _shapes(config), names)
+    latents = {name: np.full(config.latent_channels, x, np.float32) for name, x in fixed.items()}
+    return config, params | {"latents": latents}
 
 
 def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]]:
@@ -174,12 +135,11 @@ def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]
         raise ConvertError(
             "the public format has one factor for all latent channels; this autoencoder has one for each"
         )
-    widths = [config.channels * multiplier for multiplier in config.channel_multipliers]
     return tensors, {
         "_class_name": CLASS,
-        "block_out_channels": widths,
-        "down_block_types": ["DownEncoderBlock2D"] * len(widths),
-        "up_block_types": ["UpDecoderBlock2D"] * len(widths),
+        "block_out_channels": list(config.widths),
+        "down_block_types": ["DownEncoderBlock2D"] * len(config.widths),
+        "up_block_types": ["UpDecoderBlock2D"] * len(config.widths),
         "layers_per_block": config.res_blocks,
         "latent_channels": config.latent_channels,
         "norm_num_groups": config.norm_groups,

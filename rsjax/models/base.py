@@ -240,6 +240,10 @@ class WorldModel(Trainable[B], Protocol[B]):
         """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
         return saved
 
+    def cache_shapes(self, frames: int) -> Any:
+        """Returns the shapes of keys and values that a rollout of a clip of so many frames keeps; {}: no cache."""
+        return {}
+
     def flops(self, frames: int) -> dict[str, int]:
         """Returns floating-point operations per clip, "forward" and "train"; empty if the family has no counts."""
         return {}

@@ -1,9 +1,12 @@
-"""Layers of the public image autoencoders (VAE, VQ) of ``diffusers``: residual blocks, resampling, attention.
+"""The public image autoencoders (VAE, VQ) of ``diffusers``: both halves, and their layers.
 
-Convolutions have biases, norms are GroupNorms with epsilon 1e-6.
+Convolutions have biases, norms are GroupNorms with epsilon 1e-6. :mod:`rsjax.convert.vae_names` knows the public names
+of the modules here.
 
 Axes: N images, h×w cells, C channels.
 """
+
+from collections.abc import Callable, Sequence
 
 import flax.linen as nn
 import jax
@@ -67,3 +70,59 @@ class SelfAttention(nn.Module):
         q, k, v = (nn.Dense(width, name=f"to_{name}")(normed) for name in "qkv")
         weights = jax.nn.softmax(jnp.einsum("nqc,nkc->nqk", q, k) * width**-0.5, axis=-1)
         return x + nn.Dense(width, name="to_out")(jnp.einsum("nqk,nkc->nqc", weights, v)).reshape(x.shape)
+
+
+def middle(x: Map, groups: int, attention: bool) -> Map:
+    """Computes two residual blocks, perhaps with attention between, in the module that calls it."""
+    x = ResBlock(x.shape[-1], groups, name="mid_block_0")(x)
+    if attention:
+        x = SelfAttention(groups, name="mid_attention")(x)
+    return ResBlock(x.shape[-1], groups, name="mid_block_1")(x)
+
+
+def encode(
+    x: Map,
+    widths: Sequence[int],
+    res_blocks: int,
+    groups: int,
+    out: int,
+    attention: bool,
+    after: Callable[[Map], Map] = lambda x: x,
+) -> Map:
+    """Computes the encoder in the module that calls it, a compact one; every level but the last halves the grid.
+
+    Args:
+        widths: channels of each level.
+        out: channels of the result.
+        attention: whether the middle attends.
+        after: applied to the features after each level.
+    """
+    x = conv3(widths[0], "conv_in")(x)
+    for level, width in enumerate(widths):
+        for i in range(res_blocks):
+            x = ResBlock(width, groups, name=f"down_{level}_block_{i}")(x)
+        if level < len(widths) - 1:
+            x = Downsample(name=f"down_{level}_downsample")(x)
+        x = after(x)
+    x = middle(x, groups, attention)
+    return conv3(out, "conv_out")(nn.silu(group_norm(groups, name="norm_out")(x)))
+
+
+def decode(
+    x: Map,
+    widths: Sequence[int],
+    res_blocks: int,
+    groups: int,
+    out: int,
+    attention: bool,
+    after: Callable[[Map], Map] = lambda x: x,
+) -> Map:
+    """Inverts :func:`encode` with one residual block more at each level; ``after`` also follows the middle."""
+    x = after(middle(conv3(widths[-1], "conv_in")(x), groups, attention))
+    for level, width in enumerate(reversed(widths)):
+        for i in range(res_blocks + 1):
+            x = ResBlock(width, groups, name=f"up_{level}_block_{i}")(x)
+        if level < len(widths) - 1:
+            x = Upsample(name=f"up_{level}_upsample")(x)
+        x = after(x)
+    return conv3(out, "conv_out")(nn.silu(group_norm(groups, name="norm_out")(x)))

@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from rsjax.config import GenieConfig, RoboScapeConfig, presets
-from rsjax.describe import by_part, cache_bytes, count
+from rsjax.describe import by_part, count
 from rsjax.models import create_model
 from rsjax.models.roboscape.architecture import Architecture
 
@@ -27,7 +27,7 @@ def test_full_size_world_models_have_their_exact_counts(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "published"), [("roboscape_s", 268), ("roboscape_m", 537), ("roboscape_l", 1074)])
 def test_the_cache_of_a_rollout_in_bf16_has_the_known_size(name: str, published: int) -> None:
-    assert round(cache_bytes(Architecture.create(presets.get(name)), 2) / 1e6) == published
+    assert round(2 * count(create_model(presets.get(name)).cache_shapes(16)) / 1e6) == published
 
 
 @pytest.mark.parametrize("name", WORLD_MODELS)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, UInt8
+from jaxtyping import Array, Bool, Float, Key
 
 from rsjax.clip import Video
 from rsjax.config import Config, KLConfig, TokenizerTrainConfig
@@ -27,12 +27,13 @@ from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import CHUNK, in_chunks
-from rsjax.tokenizers.lpips import load_lpips, lpips
+from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
-from rsjax.tokenizers.training import TokenizerImages, image_batch
+from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Images = Float[Array, "B H W 3"]
+Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which decides an image's noise
 Latents = Float[Array, "B h w z"]
 
 SDXL_FACTOR = 0.13025  # by which the public code multiplies latents
@@ -71,8 +72,8 @@ def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
 
 
 @dataclass(frozen=True)
-class KLTraining(Autoencoder[Images]):
-    """Learns to reconstruct RGB frames from a sample of their posterior. A batch is images 0–255, (B, H, W, 3)."""
+class KLTraining(Autoencoder[Batch]):
+    """Learns to reconstruct RGB frames from a sample of their posterior."""
 
     config: KLConfig
     train: TokenizerTrainConfig
@@ -94,38 +95,39 @@ class KLTraining(Autoencoder[Images]):
     def init_extra(self) -> Extra:
         if "perceptual" not in self.loss_weights:
             return None
-        return {"lpips": jax.tree.map(jnp.array, load_lpips(self.train.lpips_weights))}
+        return {"lpips": lpips_weights(self.train, self.image_size)}
 
-    def loss_terms(self, params: Params, batch: Images, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns the terms of the reconstruction, and
 
         - "kl": the divergence of the posterior from the normal distribution, per number;
-        - "standard": how far the parameters "latents" are from the statistics of the batch, which they follow.
+        - "standard": -log p of the latents under the parameters "latents", which so become their mean and deviation.
         """
-        images = to_unit(batch)
+        images = to_unit(batch["images"])
         mean, log_variance = posterior(self.config, params, images)
-        latents = mean + jnp.exp(log_variance / 2) * jax.random.normal(key, mean.shape)
+        noise = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), mean.shape[1:]))
+        latents = mean + jnp.exp(log_variance / 2) * noise(batch["index"])
         output = decode(self.config, params, latents)
-        of_batch = jax.lax.stop_gradient(latents).reshape(-1, latents.shape[-1])
         fitted = params["latents"]
+        standard = (jax.lax.stop_gradient(latents) - fitted["mean"]) * jnp.exp(-fitted["log_deviation"])
         means = {
             "l1": jnp.mean(jnp.abs(images - output)),
             "l2": jnp.mean(jnp.square(images - output)),
             "kl": jnp.mean(jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance) / 2,
-            "standard": jnp.mean(jnp.square(fitted["mean"] - jnp.mean(of_batch, 0)))
-            + jnp.mean(jnp.square(fitted["log_deviation"] - jnp.log(jnp.std(of_batch, 0) + 1e-6))),
+            "standard": jnp.mean(fitted["log_deviation"]) + jnp.mean(jnp.square(standard)) / 2,
         }
         if "perceptual" in self.loss_weights:
             assert context.extra is not None
             means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], images, output))
-        count = jnp.float32(len(batch))
+        count = jnp.float32(len(images))
         return {name: (means[name] * count, count) for name in self.loss_weights}
 
     def transform(self) -> Transform:
         return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
 
-    def batch(self, arrays: Arrays) -> UInt8[np.ndarray, "B H W 3"]:
-        return image_batch(arrays)
+    def batch(self, arrays: Arrays) -> Batch:
+        images = image_batch(arrays)
+        return {"images": images, "index": np.arange(len(images), dtype=np.int32)}
 
     def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
         return KLCodec(self.config, params)

@@ -30,7 +30,7 @@ class Architecture(DiTConfig):
         frames: of a clip that the network processes at once.
         rows, columns: cells of a frame's latents.
         channels: of latents.
-        action_inputs: numbers of an action.
+        action_inputs: numbers of an action and, with ``integrate_actions``, of their sum.
     """
 
     frames: int = 16
@@ -56,7 +56,7 @@ def architecture(config: Config) -> Architecture:
         rows=side,
         columns=side,
         channels=model.autoencoder.latent_channels,
-        action_inputs=clips.action_dim,
+        action_inputs=clips.action_dim * (1 + model.integrate_actions),
     )
 
 

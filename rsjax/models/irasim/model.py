@@ -96,7 +96,7 @@ class IRASim(WorldModel[Batch]):
         return prepare_store(clips, codec.config, codec.params, encode, size, folder, max_damaged)
 
     def transform(self, normalization: Normalization) -> Transform:
-        return partial(latent_arrays, normalization)
+        return partial(latent_arrays, normalization, self.config.integrate_actions)
 
     def example(self, rng: np.random.Generator) -> Record:
         arch = self.architecture
@@ -104,7 +104,7 @@ class IRASim(WorldModel[Batch]):
         return {
             "mean": rng.normal(size=shape).astype(np.float16),
             "deviation": np.full(shape, 0.1, np.float16),
-            "actions": rng.normal(size=(arch.frames, arch.action_inputs)).astype(np.float32),
+            "actions": rng.normal(size=(arch.frames, self.clips.action_dim)).astype(np.float32),
         }
 
     def generate(
@@ -142,11 +142,11 @@ class IRASim(WorldModel[Batch]):
         return KLCodec(self.config.autoencoder, assets.tokenizer)
 
 
-def latent_arrays(normalization: Normalization, record: Record, rng: np.random.Generator) -> Arrays:
-    """Returns a sample of a record's posterior, and its actions, normalised."""
+def latent_arrays(normalization: Normalization, integrate: bool, record: Record, rng: np.random.Generator) -> Arrays:
+    """Returns a sample of a record's posterior, and the network's inputs from its actions."""
     mean, deviation = (record[name].astype(np.float32) for name in ("mean", "deviation"))
     drawn = rng.standard_normal(mean.shape, np.float32)
     return {
         "latents": mean + deviation * drawn,
-        "actions": normalization.action_inputs(record["actions"], False),
+        "actions": normalization.action_inputs(record["actions"], integrate),
     }

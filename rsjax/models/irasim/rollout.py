@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import IRASimConfig
+from rsjax.data.normalization import with_sums
 from rsjax.devices import divide
 from rsjax.models.diffusion.samplers import denoise, make_plan
 from rsjax.models.irasim.dit import Architecture, DiT
@@ -30,7 +31,7 @@ def rollout(
 
     Args:
         shared: frames that two chunks have in common, and of the prompt that the first chunk continues.
-        actions: normalised; row t leads into frame t.
+        actions: normalised, without sums; row t leads into frame t.
         index: each clip's number, which decides its noise.
     """
     frames, made, number = actions.shape[1], prompt, 0
@@ -39,9 +40,11 @@ def rollout(
         first = made.shape[1] - shared
         rows = actions[:, first : first + arch.frames]
         # As in the public code, a short tail is filled up with its first action.
-        filling = np.repeat(rows[:, 1:2], arch.frames - rows.shape[1], axis=1)
+        rows = np.concatenate([rows, np.repeat(rows[:, 1:2], arch.frames - rows.shape[1], axis=1)], axis=1)
+        rows[:, 0] = 0.0  # where the sums begin, as in a training clip
+        rows = with_sums(rows, np.cumsum(rows, axis=1) if arch.integrate_actions else None)
         key = jax.random.fold_in(jax.random.key(config.sample.seed), number)
-        batch = divide((made[:, first:], np.concatenate([rows, filling], axis=1), index), params)
+        batch = divide((made[:, first:], rows, index), params)
         chunk = _chunk(arch, config, params, key, *batch)
         made = np.concatenate([made, np.asarray(chunk)[:, shared:]], axis=1)
         number += 1

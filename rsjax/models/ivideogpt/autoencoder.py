@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Key
 
 from rsjax.clip import Video
 from rsjax.config import ConditionalVQConfig, Config, IVideoGPTConfig, TokenizerTrainConfig, require
@@ -30,14 +30,14 @@ from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.training import lpips_weights
 from rsjax.trainable import Extra, Params, StepContext, Term
 
-Clips = Float[Array, "B T H W 3"]
+Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's dropout
 
 FRAMES = 128  # most frames per pass, to bound memory
 
 
 @dataclass(frozen=True)
-class ConditionalVQTraining(Autoencoder[Clips]):
-    """Learns to reconstruct the first frames of a clip and some later ones. A batch is frames 0–255."""
+class ConditionalVQTraining(Autoencoder[Batch]):
+    """Learns to reconstruct the first frames of a clip and some later ones."""
 
     config: ConditionalVQConfig
     train: TokenizerTrainConfig
@@ -72,11 +72,11 @@ class ConditionalVQTraining(Autoencoder[Clips]):
     def init_extra(self) -> Extra:
         return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
 
-    def loss_terms(self, params: Params, batch: Clips, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
+    def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns the terms; those of pixels are the sum of a mean over context and one over later frames."""
-        frames, first = jnp.asarray(batch, jnp.float32) / 255, self.config.context_frames
-        rngs = {"dropout": key}
-        made = cast(Reconstruction, ConditionalVQ(self.config).apply({"params": params}, frames, train=True, rngs=rngs))
+        frames, first = jnp.asarray(batch["frames"], jnp.float32) / 255, self.config.context_frames
+        inputs = ({"params": params}, frames, batch["index"])
+        made = cast(Reconstruction, ConditionalVQ(self.config).apply(*inputs, rngs={"dropout": key}))
         pairs = ((frames[:, :first], made.context), (frames[:, first:], made.future))
 
         def total(distance: Callable[[Array, Array], Array]) -> Array:
@@ -91,14 +91,14 @@ class ConditionalVQTraining(Autoencoder[Clips]):
         if "perceptual" in self.loss_weights:
             weights = cast(dict[str, Any], context.extra)["lpips"]
             terms["perceptual"] = total(lambda one, other: lpips(weights, 2 * one - 1, 2 * other - 1))
-        count = jnp.float32(batch.shape[0])
+        count = jnp.float32(len(frames))
         return {name: (terms[name] * count, count) for name in self.loss_weights}
 
     def transform(self) -> Transform:
         return partial(_draw, self.config.context_frames, self.train.frames_per_clip, self.train.flip)
 
-    def batch(self, arrays: Arrays) -> np.ndarray:
-        return arrays["frames"]
+    def batch(self, arrays: Arrays) -> Batch:
+        return {"frames": arrays["frames"], "index": np.arange(len(arrays["frames"]), dtype=np.int32)}
 
     def codec(self, params: Params, normalization: Normalization) -> "ConditionalCodec":
         return ConditionalCodec(self.config, params)

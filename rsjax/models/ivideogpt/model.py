@@ -23,7 +23,7 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
-from rsjax.models.ivideogpt.llama import Architecture, LLaMA, folded
+from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.models.ivideogpt.rollout import generate
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import check_alike, read_model, saved_inputs
@@ -148,6 +148,10 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
         """Returns the saved parameters; a model without actions gets the fresh layer of actions, which is zero."""
         return {name: saved.get(name, x) for name, x in fresh.items()}
+
+    def cache_shapes(self, frames: int) -> Any:
+        arch = self.architecture
+        return jax.eval_shape(lambda: empty_cache(arch, 1, arch.layout.length(frames) + 1))
 
     def flops(self, frames: int) -> dict[str, int]:
         """Counts matrix products, 2 per multiply-add; attention as if it were not causal, as it is computed."""

@@ -7,18 +7,21 @@ Axes: B clips, c context frames, F later frames, N = B·c or B·F images, H×W p
 frame, C channels.
 """
 
+from collections.abc import Callable
+from itertools import count
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ConditionalVQConfig
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
-from rsjax.tokenizers.vae_blocks import Downsample, Map, ResBlock, SelfAttention, Upsample, conv3, group_norm
+from rsjax.tokenizers.vae_blocks import Map, decode, encode, group_norm
 
 Features = list[Float[Array, "B c h w C"]]  # of the context after each level
+Index = Int[Array, " B"] | None  # each clip's number, which decides its dropout; None: no dropout
 
 
 class CrossAttention(nn.Module):
@@ -27,7 +30,7 @@ class CrossAttention(nn.Module):
     config: ConditionalVQConfig
 
     @nn.compact
-    def __call__(self, z: Map, context: Float[Array, "B c h w C"], train: bool) -> Map:
+    def __call__(self, z: Map, context: Float[Array, "B c h w C"], index: Index) -> Map:
         cfg, (clips, frames, h, w, width) = self.config, context.shape
         # Context frames are stacked along the height before the norm, as in the public code.
         kv = group_norm(cfg.norm_groups, 1e-5, "kv_norm")(context.reshape(clips, frames * h, w, width))
@@ -40,9 +43,20 @@ class CrossAttention(nn.Module):
         q = heads(q @ kernel[:, :width] + bias[:width])
         k, v = map(heads, jnp.split(kv @ kernel[:, width:] + bias[width:], 2, axis=-1))
         scores = jnp.einsum("bfqhe,bkhe->bfhqk", q, k) * q.shape[-1] ** -0.5
-        drop = nn.Dropout(cfg.dropout, deterministic=not train)
-        out = jnp.einsum("bfhqk,bkhe->bfqhe", drop(jax.nn.softmax(scores, axis=-1)), v).reshape(*q.shape[:3], width)
-        return nn.silu(z + drop(nn.Dense(width, name="out_proj")(out)).reshape(z.shape))
+        weights = self._drop(jax.nn.softmax(scores, axis=-1), index)
+        out = jnp.einsum("bfhqk,bkhe->bfqhe", weights, v).reshape(*q.shape[:3], width)
+        return nn.silu(z + self._drop(nn.Dense(width, name="out_proj")(out), index).reshape(z.shape))
+
+    def _drop(self, x: Float[Array, "B ..."], index: Index) -> Float[Array, "B ..."]:
+        """Dropout that follows the clip, so that a step does not depend on how its batch is split."""
+        if index is None or not self.config.dropout:
+            return x
+        key, share = self.make_rng("dropout"), 1 - self.config.dropout
+
+        def kept(number: Int[Array, ""]) -> Bool[Array, "..."]:
+            return jax.random.bernoulli(jax.random.fold_in(key, number), share, x.shape[1:])
+
+        return jnp.where(jax.vmap(kept)(index), x / share, 0.0)
 
 
 class Encoder(nn.Module):
@@ -52,23 +66,14 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, images: Float[Array, "N H W 3"], context: Features | None = None, train: bool = False
+        self, images: Float[Array, "N H W 3"], context: Features | None = None, index: Index = None
     ) -> tuple[Map, list[Map]]:
-        """Returns the latents (N, g, g, latent), and the features after the first convolution and each level."""
-        cfg = self.config
-        x = conv3(cfg.widths[0], "conv_in")(space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images)
-        features, crossed = [x], 0
-        for level, width in enumerate(cfg.widths):
-            for i in range(cfg.res_blocks):
-                x = ResBlock(width, cfg.norm_groups, name=f"down_{level}_block_{i}")(x)
-            if level < len(cfg.widths) - 1:
-                x = Downsample(name=f"down_{level}_downsample")(x)
-            if context is not None and x.shape[-2] <= cfg.attention_size:
-                x = CrossAttention(cfg, name=f"cross_{crossed}")(x, context[level + 1], train)
-                crossed += 1
-            features.append(x)
-        x = _mid(cfg, x, context is not None)
-        return conv3(cfg.latent, "conv_out")(nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))), features
+        """Returns the latents (N, g, g, latent), and the features after each level."""
+        cfg, features = self.config, list[Map]()
+        x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
+        after = _crossing(cfg, context, index, features)
+        sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, cfg.latent)
+        return encode(x, *sizes, attention=context is not None, after=after), features
 
 
 class Decoder(nn.Module):
@@ -78,33 +83,29 @@ class Decoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, latents: Map, context: Features | None = None, train: bool = False
+        self, latents: Map, context: Features | None = None, index: Index = None
     ) -> tuple[Float[Array, "N H W 3"], list[Map]]:
-        """Returns images, and the features after the first convolution, the middle and each level."""
-        cfg = self.config
-        features = [conv3(cfg.widths[-1], "conv_in")(latents)]
-        x = _mid(cfg, features[0], context is not None)
-        if context is not None:
-            x = CrossAttention(cfg, name="cross_0")(x, context[1], train)
-        features.append(x)
-        for level, width in enumerate(reversed(cfg.widths)):
-            for i in range(cfg.res_blocks + 1):
-                x = ResBlock(width, cfg.norm_groups, name=f"up_{level}_block_{i}")(x)
-            if level < len(cfg.widths) - 1:
-                x = Upsample(name=f"up_{level}_upsample")(x)
-            if context is not None and x.shape[-2] <= cfg.attention_size:
-                x = CrossAttention(cfg, name=f"cross_{level + 1}")(x, context[level + 2], train)
-            features.append(x)
-        x = nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))
-        x = conv3(3 * cfg.patch_size**2, "conv_out")(x)
+        """Returns images, and the features after the middle and each level."""
+        cfg, features = self.config, list[Map]()
+        after = _crossing(cfg, context, index, features)
+        sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, 3 * cfg.patch_size**2)
+        x = decode(latents, *sizes, attention=context is not None, after=after)
         return (depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x), features
 
 
-def _mid(config: ConditionalVQConfig, x: Map, attention: bool) -> Map:
-    x = ResBlock(x.shape[-1], config.norm_groups, name="mid_block_0")(x)
-    if attention:
-        x = SelfAttention(config.norm_groups, name="mid_attention")(x)
-    return ResBlock(x.shape[-1], config.norm_groups, name="mid_block_1")(x)
+def _crossing(
+    config: ConditionalVQConfig, context: Features | None, index: Index, features: list[Map]
+) -> Callable[[Map], Map]:
+    """Returns what follows each level: attention to the context where the grid is small; ``features`` collects all."""
+    crossed = count()
+
+    def after(x: Map) -> Map:
+        if context is not None and x.shape[-2] <= config.attention_size:
+            x = CrossAttention(config, name=f"cross_{next(crossed)}")(x, context[len(features)], index)
+        features.append(x)
+        return x
+
+    return after
 
 
 class Codebook(nn.Module):
@@ -158,46 +159,46 @@ class ConditionalVQ(nn.Module):
         self.post_quant_linear = nn.Dense(cfg.latent * cfg.future_patch**2)
         self.quantize, self.dynamics_quantize = Codebook(cfg), Codebook(cfg)
 
-    def __call__(self, frames: Float[Array, "B T H W 3"], train: bool = False) -> Reconstruction:
+    def __call__(self, frames: Float[Array, "B T H W 3"], index: Index = None) -> Reconstruction:
         """Encodes and decodes clips in [0, 1], differentiable through the codebooks."""
-        context, future = self._latents(frames, train)
+        context, future = self._latents(frames, index)
         context, *of_context = self.quantize(context)
         future, *of_future = self.dynamics_quantize(future)
-        images = self._images(context, future, train)
+        images = self._images(context, future, index)
         codebook, commitment = (one + other for one, other in zip(of_context, of_future, strict=True))
         return Reconstruction(images[0], images[1], codebook, commitment)
 
     def encode(self, frames: Float[Array, "B T H W 3"]) -> tuple[Int[Array, "B c g g"], Int[Array, "B F n"]]:
         """Returns the tokens of the first c frames and of the later ones, of images 0–255."""
-        context, future = self._latents(jnp.asarray(frames, jnp.float32) / 255, False)
+        context, future = self._latents(jnp.asarray(frames, jnp.float32) / 255)
         return self.quantize.nearest(context), self.dynamics_quantize.nearest(future)
 
     def decode(self, context: Int[Array, "B c g g"], future: Int[Array, "B F n"]) -> Float[Array, "B T H W 3"]:
         """Decodes tokens to images 0–255 (float32, clipped, not rounded)."""
-        images = self._images(self.quantize.lookup(context), self.dynamics_quantize.lookup(future), False)
+        images = self._images(self.quantize.lookup(context), self.dynamics_quantize.lookup(future))
         return jnp.clip(jnp.concatenate(images, axis=1), 0.0, 1.0) * 255
 
     def _latents(
-        self, frames: Float[Array, "B T H W 3"], train: bool
+        self, frames: Float[Array, "B T H W 3"], index: Index = None
     ) -> tuple[Float[Array, "B c g g D"], Float[Array, "B F n D"]]:
         cfg = self.config
         context, future = jnp.split(frames, [cfg.context_frames], axis=1)
         h, features = self.encoder(_flat(context))
-        d, _ = self.cond_encoder(_flat(future), _by_clip(features, context), train)
+        d, _ = self.cond_encoder(_flat(future), _by_clip(features, context), index)
         d = space_to_depth(d, cfg.future_patch)
         d = self.quant_linear(d.reshape(*future.shape[:2], -1, d.shape[-1]))
         h = self.quant_conv(h)
         return h.reshape(*context.shape[:2], *h.shape[1:]), d
 
     def _images(
-        self, context: Float[Array, "B c g g D"], future: Float[Array, "B F n D"], train: bool
+        self, context: Float[Array, "B c g g D"], future: Float[Array, "B F n D"], index: Index = None
     ) -> tuple[Float[Array, "B c H W 3"], Float[Array, "B F H W 3"]]:
         cfg = self.config
         patches = context.shape[2] // cfg.future_patch
         first, features = self.decoder(self.post_quant_conv(_flat(context)))
         d = self.post_quant_linear(future)
         d = depth_to_space(d.reshape(-1, patches, patches, d.shape[-1]), cfg.future_patch)
-        later, _ = self.cond_decoder(d, _by_clip(features, context), train)
+        later, _ = self.cond_decoder(d, _by_clip(features, context), index)
         return first.reshape(*context.shape[:2], *first.shape[1:]), later.reshape(*future.shape[:2], *later.shape[1:])
 
     def init_params(self, key: Array, image_size: int) -> dict[str, Array]:

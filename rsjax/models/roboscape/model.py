@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.imagine import Imagined
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
 from rsjax.models.roboscape.records import Batch
-from rsjax.models.roboscape.transformer import Transformer
+from rsjax.models.roboscape.transformer import Transformer, empty_cache
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
@@ -257,6 +258,9 @@ class RoboScape(WorldModel[Batch]):
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
         return pretrained.start(fresh, saved, directory)
+
+    def cache_shapes(self, frames: int) -> Any:
+        return jax.eval_shape(lambda: empty_cache(self.architecture, 1, min(frames, self.architecture.frames)))
 
     def flops(self, frames: int) -> dict[str, int]:
         forward = forward_flops(self.architecture, frames)

@@ -1,6 +1,5 @@
-"""IRASim through the stages of a run, and what its loss and its rollouts must and must not depend on."""
+"""What IRASim's loss and its rollouts must and must not depend on."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,62 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rsjax
 from rsjax.bench import inputs
 from rsjax.clip import Video
 from rsjax.config import Config, DenoiseConfig, KLConfig
 from rsjax.convert.directory import save
 from rsjax.describe import describe
-from rsjax.errors import UserError
-from rsjax.models.base import Assets, create_autoencoder, create_model
+from rsjax.models.base import Assets, create_model
 from rsjax.models.irasim.dit import Architecture, forward_flops
 from rsjax.models.irasim.model import latent_arrays
 from rsjax.models.irasim.rollout import rollout
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import run_all
-from rsjax.pipeline.videos import resampled
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy
-from tests.pipeline.toy import store
 
 CONFIG = toy.config()
 MODEL: Any = create_model(CONFIG)
 RNG = np.random.default_rng(0)
-
-
-def test_a_run_trains_both_networks_generates_and_is_evaluated(tmp_path: Path) -> None:
-    clips = store(tmp_path / "clips")
-    run = Run(on_store(CONFIG, clips.path), tmp_path / "run", tmp_path)
-    run.prepare(overwrite=False)
-    run_all(run)
-    assert run.stages == ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
-    metrics = json.loads((run.directory / "metrics.json").read_text())
-    assert {"psnr", "psnr_tokenizer", "delta_psnr"} <= metrics.keys()
-    assert metrics["psnr"] > 0
-    rows = [json.loads(line) for line in (run.directory / "world_model" / "log.jsonl").read_text().splitlines()]
-    assert 0.5 < next(row["error"] for row in rows if "error" in row) < 1.5, "fresh, it predicts zeros, not the noise"
-    prepared, trained = run.open_prepared(), rsjax.load(run.directory)
-    assert prepared.counts() == clips.counts()
-    record, clip = prepared.source("test")[0], clips.source("test")[0]
-    assert record["mean"].dtype == np.float16
-    video = trained.generate(clip["rgb"][:1], clip["actions"])
-    assert video.rgb.shape == clip["rgb"].shape
-    assert video.depth is None
-    with pytest.raises(UserError, match="has no setting temperature; it has sampler, steps"):
-        resampled(trained, {"temperature": 1.0})
-    assert resampled(trained, {"steps": 5}).model.config.sample.steps == 5
-
-    # The run's weights start another run; those of another network are refused, with the fields that differ.
-    again = replace(CONFIG, train=replace(CONFIG.train, start_from=str(run.directory)))
-    start = create_model(again)
-    assert start.pretrained_shapes(run.directory).keys() == trained.params.keys()
-    with pytest.raises(UserError, match="holds another network .width is 16 there, 32 here"):
-        create_model(toy.config(width=32)).pretrained_shapes(run.directory)
-    other = replace(toy.AUTOENCODER, channels=16)
-    with pytest.raises(UserError, match="holds another autoencoder .channels is 8 there, 16 here"):
-        create_autoencoder(toy.config(autoencoder=other)).pretrained_shapes(run.directory)
-    assert create_autoencoder(CONFIG).pretrained_shapes(run.directory).keys() == {"encoder", "decoder", "latents"}
 
 
 def batch(clips: int = 3) -> Any:
@@ -116,7 +74,8 @@ def test_the_given_frame_is_clean_and_no_target() -> None:
 
 def test_loaders_draw_latents_from_the_posterior() -> None:
     record, normalization = MODEL.example(RNG), inputs.normalization(CONFIG)
-    draws = np.stack([latent_arrays(normalization, record, np.random.default_rng(i))["latents"] for i in range(200)])
+    rngs = map(np.random.default_rng, range(200))
+    draws = np.stack([latent_arrays(normalization, False, record, rng)["latents"] for rng in rngs])
     np.testing.assert_allclose(draws.mean(0), record["mean"].astype(np.float32), atol=0.05)
     np.testing.assert_allclose(draws.std(0), record["deviation"].astype(np.float32), atol=0.03)
 
@@ -166,6 +125,33 @@ def test_long_rollouts_continue_chunk_by_chunk(roll: Roll) -> None:
     assert np.abs(later[:, frames:] - long[:, frames:]).max() > 1e-3
 
 
+def test_with_sums_a_chunk_reads_them_from_its_own_first_frame_on() -> None:
+    """As a training clip does: a rollout of two chunks is one of the second chunk alone, from the first one's end."""
+    model: Any = create_model(toy.config(integrate_actions=True))
+    arch, width = model.architecture, CONFIG.clips.action_dim
+    assert arch.action_inputs == 2 * width
+    record = model.example(RNG)
+    row = latent_arrays(inputs.normalization(CONFIG), True, record, RNG)["actions"]
+    np.testing.assert_allclose(row[1:, width:], np.cumsum(record["actions"][1:], 0) / 4, rtol=1e-5, atol=1e-6)
+    seen: list[Any] = []
+
+    def chunk(arch: Any, config: Any, params: Any, key: Any, known: Any, actions: Any, index: Any) -> Any:
+        seen.append(np.asarray(actions))
+        return np.zeros((1, arch.frames, *known.shape[2:]), np.float32)
+
+    actions = RNG.normal(size=(1, 2 * arch.frames - 3, width)).astype(np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rsjax.models.irasim.rollout._chunk", chunk)
+        prompt = np.zeros((1, 1, arch.rows, arch.columns, arch.channels), np.float32)
+        rollout(arch, model.config, 1, {}, prompt, actions, np.array([0]))
+    for number, part in enumerate(seen):
+        first = number * (arch.frames - 1)
+        own = actions[:, first + 1 : first + arch.frames]
+        own = np.concatenate([own, np.repeat(own[:, :1], arch.frames - 1 - own.shape[1], axis=1)], axis=1)
+        np.testing.assert_allclose(part[:, 1:], np.concatenate([own, np.cumsum(own, 1) / 4], -1), rtol=1e-5, atol=1e-6)
+    assert len(seen) == 2
+
+
 def test_videos_start_with_the_prompt_as_the_autoencoder_sees_it() -> None:
     assets = Assets(inputs.normalization(CONFIG), toy.autoencoder_params(CONFIG))
     prompt, actions = inputs.video(CONFIG, 1, 1), np.zeros((1, 6, CONFIG.clips.action_dim), np.float32)
@@ -191,15 +177,6 @@ def on_width(config: Config, width: int) -> Config:
     clips = config.clips
     shape = {name: getattr(clips, name) for name in ("frames", "image_size", "tracks", "test_clips")}
     return replace(config, data=replace(config.data, store="x", key="x", action_dim=width, **shape))
-
-
-def test_directories_of_something_else_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no tokenizer/weights .* make it with python -m rsjax.convert sdxl"):
-        create_autoencoder(CONFIG).pretrained_shapes(tmp_path)
-    (tmp_path / "tokenizer" / "weights").mkdir(parents=True)
-    (tmp_path / "config.json").write_text('{"tokenizer": {}}')
-    with pytest.raises(UserError, match="describes no network of IRASim but tokenizer"):
-        create_autoencoder(CONFIG).pretrained_shapes(tmp_path)
 
 
 def test_operations_are_counted_and_described() -> None:

@@ -1,0 +1,171 @@
+"""Every family goes through one training engine: what the engine promises holds for each, in both its networks."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rsjax
+from rsjax.ablation.grid import expand, parse_axes
+from rsjax.bench import inputs
+from rsjax.config import Config, LoopConfig, presets
+from rsjax.config.leaves import with_values
+from rsjax.describe import describe
+from rsjax.errors import UserError
+from rsjax.models.base import create_autoencoder, create_model
+from rsjax.pipeline import stages
+from rsjax.pipeline.own_data import on_store
+from rsjax.pipeline.replay import replay
+from rsjax.pipeline.run import Run
+from rsjax.pipeline.setup import tokenizer_setup, world_model_setup
+from rsjax.pipeline.videos import Request, write_videos
+from rsjax.trainable import StepContext, combine
+from rsjax.training import loop as loop_module
+from rsjax.training.checkpoint import load_weights
+from rsjax.training.log import read_log
+from rsjax.training.sharding_rules import cut_elements, table
+from rsjax.training.skipped import SkippedSteps
+from rsjax.training.state import create_state
+from tests.models import families
+from tests.pipeline import toy
+
+PUBLIC = {"genie": "genie_35m_actions", "ivideogpt": "ivideogpt_64", "irasim": "irasim_s"}
+SETTING = {"genie": "steps", "ivideogpt": "top_k", "irasim": "steps"}  # of sampling
+TERM = {"genie": "rgb", "ivideogpt": "token", "irasim": "error"}
+TRAINED: tuple[Literal["tokenizer", "world_model"], ...] = ("tokenizer", "world_model")
+
+
+every_family = pytest.mark.parametrize("family", families.FAMILIES)
+
+
+@pytest.fixture(scope="module", params=["ivideogpt", "irasim"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A finished run. Genie's is RoboScape's, which has tests of its own."""
+    folder = tmp_path_factory.mktemp(request.param)
+    config = families.FAMILIES[request.param]()
+    run = Run(on_store(config, toy.store(folder / "clips").path), folder / "run", folder)
+    run.prepare(overwrite=False)
+    stages.run_all(run)
+    return run
+
+
+def test_a_run_goes_through_all_stages(run: Run) -> None:
+    assert run.stages == ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
+    assert all(map(run.finished, run.stages))
+    metrics = json.loads((run.directory / "metrics.json").read_text())
+    assert {"psnr", "delta_psnr", "psnr_tokenizer"} <= {name for name, value in metrics.items() if value is not None}
+    assert metrics["reasons"]["depth_absrel"] == "the model generates no depth"
+    for stage in TRAINED:
+        rows = read_log(run.directory / stage)
+        assert any("validation/psnr" in row for row in rows)
+    assert sum(TERM[run.config.model.family] in row for row in rows) == 4
+    assert run.open_prepared().counts() == run.open_clips().counts()
+
+
+def test_a_loaded_model_generates_plans_and_goes_on_beyond_its_clips(run: Run, tmp_path: Path) -> None:
+    model, clip = rsjax.load(run.directory), run.open_clips().source("test")[0]
+    video = model.generate(clip["rgb"][:1], clip["actions"])
+    assert video.rgb.shape == clip["rgb"].shape and video.depth is None
+    many = model.plan(clip["rgb"][:1], np.stack([clip["actions"], -clip["actions"]]))
+    np.testing.assert_allclose(many.rgb[0].astype(int), video.rgb, atol=1)  # batches of two sizes round differently
+    setting = SETTING[run.config.model.family]
+    request = Request("test", (0,), None, None, len(clip["rgb"]) + 2, {setting: 4})
+    (written,) = write_videos(run.directory, tmp_path, request, tmp_path / "videos", "gif", 4.0, 1)
+    assert written.stat().st_size > 0
+    with pytest.raises(UserError, match="no setting nothing"):
+        next(write_videos(run.directory, tmp_path, replace(request, sample={"nothing": 3}), tmp_path, "gif", 4.0, 1))
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = Run(run.config, tmp_path / "again", run.data_directory)
+    again.directory.mkdir()
+    for stage in ("collect", "tokens"):
+        (again.directory / stage).symlink_to(run.directory / stage)
+    for stage, train in (("tokenizer", stages.train_tokenizer), ("world_model", stages.train_world_model)):
+        for stop_at in (2, None):
+            with monkeypatch.context() as patch:
+                changed = {"stop_at": stop_at, "monitor": loop_module.Monitor()}  # without validation
+                patch.setattr(stages, "fit", lambda *args, more=changed, **own: loop_module.fit(*args, **(own | more)))
+                train(again, resume=True)
+        shapes = create_autoencoder(run.config).shapes() if stage == "tokenizer" else create_model_shapes(run.config)
+        whole, ours = (load_weights(one.output(stage), shapes) for one in (run, again))
+        jax.tree.map(np.testing.assert_array_equal, ours, whole)
+        rows = [[row["loss"] for row in read_log(one.directory / stage) if "loss" in row] for one in (run, again)]
+        assert rows[0] == rows[1] and len(rows[0]) == 4
+
+
+def create_model_shapes(config: Config) -> Any:
+    return jax.eval_shape(create_model(config).init, jax.random.key(0))
+
+
+def test_clips_replay_alone_as_in_their_batch(run: Run) -> None:
+    """The batch of a step, as if it had been skipped: every clip has a loss of its own."""
+    for stage in TRAINED:
+        setup = tokenizer_setup(run) if stage == "tokenizer" else world_model_setup(run)
+        with setup.loader(None) as batches:
+            before = batches.state()
+            arrays = next(batches)
+            SkippedSteps(run.directory / stage, 0).add(
+                4, {"loss": 1.0, "grad_norm": 1.0}, batches.identify(arrays), before
+            )
+        clips = list(replay(run, stage, 4))
+        assert len(clips) == 2 and all(clip.finite for clip in clips)
+        assert clips[0].scalars["loss"] != clips[1].scalars["loss"]
+
+
+def batches_of(config: Config) -> Iterator[tuple[Any, Any, Any]]:
+    """Both networks, with shapes of their parameters and a batch of four clips."""
+    model = create_model(config)
+    if config.model.own_autoencoder is not None:
+        autoencoder, rng = create_autoencoder(config), np.random.default_rng(0)
+        transform = autoencoder.transform()
+        rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(4)]
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        yield autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
+    yield model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, 4)
+
+
+@every_family
+def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
+    """What accumulation and every sharding need: the terms of parts add up to those of the whole."""
+    for model, shapes, batch in batches_of(families.FAMILIES[family]()):
+        rng = np.random.default_rng(1)
+        params = jax.tree.map(lambda x: (0.1 * rng.normal(size=x.shape)).astype(np.float32), shapes)  # noqa: B023
+
+        @jax.jit
+        def terms(params: Any, part: Any) -> Any:
+            return model.loss_terms(params, part, jax.random.key(0), StepContext(jnp.int32(3), None, None))  # noqa: B023
+
+        whole = terms(params, batch)
+        parts = [terms(params, jax.tree.map(lambda x: x[i::2], batch)) for i in range(2)]  # noqa: B023
+        summed = jax.tree.map(lambda *x: sum(x), *parts)
+        for name, (value, weight) in whole.items():
+            np.testing.assert_allclose(summed[name], (value, weight), rtol=2e-4, atol=1e-5, err_msg=name)
+        assert np.isfinite(combine(whole, model.loss_weights)[0])
+
+
+@every_family
+def test_a_public_size_is_cut_over_devices_and_described(family: str) -> None:
+    config = presets.get(PUBLIC[family])
+    state = jax.eval_shape(lambda: create_state(create_model(config), LoopConfig(ema=0.9)))
+    rows = table(state, 2)
+    assert cut_elements(rows) / sum(int(np.prod(row.shape)) for row in rows) > 0.99
+    tiny = describe(with_values(families.FAMILIES[family](), {"model.blocks": 8})).figures
+    assert tiny["flops_train_per_clip"] > 0 and tiny["params_world_model"] > 0
+    assert 0 < tiny["bytes_activations_per_clip_remat"] < tiny["bytes_activations_per_clip"]
+
+
+@every_family
+def test_a_grid_has_the_familys_own_fields(family: str) -> None:
+    config = families.FAMILIES[family]()
+    grid = expand(config, parse_axes(config, ["model.width=16,32", f"model.sample.{SETTING[family]}=1,2"]), [0, 1])
+    assert len(grid.cells) == 8
+    assert {config.model.width for config in grid.cells.values()} == {16, 32}  # type: ignore[attr-defined]
