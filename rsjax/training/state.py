@@ -65,7 +65,7 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
             adam_b1=opt.beta1,
             adam_b2=opt.beta2,
             adam_weight_decay=opt.weight_decay,
-            muon_weight_dimension_numbers=_block_matrices,
+            muon_weight_dimension_numbers=_matrices,
             consistent_rms=0.2,
         )
     else:
@@ -73,13 +73,19 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(opt.grad_clip) if opt.grad_clip else optax.identity(), inner)
 
 
-def _block_matrices(params: Params) -> Params:
-    """Marks the matrices inside blocks, (blocks, in, out), for Muon; None for embeddings, heads, biases and norms."""
+def _matrices(params: Params) -> Params:
+    """Marks for Muon the matrices inside blocks, (blocks, in, out), and kernels of convolutions, (height, width, in, out).
+
+    None for embeddings, heads, biases, norms, and a network's last convolution, which is its head.
+    """
 
     def axes(path: KeyPath, value: jax.Array) -> optax.contrib.MuonDimensionNumbers | None:
         names = [getattr(key, "key", "") for key in path]
-        matrix = "blocks" in names and names[-1] == "kernel"
-        return optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2) if matrix else None
+        if names[-1] == "kernel" and "blocks" in names:
+            return optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2)
+        if names[-1] == "kernel" and value.ndim == 4 and "conv_out" not in names:
+            return optax.contrib.MuonDimensionNumbers(reduction_axis=(0, 1, 2), output_axis=3)
+        return None
 
     return jax.tree.map_with_path(axes, params)
 

@@ -129,16 +129,19 @@ def test_a_fresh_state_follows_from_the_seed() -> None:
     assert not np.array_equal(one, other)
 
 
-def test_muon_orthogonalises_the_blocks_matrices_and_leaves_the_rest_to_adamw() -> None:
+def test_muon_orthogonalises_blocks_and_convolutions_and_leaves_the_rest_to_adamw() -> None:
     rng = np.random.default_rng(0)
     normal = lambda *shape: jax.numpy.asarray(rng.normal(size=shape), "float32")  # noqa: E731
     params = {
         "blocks": {"kernel": normal(2, 6, 4), "bias": normal(2, 4)},
         "embed": {"embedding": normal(5, 4)},
         "head": {"kernel": normal(4, 3)},
+        "conv1": {"kernel": normal(3, 3, 2, 4)},
+        "conv_out": {"kernel": normal(3, 3, 4, 2)},
     }
     grads = jax.tree.map(lambda x: normal(*x.shape), params)
-    grads["blocks"]["kernel"] *= np.logspace(0, -1.5, 4)  # badly conditioned
+    for name in ("blocks", "conv1"):
+        grads[name]["kernel"] *= np.logspace(0, -1.5, 4)  # badly conditioned
     loop = LoopConfig(steps=20, optimizer=replace(OPTIMIZER, kind="muon", weight_decay=0.0))
     adam = optax.nadamw(learning_rate(loop), OPTIMIZER.beta1, OPTIMIZER.beta2, weight_decay=0.0)
     updates = {}
@@ -152,7 +155,10 @@ def test_muon_orthogonalises_the_blocks_matrices_and_leaves_the_rest_to_adamw() 
         assert np.linalg.cond(gradient) > 10
         assert np.linalg.cond(update) < 2.5  # Newton–Schulz brings singular values near one another, not together
         assert np.sum(update * gradient) < 0
-    for path in (("blocks", "bias"), ("embed", "embedding"), ("head", "kernel")):
+    gradient, update = (tree["conv1"]["kernel"].reshape(-1, 4) for tree in (grads, updates["muon"]))
+    assert np.linalg.cond(update) < 2.5
+    assert np.sum(update * gradient) < 0
+    for path in (("blocks", "bias"), ("embed", "embedding"), ("head", "kernel"), ("conv_out", "kernel")):
         ours, adamw = (updates[kind][path[0]][path[1]] for kind in ("muon", "adamw"))
         np.testing.assert_allclose(ours, adamw, rtol=1e-5)
 
