@@ -11,8 +11,8 @@ from rsjax.config.fields import added, require, require_range, runtime
 class OptimizerConfig:
     """The optimizer: linear warm-up, then a learning rate schedule; clipping by the global norm.
 
-    ``muon`` orthogonalises the updates of the blocks' matrices and of convolutions (at AdamW's scale) and leaves the rest
-    to AdamW with Nesterov momentum. The paper does not name its optimizer; the public Genie uses AdamW.
+    ``muon`` orthogonalises the updates of the blocks' matrices and of convolutions (at AdamW's scale) and leaves the
+    rest to AdamW with Nesterov momentum. The paper does not name its optimizer; the public Genie uses AdamW.
     """
 
     kind: Literal["adamw", "muon"] = "adamw"

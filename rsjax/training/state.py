@@ -74,7 +74,7 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
 
 
 def _matrices(params: Params) -> Params:
-    """Marks for Muon the matrices inside blocks, (blocks, in, out), and kernels of convolutions, (height, width, in, out).
+    """Marks for Muon the matrices inside blocks, (blocks, in, out), and of convolutions, (height, width, in, out).
 
     None for embeddings, heads, biases, norms, and a network's last convolution, which is its head.
     """
