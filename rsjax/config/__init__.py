@@ -23,20 +23,18 @@ from rsjax.config.fields import (
 )
 from rsjax.config.irasim import DiTConfig, IRASimConfig, KLConfig
 from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig, TopKConfig
-from rsjax.config.model import (
-    FAMILIES,
+from rsjax.config.model import FAMILIES, ModelConfig, register_family
+from rsjax.config.run import Config, EvalConfig
+from rsjax.config.sim import SimConfig
+from rsjax.config.token_model import (
     GenieConfig,
     LossConfig,
     MaskConfig,
-    ModelConfig,
     RoboScapeConfig,
     SampleConfig,
     TokenModelConfig,
     TransformerConfig,
-    register_family,
 )
-from rsjax.config.run import Config, EvalConfig
-from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import ComponentConfig, CurriculumStageConfig, LoopConfig, OptimizerConfig
 

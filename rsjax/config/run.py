@@ -6,8 +6,9 @@ from typing import Any
 
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import added, check_numbers, require, require_range
-from rsjax.config.model import ModelConfig, RoboScapeConfig, converted
+from rsjax.config.model import ModelConfig, converted
 from rsjax.config.sim import SimConfig
+from rsjax.config.token_model import RoboScapeConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import LoopConfig
 

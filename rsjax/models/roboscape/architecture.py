@@ -9,7 +9,7 @@ from rsjax.config import (
     TokenModelConfig,
     TransformerConfig,
 )
-from rsjax.config.model import check_sampling
+from rsjax.config.token_model import check_sampling
 
 
 @dataclass(frozen=True)

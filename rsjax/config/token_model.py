@@ -1,0 +1,241 @@
+"""Settings of the families that predict tokens, RoboScape and Genie: masking, sampling, losses and the network."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from rsjax.config.data import ClipShape
+from rsjax.config.fields import added, loss_weights, require, require_range, runtime, sampling
+from rsjax.config.model import ModelConfig, register_family
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Masking and corruption of training tokens, as in the public Genie (reference: 1xgpt).
+
+    Rates are probabilities; see :mod:`rsjax.models.roboscape.masking` for the recipe's three steps.
+    """
+
+    random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
+    corruption_probability: float = 0.5  # step 2 applies to this share of the batches
+    corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
+    corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+    visible_prefix: float = 0.0  # step 3: share of the clips in which all frames before a random one stay visible
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """Settings of MaskGIT decoding within a frame, and of the memory from frame to frame."""
+
+    steps: int = 2
+    # Logits are divided by it; 0 takes the most probable code. The public Genie divides probabilities, which are then
+    # normalised again, so that every temperature above 0 samples as 1 does here.
+    temperature: float = 0.0
+    top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
+    unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
+    # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
+    # double the work.
+    guidance: float = 1.0
+    # Learned positions only: when the window is full, its first window_stride frames are dropped and the others encoded
+    # again from position 0. A smaller stride gives a longer memory and more work. 0: half of the positions.
+    window_stride: int = 0
+    cache_dtype: Literal["float32", "bfloat16"] = "float32"  # of temporal keys and values; bfloat16 halves the memory
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 1, f"model.sample.steps is {self.steps}; a frame needs at least 1 decoding step")
+        for name in ("temperature", "top_k", "window_stride"):
+            value = getattr(self, name)
+            require(value >= 0, f"model.sample.{name} is {value}; it cannot be negative")
+
+
+def check_sampling(sample: SampleConfig, positions: int, action_dropout: float) -> None:
+    """Raises :class:`rsjax.config.ConfigError` if a model with so many positions does not support these settings."""
+    require(
+        sample.guidance == 1 or action_dropout > 0,
+        f"model.sample.guidance is {sample.guidance} but the model never saw clips without actions; "
+        f"set it to 1, or train with model.action_dropout above 0",
+    )
+    require(
+        sample.window_stride < positions,
+        f"model.sample.window_stride is {sample.window_stride} of {positions} positions; "
+        f"at least one frame must stay in the window",
+    )
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Eq. 8: L = L_RGB + λ₁·L_Depth + λ₂·L_Keypoint + λ₃·L_Attention.
+
+    A field ``NAME_weight`` weighs the term NAME; 0 switches it off.
+    """
+
+    rgb_weight: float = 1.0
+    depth_weight: float = 1.0  # λ₁
+    keypoint_weight: float = 0.01  # λ₂
+    attention_weight: float = 1.0  # λ₃
+    gamma: float = 5.0  # γ of Eq. 6
+    use_keypoints: bool = True  # False: without the keypoint and attention terms
+    num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
+    # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
+    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which has
+    # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (docs/results/keypoints.md).
+    keypoint_target: Literal["observed", "predicted"] = "observed"
+    # Whether Eq. 5 compares masked cells only: from a third to half of ŝ_t lie on visible cells, where nobody samples.
+    # Measured there without effect.
+    keypoint_masked_only: bool = True
+
+    def __post_init__(self) -> None:
+        require(self.num_keypoints >= 1, f"model.loss.num_keypoints is {self.num_keypoints}; it must be at least 1")
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """A spatial-temporal transformer on token grids, with one branch or two."""
+
+    # linear: one linear layer (RoboScape). mlp: an MLP (the paper's Genie with actions), whose last layer starts at
+    # zero, so that public weights keep their logits. none: no actions (the public Genie).
+    action_encoder: Literal["linear", "mlp", "none"] = "linear"
+    # The encoder also reads the sum of all actions so far, which doubles its input. If actions are pose deltas, the sum
+    # is the pose: a large model finds it by temporal attention, a small one in few steps may not. Not in the paper.
+    integrate_actions: bool = False
+    # Every frame's input also has the embedded tokens of the frame before it, cell by cell, through a table of its own.
+    # In training these are visible where the frame before is masked, as past frames are in sampling, and the first
+    # spatial attention finds more than masks in the frame to predict. No output sees its own frame by it. Not in the
+    # paper.
+    read_previous: bool = False
+    width: int = 256
+    blocks: int = 32
+    heads: int = 8
+    mlp_ratio: int = 4
+    # The share of training clips whose actions are replaced by a learned null action, for classifier-free guidance in
+    # sampling. Not in the paper.
+    action_dropout: float = 0.0
+    # learned: as in the public code. rotary: temporal queries and keys are rotated, and a rollout can go on beyond the
+    # trained frames with a rolling cache; positions within a frame are learned in both cases.
+    positions: Literal["learned", "rotary"] = "learned"
+    # Norms before temporal attention and before the heads. The public Genie has neither; small models trained for few
+    # steps learn faster with both.
+    temporal_norm: bool = False
+    final_norm: bool = False
+    # Options of the public code that published weights may use. qk_norm: one LayerNorm normalises each head's queries
+    # and keys; the norms before spatial attention and the MLP are then absent.
+    qk_norm: bool = False
+    mup: bool = False  # attention scale 8/head width instead of 1/√(head width); the heads' input ÷ (width/256)
+    embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 as in the public code (torch's default)
+    position_std: float = 0.0  # position and mask embeddings ~ N(0, std²); 0 as in the public code
+    # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
+    # more, of attention within frames. Parameters, norms and softmaxes stay float32.
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
+    # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
+    # but linear layers' outputs are kept too (less work, more memory).
+    remat: Literal["none", "products", "blocks"] = runtime("none")
+
+    def __post_init__(self) -> None:
+        for name in ("width", "blocks", "heads", "mlp_ratio", "unroll"):
+            require(getattr(self, name) >= 1, f"model.{name} is {getattr(self, name)}; it must be at least 1")
+        require(
+            self.width % self.heads == 0,
+            f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
+        )
+        require(
+            self.positions == "learned" or self.head_width % 2 == 0,
+            f"model.positions is 'rotary', which turns pairs of channels, but a head has {self.head_width} "
+            f"(model.width / model.heads); change one of them",
+        )
+        require(
+            self.action_encoder != "none" or not (self.integrate_actions or self.action_dropout),
+            "model.action_encoder is none, so there are no actions for model.integrate_actions or "
+            "model.action_dropout; set them to False and 0",
+        )
+        require(
+            0 <= self.action_dropout < 1,
+            f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
+        )
+
+    @property
+    def head_width(self) -> int:
+        """Channels of one attention head."""
+        return self.width // self.heads
+
+
+@dataclass(frozen=True)
+class TokenModelConfig(TransformerConfig, ModelConfig):
+    """Settings that RoboScape and Genie share: a transformer trained on masked tokens and sampled with MaskGIT.
+
+    Attributes:
+        max_frames: positions in time, and how many frames temporal attention covers; 0: the clips' frames.
+        shifts: copies of each training clip, moved by up to ``shift_pixels``, of which a step draws one or the clip.
+            Few clips last longer with them: a scene that is moved by less than a token has other tokens everywhere.
+    """
+
+    uses_tokenizer: ClassVar[bool] = True
+    max_frames: int = 0
+    shifts: int = added(0)
+    shift_pixels: int = added(4)
+    mask: MaskConfig = MaskConfig()
+    sample: SampleConfig = sampling(SampleConfig())
+
+    @property
+    def takes_actions(self) -> bool:
+        return self.action_encoder != "none"
+
+    @property
+    def scanned(self) -> int:
+        return self.blocks
+
+    def frames(self, clips: ClipShape) -> int:
+        """Returns the number of positions in time for such clips."""
+        return self.max_frames or clips.frames
+
+    @property
+    def token_shifts(self) -> tuple[int, ...]:
+        return (self.shifts, self.shift_pixels) if self.shifts else ()
+
+    def check(self, clips: ClipShape) -> None:
+        require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
+        require(
+            clips.frames <= self.frames(clips),
+            f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "
+            f"it to 0 (as many as the clips have)",
+        )
+        check_sampling(self.sample, self.frames(clips), self.action_dropout)
+
+
+@register_family("roboscape")
+@dataclass(frozen=True)
+class RoboScapeConfig(TokenModelConfig):
+    """RoboScape: the dual-branch transformer with the physics-informed objective (paper §2.3)."""
+
+    use_depth: bool = True  # False: without the depth branch, its projections and the depth term
+    loss: LossConfig = LossConfig()
+
+    @property
+    def uses_depth(self) -> bool:
+        return self.use_depth
+
+    @property
+    def marked_keypoints(self) -> int:
+        return self.loss.num_keypoints if self.loss.use_keypoints else 0
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        off = set() if self.use_depth else {"depth"}
+        off |= set() if self.loss.use_keypoints else {"keypoint", "attention"}
+        return {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
+
+
+@register_family("genie")
+@dataclass(frozen=True)
+class GenieConfig(TokenModelConfig):
+    """Genie (reference: 1xgpt's STMaskGIT): RGB only, trained with cross-entropy only.
+
+    With ``action_encoder`` "mlp" it is the paper's baseline, with "none" the public model.
+    """
+
+    action_encoder: Literal["linear", "mlp", "none"] = "mlp"
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        return {"rgb": 1.0}
