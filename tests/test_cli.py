@@ -111,7 +111,7 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
         (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
         (["debug", "--model", "genie", "--model.loss.gamma", "2"], "unknown argument '--model.loss.gamma'"),
-        (["debug", "--model", "geni"], "unknown model 'geni'; did you mean 'genie'? (models: roboscape, genie"),
+        (["debug", "--model", "geni"], "unknown model 'geni'; did you mean 'genie'? (models: cogvideox, genie, irasim"),
     ],
 )
 def test_each_mistake_gets_one_line_that_names_it(argv: list[str], expected: str) -> None:

@@ -104,7 +104,8 @@ def family(name: str) -> type[ModelConfig]:
         ConfigError: the name is unknown; the message suggests the closest and lists all.
     """
     if name not in FAMILIES:
-        raise ConfigError(f"unknown model {name!r}{did_you_mean(name, FAMILIES)} (models: {', '.join(FAMILIES)})")
+        names = ", ".join(sorted(FAMILIES))
+        raise ConfigError(f"unknown model {name!r}{did_you_mean(name, FAMILIES)} (models: {names})")
     return FAMILIES[name]
 
 

@@ -65,7 +65,7 @@ def test_a_model_of_the_family_already_stays_as_it_is(name: str) -> None:
 
 
 def test_an_unknown_family_is_refused_with_the_nearest_and_all() -> None:
-    expected = r"unknown model 'geni'; did you mean 'genie'\? \(models: roboscape, genie"
+    expected = r"unknown model 'geni'; did you mean 'genie'\? \(models: cogvideox, genie, irasim"
     values = to_dict(DEBUG)
     values["model"]["family"] = "geni"
     with pytest.raises(ConfigError, match=expected):
