@@ -39,6 +39,7 @@ _FAIR = (
     "Same clips, actions and evaluation; one prompt frame, one sample a clip; all models train for about the same time "
     "(the table of trainings has steps, operations and measured minutes).",
     "Genie reads actions through an MLP, as the authors answered a reviewer (W4).",
+    "RoboScape and Genie also learn from moved copies of the clips (model.shifts), the other families do not.",
 )
 
 register(
