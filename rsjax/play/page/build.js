@@ -1,7 +1,7 @@
 // Builds what the server's welcome describes, once.
 import { makeBranches } from "./branches.js";
 import { compareBranch, dropBranch, fork, openBranch } from "./session.js";
-import { askAgain, layout, meter, redraw, watched } from "./drawing.js";
+import { askAgain, askLate, layout, meter, redraw, watched } from "./drawing.js";
 import { keepsKey, makeStick } from "./drive.js";
 import { makeKeep } from "./keep.js";
 import { makeView } from "./panes.js";
@@ -63,6 +63,7 @@ function listen() {
   const { stick } = state.parts;
   setInterval(meter, 500);
   setInterval(measureTrip, 5000);
+  setInterval(askLate, 2000);
   document.addEventListener("rsjax-forget", () => state.pace.clear()); // of measurements (tests/play/latency.py)
   document.addEventListener("keydown", typed);
   document.addEventListener("keyup", stick.key);

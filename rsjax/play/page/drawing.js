@@ -3,10 +3,13 @@ import { at, attempt, state, tree } from "./state.js";
 
 const BLOCK = 32; // frames asked for at once
 const APART = 100; // milliseconds between two drawings of the list and the chart
+const MOST_TRIES = 5; // to get a frame's pictures again
 const asked = new Set();
 const pending = []; // frames to be drawn whose time is measured: [frame, time of the key or null]
 let dirty = false;
 let later = 0;
+let late = ""; // the frame that was asked for again, and how often
+let tries = 0;
 
 /** Forgets which frames were asked for. */
 export function askAgain() {
@@ -71,6 +74,21 @@ function drawAside() {
   parts.chart.draw(series, frame, Math.max(...lines.map(tree.length)));
 }
 
+function lacks(branch, place, kinds) {
+  return kinds.some((kind) => kind !== "points" && !tree.frame(branch, kind, place));
+}
+
+/** Asks again for what a still picture lacks: a busy server drops pushed pictures. Call it every few seconds. */
+export function askLate() {
+  const { session, pace, current, frame } = state;
+  const place = `${current} ${frame}`;
+  [late, tries] = [place, place === late ? tries : 0];
+  if (!session || pace.flying() || tries >= MOST_TRIES || !lacks(current, frame, watched())) return;
+  tries += 1;
+  askAgain();
+  redraw();
+}
+
 /** Asks for frames that are to be shown and were never sent to this page. */
 function fetchMissing() {
   const kinds = ["rgb", ...watched()];
@@ -78,8 +96,7 @@ function fetchMissing() {
     const place = Math.min(state.frame, tree.length(branch) - 1);
     const block = Math.floor(place / BLOCK) * BLOCK;
     const names = [`${tree.owner(branch, place)} ${place} ${kinds}`, `${branch} ${block} ${kinds}`];
-    const lacks = kinds.some((kind) => kind !== "points" && !tree.frame(branch, kind, place));
-    if (!lacks || names.some((name) => asked.has(name))) continue;
+    if (!lacks(branch, place, kinds) || names.some((name) => asked.has(name))) continue;
     asked.add(names[1]);
     const count = Math.min(BLOCK, tree.length(branch) - block);
     attempt(state.connection.call("frames", { branch, first: block, count, kinds }));
