@@ -67,6 +67,7 @@ async function beginAgain() {
 }
 
 function received(message) {
+  if (message.type === "truth_off") state.truthOff = message.message;
   if (message.type === "session") applySession(message);
   else if (message.type === "truth" || message.type === "points") takeFacts(message);
   else if (message.type === "truth_off" || message.type === "error") note(message.message, true);

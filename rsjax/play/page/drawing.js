@@ -45,7 +45,8 @@ function draw() {
     if (view === parts.dream) drawn.then((done) => done && requestAnimationFrame(() => measured(frame)));
   }
   caption(parts.dream, current, beside === null ? "dream" : `branch ${current}`);
-  parts.truth.note.textContent = tree.frame(current, "truth", frame) ? "" : "catching up …";
+  parts.truth.note.textContent = tree.frame(current, "truth", frame) ? "" : state.truthOff ? "stays behind" : "catching up …";
+  parts.truth.note.title = state.truthOff;
   if (beside !== null) caption(parts.beside, beside, `branch ${beside}`);
   later ||= setTimeout(drawAside, APART);
 }

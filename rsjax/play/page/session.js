@@ -34,6 +34,7 @@ async function begin(type, fields) {
 /** Takes over what a `session` message says; also after a lost connection was found again. */
 export function applySession(message) {
   const truth = state.session?.has_truth;
+  state.truthOff = "";
   state.session = message;
   tree.branches.clear();
   message.branches.forEach(tree.setBranch);

@@ -17,6 +17,7 @@ export const state = {
   halted: false, // after a step that failed, until the next key
   incoming: null, // messages since a start was asked for, until its answer
   parts: null, // what the welcome describes: stick, sources, views …
+  truthOff: "", // why the simulator does not follow
   connection: null,
   transport: null,
   pace: null,
