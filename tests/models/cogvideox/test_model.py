@@ -154,8 +154,8 @@ def test_guidance_moves_away_from_the_empty_text() -> None:
         return np.asarray(_chunk(arch, params, jax.random.key(0), image, texts, empty, index))
 
     without, with_text = latents(0.0), latents(1.0)
-    assert np.abs(with_text - without).max() > 1e-2
-    np.testing.assert_allclose(latents(3.0), 3 * with_text - 2 * without, rtol=1e-3, atol=1e-3)
+    assert np.abs(with_text - without).max() > 3e-3
+    np.testing.assert_allclose(latents(3.0), 3 * with_text - 2 * without, atol=1e-4)
 
 
 def test_videos_are_filled_up_and_cut_again() -> None:
