@@ -33,7 +33,7 @@ class Viewer:
         self.session, self.side, self.files, self._truths = session, side, files, truths
         self._follower: Follower | None = None
         self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator is to reach
-        self._following = False
+        self._chase: object | None = None  # stands for the task that brings it there; another one after a new start
         self.sources = Sources(session.run)
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -55,7 +55,7 @@ class Viewer:
 
     def rest(self) -> None:
         """Lets others have the simulator."""
-        self._wanted = None
+        self._wanted = self._chase = None
         if self._follower is not None:
             self._follower.close()
             self._follower = None
@@ -112,11 +112,11 @@ class Viewer:
         if start is None or start.clip is None or self.no_truth:
             return
         self._wanted = number, frame
-        if not self._following:
-            self._following = True
-            self._later(self._catch_up(start.clip))
+        if self._chase is None:
+            self._chase = object()
+            self._later(self._catch_up(start.clip, self._chase))
 
-    async def _catch_up(self, clip: Record) -> None:
+    async def _catch_up(self, clip: Record, chase: object) -> None:
         session = self.session
         try:
             while self._wanted is not None:
@@ -125,15 +125,20 @@ class Viewer:
                 if self._follower is None:
                     task = str(clip["task"]) if session.run.simulator and session.run.simulator.train_tasks else ""
                     self._follower = Follower(self._truths, clip["provenance"], task)
-                for each in await self._follower.follow(nodes):
+                filled = await self._follower.follow(nodes)
+                if self._chase is not chase:  # these are frames of the start before
+                    return
+                for each in filled:
                     place = Place(number, each, 0)
                     shown.send_truth(session, place, nodes[each], session.watched, shown.mean_psnr(nodes[: each + 1]))
                     if "points" in session.watched:
                         await shown.send_points(session, self.side, place, nodes[: each + 1], "truth")
         except Refused as error:
-            session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})
+            if self._chase is chase:
+                session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})
         finally:
-            self._following = False
+            if self._chase is chase:
+                self._chase = None
 
     def mean_bits(self, node: Node) -> float | None:
         """Returns the mean entropy of a frame's tokens in bits."""

@@ -102,3 +102,16 @@ def test_a_slow_simulator_does_not_hold_up_the_dream(tmp_path: Path) -> None:
         began = time.monotonic()
         drive(page, 0, *[0.1] * 10)
         assert time.monotonic() - began < 3 and not any(each["type"] == "truth" for each in page.pushed)
+
+
+def test_a_new_start_has_a_simulator_of_its_own(tmp_path: Path) -> None:
+    run = seeded(play_run(tmp_path, Fakes()))
+    with serving(hub_of(run, truths=Truths(functools.partial(adding, 0.5)))) as server, server.client() as (page, _):
+        page.ask("watch", kinds=["truth"])
+        page.ask("start", clip=0)
+        drive(page, 0, 0.9)
+        page.ask("start", clip=1)  # while the first one is still on its way
+        drive(page, 0, 0.1)
+        told = page.until_pushed("truth", 2)
+        assert [each["frame"] for each in told] == [0, 1]
+        assert [int(rgb(each)[0, 0, 0]) for each in page.pictures if each.kind == 3] == [0, 10]
