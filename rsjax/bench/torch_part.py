@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from rsjax.bench.timing import median_seconds
-from rsjax.config import Config, ConfigError, require
+from rsjax.config import CogVideoXConfig, Config, ConfigError, require
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 
@@ -19,6 +19,15 @@ ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # op
 def check_genie(config: Config) -> None:
     """Raises :class:`ConfigError` if the model has an option that the plain Genie lacks."""
     check_plain(Architecture.create(config))
+
+
+def check_cogvideox(config: Config) -> None:
+    """Raises :class:`ConfigError` if a CogVideoX has options that its baseline lacks."""
+    assert isinstance(config.model, CogVideoXConfig)
+    for name in ("stretch", "learned_positions"):
+        require(not getattr(config.model, name), f"model.{name} is set, which the PyTorch baseline lacks; leave it out")
+    ratio = config.model.mlp_ratio
+    require(ratio == 4, f"model.mlp_ratio is {ratio}; the PyTorch baseline has 4; set it alike, or leave --torch out")
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,7 @@ FAMILIES = {
     "genie": Baseline("rsjax.bench.genie_torch", check=check_genie),
     "ivideogpt": Baseline("rsjax.bench.ivideogpt_torch", ("transformers",)),
     "irasim": Baseline("rsjax.bench.irasim_torch", ("diffusers",)),
+    "cogvideox": Baseline("rsjax.bench.cogvideox_torch", ("diffusers",), check_cogvideox),
 }
 
 
