@@ -3,6 +3,7 @@
 import io
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ from rsjax.report.depth_view import depth_to_colors
 from tests.play.client import Server, serving
 from tests.play.fake import hub_of
 
-pytest.importorskip("playwright", reason="Playwright is not installed (make extras)")
+api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (make extras)")
 
 Open = Callable[..., Any]
-_READY = "() => document.querySelector('.counter')?.textContent.startsWith('frame ')"
+# The counter says "frame" before the first picture is drawn.
+_READY = """() => { const canvas = document.querySelector('.layers canvas:first-child');
+  return canvas?.width && canvas.getContext('2d').getImageData(0, 0, 1, 1).data[3] > 0
+    && document.querySelector('.counter')?.textContent.startsWith('frame '); }"""
 _LENGTH = "length => Number(document.querySelector('.transport input').max) >= length - 1"
 _PIXELS = "() => [...document.querySelectorAll('.layers canvas:first-child')].map(each => each.toDataURL())"
 _NAMELESS = """() => [...document.querySelectorAll('button, input, select')].filter(each => !(each.labels?.length
@@ -71,10 +75,14 @@ def opened(browser: Any, server: Server) -> Iterator[Open]:
 
 
 def _drive(page: Any, key: str, length: int) -> None:
-    """Holds a key until the branch has so many frames."""
-    page.keyboard.down(key)
-    page.wait_for_function(_LENGTH, arg=length)
-    page.keyboard.up(key)
+    """Holds a key until the branch has so many frames, pressed again where the window lost the focus."""
+    for _ in range(6):
+        page.keyboard.down(key)
+        with suppress(api.TimeoutError):
+            page.wait_for_function(_LENGTH, arg=length, timeout=5000)
+        page.keyboard.up(key)
+        if page.evaluate(_LENGTH, length):
+            break
     page.wait_for_function(
         "() => document.querySelector('.counter').textContent.match(/\\d+/g).every((n, _, all) => n === all[0])"
     )
