@@ -1,8 +1,10 @@
 """Settings that have to stand before jax is loaded, here and in the processes that tests start."""
 
+import importlib.util
 import os
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any
@@ -57,6 +59,31 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     config.option.loadscopereorder = False
     return LoadFileScheduling(config, log)
+
+
+def _operators() -> object:
+    """Lets a torchvision that was built for CUDA be imported beside a torch without.
+
+    Its compiled part does not load there, and the import then wants these two operators declared. RAFT and image
+    processors are plain Python and call neither. Beside its own torch nothing is needed.
+    """
+    if not (importlib.util.find_spec("torch") and importlib.util.find_spec("torchvision")):
+        return None
+    import torch
+
+    try:
+        import torchvision  # noqa: F401
+    except RuntimeError:
+        declared = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            declared.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+            del sys.modules[name]
+        return declared
+    return None
+
+
+_OPERATORS = _operators()  # undeclared again when it is deleted
 
 
 @pytest.fixture(scope="session")
