@@ -23,7 +23,7 @@ Open = Callable[..., Any]
 _READY = """() => { const canvas = document.querySelector('.layers canvas:first-child');
   return canvas?.width && canvas.getContext('2d').getImageData(0, 0, 1, 1).data[3] > 0
     && document.querySelector('.counter')?.textContent.startsWith('frame '); }"""
-_LENGTH = "length => Number(document.querySelector('.transport input').max) >= length - 1"
+_LENGTH = "length => Number(document.querySelector('.transport input')?.max) >= length - 1"
 _PIXELS = "() => [...document.querySelectorAll('.layers canvas:first-child')].map(each => each.toDataURL())"
 _NAMELESS = """() => [...document.querySelectorAll('button, input, select')].filter(each => !(each.labels?.length
     || each.closest('[hidden]') || each.getAttribute('aria-label') || each.textContent.trim()))
