@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
+from rsjax.config.diffusion import DenoiseConfig, NoiseConfig, check_grid
 from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
@@ -171,15 +171,7 @@ class CogVideoXConfig(ModelConfig):
         return self.blocks
 
     def check(self, clips: ClipShape) -> None:
-        token = self.autoencoder.downsampling * self.patch_size
-        below = clips.image_size // token * token
-        fitting = f"{below} or {below + token}" if below else f"{token}"
-        require(
-            clips.image_size % token == 0,
-            f"images have {clips.image_size} pixels a side, which the {token} pixels of a token (the autoencoder's "
-            f"{self.autoencoder.downsampling} × model.patch_size {self.patch_size}) do not divide; take clips of "
-            f"{fitting} pixels, or change model.patch_size",
-        )
+        token = check_grid(clips, self.autoencoder.downsampling, self.patch_size)
         grid = (latent_frames(clips.frames), clips.image_size // token, clips.image_size // token)
         require(
             self.learned_positions in ((), grid),

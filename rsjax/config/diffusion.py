@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from rsjax.config.data import ClipShape
 from rsjax.config.fields import added, require, require_range
 
 
@@ -60,3 +61,24 @@ class DenoiseConfig:
             self.steps <= noise.steps,
             f"model.sample.steps is {self.steps} of model.noise.steps {noise.steps}; take at most as many",
         )
+
+
+def check_grid(clips: ClipShape, downsampling: int, patch_size: int) -> int:
+    """Returns the pixels of a token along each side.
+
+    Args:
+        downsampling: the autoencoder's.
+
+    Raises:
+        ConfigError: they do not divide the clips' images.
+    """
+    token = downsampling * patch_size
+    below = clips.image_size // token * token
+    fitting = f"{below} or {below + token}" if below else f"{token}"
+    require(
+        clips.image_size % token == 0,
+        f"images have {clips.image_size} pixels a side, which the {token} pixels of a token (the autoencoder's "
+        f"{downsampling} × model.patch_size {patch_size}) do not divide; take clips of "
+        f"{fitting} pixels, or change model.patch_size",
+    )
+    return token

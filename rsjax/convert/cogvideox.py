@@ -7,7 +7,6 @@ positions are encoded. The weights of a large transformer are in several files, 
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,7 +26,6 @@ from rsjax.convert.table import (
     to_params,
     weight_and_bias,
 )
-from rsjax.files import read_json
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.pretrained import saved_architecture
 from rsjax.models.cogvideox.transformer import shapes
@@ -88,23 +86,6 @@ def transformer_table(config: CogVideoXConfig) -> Table:
     return tuple(entries)
 
 
-def read_settings(weights: Path) -> dict[str, Any]:
-    """Reads the settings beside a file of weights; returns an empty dict if there are none.
-
-    Raises:
-        UserError: the file is damaged or of another network.
-    """
-    path = weights.parent / CONFIG
-    if not path.exists():
-        return {}
-    cure = f"put the published one beside {weights.name}, or delete it"
-    settings = read_json(path, cure=cure)
-    if settings.get("_class_name") not in CLASSES.values():
-        named, known = settings.get("_class_name", "no network"), " or ".join(CLASSES.values())
-        raise ConvertError(f"{path}: describes {named}, not {known}; {cure}")
-    return settings
-
-
 def is_autoencoder(source: object, tensors: Tensors) -> bool:
     """Returns whether tensors are an autoencoder's and not a transformer's.
 
@@ -132,7 +113,7 @@ def autoencoder_from_public(
     """Returns an autoencoder's settings and parameters.
 
     Args:
-        settings: of the file, from :func:`read_settings`; without them the latents' factor is 5B-I2V's.
+        settings: of the file, from ``published_settings``; without them the latents' factor is 5B-I2V's.
         names: of the tensors in the file, for errors, where they differ.
 
     Raises:

@@ -15,7 +15,7 @@ from rsjax.config import CogVideoXConfig
 from rsjax.convert import cogvideox
 from rsjax.convert.commands import REPLACES, check_file
 from rsjax.convert.directory import Part, save_part, saved_part
-from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
+from rsjax.convert.files import SAFE, ConvertError, Tensors, published_settings, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
 from rsjax.data.store import open_store
 from rsjax.errors import first_line
@@ -45,7 +45,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     if source.is_dir():
         return [_export(source, out, part)]
     tensors, names = _read(source)
-    settings, vae = cogvideox.read_settings(source), cogvideox.is_autoencoder(source, tensors)
+    settings, vae = published_settings(source, *cogvideox.CLASSES.values()), cogvideox.is_autoencoder(source, tensors)
     part, other = PARTS if vae else PARTS[::-1]
     if settings.get("_class_name", cogvideox.CLASSES[part]) != cogvideox.CLASSES[part]:
         raise ConvertError(f"{source}: is no {settings['_class_name']}, as {cogvideox.CONFIG} beside it says")

@@ -7,7 +7,7 @@ from typing import Literal
 from rsjax.config import ConfigError, from_dict, to_dict
 from rsjax.convert import directory, irasim, kl_autoencoder
 from rsjax.convert.commands import REPLACES, check_file
-from rsjax.convert.files import HOLDERS, ConvertError, read_tensors, write_safetensors
+from rsjax.convert.files import HOLDERS, ConvertError, published_settings, read_tensors, write_safetensors
 from rsjax.files import parse_json, read_json, write_json
 from rsjax.models.irasim.dit import Architecture
 
@@ -56,7 +56,7 @@ def convert_sdxl(source: Path, out: Path) -> list[str]:
         text = f"under their public names; settings in {kl_autoencoder.CONFIG}{replaces}"
         return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]
     tensors, _, names = read_tensors(source)
-    settings = kl_autoencoder.read_settings(source)
+    settings = published_settings(source, kl_autoencoder.CLASS)
     config, params = kl_autoencoder.from_public(source, tensors, settings, names)
     replaces = REPLACES * directory.save(out, config, params)
     lines = [f"{out}: an autoencoder of {len(tensors)} tensors, none left aside, {config}{replaces}"]

@@ -11,7 +11,7 @@ import safetensors
 import safetensors.numpy
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import placeholder, write_file
+from rsjax.files import placeholder, read_json, write_file
 
 Tensors = dict[str, np.ndarray]
 
@@ -164,3 +164,23 @@ def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
 
 def _unreadable(path: Path, name: str, dtype: str) -> ConvertError:
     return ConvertError(f"{path}: {name} is of type {dtype} or a form that cannot be read; save it as dense float32")
+
+
+def published_settings(weights: Path, *classes: str) -> dict[str, Any]:
+    """Reads the settings beside a file of weights in diffusers' layout; returns an empty dict if there are none.
+
+    Args:
+        classes: names of the networks that they may describe.
+
+    Raises:
+        UserError: the file is damaged or of another network.
+    """
+    path = weights.parent / "config.json"
+    if not path.exists():
+        return {}
+    cure = f"put the published one beside {weights.name}, or delete it"
+    settings = read_json(path, cure=cure)
+    named = settings.get("_class_name", "no network")
+    if named not in classes:
+        raise ConvertError(f"{path}: describes {named}, not {' or '.join(classes)}; {cure}")
+    return settings

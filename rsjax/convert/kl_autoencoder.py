@@ -6,7 +6,6 @@ older autoencoders of the same shapes have another one.
 
 import math
 import re
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,7 +15,6 @@ from rsjax.config import ConfigError, KLConfig
 from rsjax.convert.files import ConvertError, Tensors
 from rsjax.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors
 from rsjax.convert.vae_names import vae_table
-from rsjax.files import read_json
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
 from rsjax.trainable import Params
 
@@ -42,22 +40,6 @@ def _shapes(config: KLConfig) -> Params:
     """Returns the shapes of the networks, without the latents' statistics."""
     shapes = jax.eval_shape(lambda key: init(config, key), jax.random.key(0))
     return {name: shapes[name] for name in ("encoder", "decoder")}
-
-
-def read_settings(weights: Path) -> dict[str, Any]:
-    """Reads the settings beside a file of weights; returns an empty dict if there are none.
-
-    Raises:
-        UserError: the file is damaged or of another network.
-    """
-    path = weights.parent / CONFIG
-    if not path.exists():
-        return {}
-    cure = f"put the published one beside {weights.name}, or delete it"
-    settings = read_json(path, cure=cure)
-    if settings.get("_class_name") != CLASS:
-        raise ConvertError(f"{path}: describes {settings.get('_class_name', 'no network')}, not an {CLASS}; {cure}")
-    return settings
 
 
 def infer_config(source: object, tensors: Tensors, settings: dict[str, Any], names: Names = SAME_NAMES) -> KLConfig:
@@ -98,7 +80,7 @@ def from_public(
     """Returns an autoencoder's settings and parameters, converted from a public file's tensors.
 
     Args:
-        settings: of the file, from :func:`read_settings`; without them the latents' factor is SDXL's.
+        settings: of the file, from ``published_settings``; without them the latents' factor is SDXL's.
         names: of the tensors in the file, for errors, where they differ.
 
     Raises:

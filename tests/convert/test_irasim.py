@@ -86,7 +86,7 @@ def test_files_of_something_else_are_refused(
     message = refused(capsys, "irasim", weights, tmp_path / "o", "--heads", 2)
     assert "missing: blocks.1.mlp.fc2.bias; unexpected: extra" in message
     (vae.parent / "config.json").write_text('{"_class_name": "AutoencoderTiny"}')
-    assert "describes AutoencoderTiny, not an AutoencoderKL" in refused(capsys, "sdxl", vae, tmp_path / "o")
+    assert "describes AutoencoderTiny, not AutoencoderKL" in refused(capsys, "sdxl", vae, tmp_path / "o")
 
 
 def test_a_trained_autoencoder_has_no_public_form(tmp_path: Path) -> None:

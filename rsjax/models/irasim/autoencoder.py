@@ -22,6 +22,7 @@ from rsjax.config import Config, KLConfig, TokenizerTrainConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
+from rsjax.models.diffusion import latents as distributions
 from rsjax.models.irasim import pretrained
 from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
 from rsjax.tokenizers import magvit2
@@ -37,7 +38,6 @@ Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which deci
 Latents = Float[Array, "B h w z"]
 
 SDXL_FACTOR = 0.13025  # by which the public code multiplies latents
-LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's, as in the public code
 CHUNK_PIXELS = CHUNK * 64**2  # of images per pass, to bound memory
 
 
@@ -62,8 +62,7 @@ def init(config: KLConfig, key: Key[Array, ""]) -> Params:
 
 def posterior(config: KLConfig, params: Params, images: Images) -> tuple[Latents, Latents]:
     """Returns the mean and the log-variance of images' latents, not standardised."""
-    mean, log_variance = jnp.split(networks(config)[0].apply({"params": params["encoder"]}, images), 2, axis=-1)
-    return mean, jnp.clip(log_variance, *LOG_VARIANCE)
+    return distributions.posterior(networks(config)[0].apply({"params": params["encoder"]}, images))
 
 
 def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
@@ -98,24 +97,12 @@ class KLTraining(Autoencoder[Batch]):
         return {"lpips": lpips_weights(self.train, self.image_size)}
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms of the reconstruction, and
-
-        - "kl": the divergence of the posterior from the normal distribution, per number;
-        - "standard": -log p of the latents under the parameters "latents", which so become their mean and deviation.
-        """
+        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and perhaps "perceptual"."""
         images = to_unit(batch["images"])
         mean, log_variance = posterior(self.config, params, images)
-        noise = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), mean.shape[1:]))
-        latents = mean + jnp.exp(log_variance / 2) * noise(batch["index"])
+        latents = distributions.draw(mean, log_variance, key, batch["index"])
         output = decode(self.config, params, latents)
-        fitted = params["latents"]
-        standard = (jax.lax.stop_gradient(latents) - fitted["mean"]) * jnp.exp(-fitted["log_deviation"])
-        means = {
-            "l1": jnp.mean(jnp.abs(images - output)),
-            "l2": jnp.mean(jnp.square(images - output)),
-            "kl": jnp.mean(jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance) / 2,
-            "standard": jnp.mean(fitted["log_deviation"]) + jnp.mean(jnp.square(standard)) / 2,
-        }
+        means = distributions.means_of_terms(images, output, mean, log_variance, latents, params["latents"])
         if "perceptual" in self.loss_weights:
             assert context.extra is not None
             means["perceptual"] = jnp.mean(lpips(context.extra["lpips"], images, output))
@@ -166,12 +153,10 @@ class KLCodec:
 
 @partial(jax.jit, static_argnums=0)
 def _encode(config: KLConfig, params: Params, images: Any) -> Float[Array, "B h w z2"]:
-    mean, log_variance = posterior(config, params, to_unit(images))
-    scale = jnp.exp(-params["latents"]["log_deviation"])
-    return jnp.concatenate([(mean - params["latents"]["mean"]) * scale, jnp.exp(log_variance / 2) * scale], axis=-1)
+    made = networks(config)[0].apply({"params": params["encoder"]}, to_unit(images))
+    return distributions.standardised(made, params["latents"])
 
 
 @partial(jax.jit, static_argnums=0)
 def _decode(config: KLConfig, params: Params, latents: Any) -> Float[Array, "B H W 3"]:
-    own = latents * jnp.exp(params["latents"]["log_deviation"]) + params["latents"]["mean"]
-    return to_pixels(decode(config, params, own))
+    return to_pixels(decode(config, params, distributions.original(latents, params["latents"])))
