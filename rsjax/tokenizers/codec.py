@@ -1,9 +1,9 @@
 """Encodes and decodes numpy images with a trained tokenizer: RGB frames and depth maps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, cast
+from typing import Literal, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
+Grids: TypeAlias = Int[np.ndarray, "*B h w"] | Float32[np.ndarray, "*B h w D"]  # tokens, or codes of D bits
 
 CHUNK = 128  # most images per pass, to bound memory
 
@@ -42,8 +43,8 @@ class Codec:
             tokens["depth"][has_depth] = grid
         return tokens
 
-    def decode(self, tokens: Tokens, has_depth: Bool[np.ndarray, " B"]) -> Video:
-        """Decodes tokens to a video, with depth for the clips that have it and NaN for the others."""
+    def decode(self, tokens: Mapping[str, Grids], has_depth: Bool[np.ndarray, " B"]) -> Video:
+        """Decodes tokens or codes to a video, with depth for the clips that have it and NaN for the others."""
         rgb = self.decode_rgb(tokens["rgb"])
         if "depth" not in tokens or not has_depth.any():
             return Video(rgb)
@@ -64,12 +65,12 @@ class Codec:
         colors = depth_to_color(depth, *self._depth_range(), self.config.depth_scale)
         return self._chunked("encode", colors.astype(np.uint8))
 
-    def decode_rgb(self, tokens: Int[np.ndarray, "*B h w"]) -> UInt8[np.ndarray, "*B H W 3"]:
-        """Decodes tokens to frames 0–255."""
+    def decode_rgb(self, tokens: Grids) -> UInt8[np.ndarray, "*B H W 3"]:
+        """Decodes tokens or codes to frames 0–255."""
         return np.round(self._chunked("decode", np.asarray(tokens))).astype(np.uint8)
 
-    def decode_depth(self, tokens: Int[np.ndarray, "*B h w"]) -> Float32[np.ndarray, "*B H W"]:
-        """Decodes tokens of depth colour maps to metres.
+    def decode_depth(self, tokens: Grids) -> Float32[np.ndarray, "*B H W"]:
+        """Decodes tokens or codes of depth colour maps to metres.
 
         Raises:
             UserError: no clip of the data has depth.
@@ -90,7 +91,8 @@ class Codec:
         def apply(chunk: np.ndarray) -> ArrayLike:
             return _apply(self.config, method, self.params, divide(chunk, self.params))
 
-        return in_chunks(apply, images, {"encode": 3, "decode": 2}[method])
+        codes = images.dtype == np.float32  # not tokens
+        return in_chunks(apply, images, 3 if method == "encode" or codes else 2)
 
 
 def in_chunks(

@@ -63,6 +63,13 @@ def vocabulary_codes(code_bits: int, vocabularies: int) -> Float[Array, "V d"]:
     return tokens_to_codes(jnp.arange(2**width, dtype=jnp.int32), width)
 
 
+def mean_codes(logits: Float[Array, "*batch n V"], code_bits: int) -> Float[Array, "*batch D"]:
+    """Returns ŝ of Eq. 5: each bit's expectation in [-1, 1] under the predicted distribution."""
+    codes = vocabulary_codes(code_bits, logits.shape[-2])
+    expected = jax.nn.softmax(logits, axis=-1) @ codes
+    return expected.reshape(*expected.shape[:-2], code_bits)
+
+
 def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
     """Returns mean((x - sg(q))²), float32, which keeps the latents near their codes."""
     latents = latents.astype(jnp.float32)

@@ -156,9 +156,11 @@ class Tokenizer(nn.Module):
         """Encodes images 0–255 to tokens 0 … 2^D - 1."""
         return lfq.codes_to_tokens(self.encoder(to_unit(images)))
 
-    def decode(self, tokens: Int[Array, "B h w"]) -> Float[Array, "B H W 3"]:
-        """Decodes tokens to images 0–255 (float32, clipped, not rounded)."""
-        return to_pixels(self.decoder(lfq.tokens_to_codes(tokens, self.config.code_bits)))
+    def decode(self, tokens: Int[Array, "B h w"] | Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
+        """Decodes tokens, or codes, to images 0–255 (float32, clipped, not rounded)."""
+        if jnp.issubdtype(tokens.dtype, jnp.integer):
+            tokens = lfq.tokens_to_codes(tokens, self.config.code_bits)
+        return to_pixels(self.decoder(tokens))
 
     def init_params(self, key: Array) -> Any:
         """Returns fresh parameters, which do not depend on the image size."""

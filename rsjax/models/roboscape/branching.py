@@ -122,7 +122,8 @@ class TokenBranching:
         """
         drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.action_dropout else 1.0
         sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
-        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k)
+        # A moment has tokens, so its pictures are decoded from them.
+        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k, mean_codes=False)
         return Network(self._arch, sample, self._has_depth, True)
 
     def _empty_cache(self) -> Cache:

@@ -1,6 +1,6 @@
 """Decodes single frames of a rollout, with the cache or by recomputing their window.
 
-Axes: B clips, T frames, S cells, A action dimensions.
+Axes: B clips, T frames, S cells, D code bits, A action dimensions.
 """
 
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import stride, window_actions, window_start
 
 Cells = dict[str, Int[Array, "B T S"]]
+Means = dict[str, Float[Array, "B T S D"]]  # mean codes; empty unless ``sample.shows_means``
 
 
 @dataclass(frozen=True)
@@ -44,20 +45,20 @@ class Decoder:
     temperature: Float[Array, " B"] | None = None
     entropy: bool = False
 
-    def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Cache]) -> tuple[Cells, Cache]:
+    def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
         """Decodes frame t with the cache of frames before t-1: one pass over (t-1, t), then passes over t.
 
         Args:
             base: the first frame of the window.
-            carry: tokens of all frames, and the cache. The first pass commits t-1 to the cache; what it writes for t is
-                overwritten later.
+            carry: tokens and means of all frames, and the cache. The first pass commits t-1 to the cache; what it
+                writes for t is overwritten later.
         """
-        tokens, cache = carry
+        tokens, means, cache = carry
         pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
         actions = window_actions(self.arch, self.actions, base, t - 1, 2)
         before = {name: grid[:, t - 2] for name, grid in tokens.items()}
         frame, cache = self.decode_pair(pair, before, actions, t - base, self._step_keys(t), cache)
-        return _put(tokens, frame, t), cache
+        return _put(tokens, frame.tokens, t), _put(means, frame.means, t), cache
 
     def decode_pair(
         self,
@@ -83,7 +84,8 @@ class Decoder:
         previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
         logits, cache = self.apply(pair, mask, actions, position - 1, cache, previous=previous)
         entropy = jnp.zeros((b, cells)) if self.entropy else None
-        frame = Frame({name: grid[:, 1] for name, grid in pair.items()}, mask[:, 1], entropy)
+        given = {name: grid[:, 1] for name, grid in pair.items()}
+        frame = Frame(given, mask[:, 1], entropy, no_means(self.arch, self.sample, b))
         frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
         previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
@@ -94,28 +96,31 @@ class Decoder:
 
         return jax.lax.fori_loop(1, self.sample.steps, step, frame), cache
 
-    def encode_anew(self, base: Array, carry: tuple[Cells, Cache]) -> tuple[Cells, Cache]:
+    def encode_anew(self, base: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
         """Fills the cache with the frames that a window beginning at ``base`` keeps, except the last of them."""
-        tokens, cache = carry
+        tokens, means, cache = carry
         length = self.arch.frames - stride(self.arch, self.sample) - 1
         if length == 0:
             return carry
         kept = {name: jax.lax.dynamic_slice_in_dim(grid, base, length, axis=1) for name, grid in tokens.items()}
         actions = window_actions(self.arch, self.actions, base, base, length)
         _, cache = self.apply(kept, jnp.zeros(kept["rgb"].shape, bool), actions, 0, cache)
-        return tokens, cache
+        return tokens, means, cache
 
-    def uncached(self, t: Array, tokens: Cells) -> Cells:
+    def uncached(self, t: Array, carry: tuple[Cells, Means]) -> tuple[Cells, Means]:
         """Decodes frame t with a full pass over its window at every step."""
+        tokens, means = carry
         b, frames, cells = tokens["rgb"].shape
         length = frames if self.arch.positions == "rotary" else self.arch.frames
         base = window_start(self.arch, self.sample, t)
         keys = self._step_keys(t)
         actions = window_actions(self.arch, self.actions, base, base, length)
-        frame = Frame({name: grid[:, 0] for name, grid in tokens.items()}, jnp.ones((b, cells), bool))
+        given = {name: grid[:, 0] for name, grid in tokens.items()}
+        frame = Frame(given, jnp.ones((b, cells), bool), None, no_means(self.arch, self.sample, b))
 
         def step(i: Array, frame: Frame) -> Frame:
-            seen = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, base, length, axis=1), _put(tokens, frame, t))
+            grids = _put(tokens, frame.tokens, t)
+            seen = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, base, length, axis=1), grids)
             here = jnp.arange(length)[None, :, None] == t - base
             logits, _ = self.apply(seen, here & frame.mask[:, None], actions, 0, None)
             at_t = {
@@ -123,7 +128,8 @@ class Decoder:
             }
             return self._unmask(keys[:, i], i, frame, at_t)
 
-        return _put(tokens, jax.lax.fori_loop(0, self.sample.steps, step, frame), t)
+        frame = jax.lax.fori_loop(0, self.sample.steps, step, frame)
+        return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
 
     def _step_keys(self, t: Array) -> Key[Array, "B steps"]:
         return jax.vmap(lambda key: step_keys(self.sample, key, t))(self.keys)
@@ -138,9 +144,14 @@ def step_keys(sample: SampleConfig, key: Key[Array, ""], t: Array | int) -> Key[
     return jax.random.split(jax.random.fold_in(key, t), sample.steps)
 
 
-def _put(tokens: Cells, frame: Frame, t: Array) -> Cells:
-    """Returns the tokens with this frame's at position t."""
+def no_means(arch: Architecture, sample: SampleConfig, clips: int) -> dict[str, Float[Array, "B S D"]]:
+    """Returns zeros for a frame's mean codes by branch; empty if the settings do not ask for them."""
+    shape = (clips, arch.grid**2, arch.code_bits)
+    return {name: jnp.zeros(shape) for name in arch.branches if sample.shows_means}
+
+
+def _put(grids: dict[str, Array], frame: dict[str, Array], t: Array) -> dict[str, Array]:
+    """Returns the grids of all frames with this frame's at position t."""
     return {
-        name: jax.lax.dynamic_update_slice_in_dim(grid, frame.tokens[name][:, None], t, axis=1)
-        for name, grid in tokens.items()
+        name: jax.lax.dynamic_update_slice_in_dim(grid, frame[name][:, None], t, axis=1) for name, grid in grids.items()
     }

@@ -16,7 +16,7 @@ from rsjax.config import TokenizerConfig, TokenModelConfig
 from rsjax.data.depth_color import color_to_depth
 from rsjax.data.normalization import Normalization, with_sums
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.stepping import Network, State, advance, begin, restart
+from rsjax.models.roboscape.stepping import Network, State, advance, begin, last_frame, restart
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -75,8 +75,8 @@ def _step(
     state = advance(net, params, state, actions)
 
     def pixels(name: str) -> Array:
-        grid = state.tokens[name][:, -1].reshape(-1, net.arch.grid, net.arch.grid)
-        return cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode"))
+        made = last_frame(net, state, name)
+        return cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, made, method="decode"))
 
     rgb = jnp.round(pixels("rgb")).astype(jnp.uint8)
     if normalization is None or normalization.depth_range is None:

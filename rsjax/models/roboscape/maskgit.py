@@ -2,7 +2,7 @@
 
 A clip's draws depend only on its own key, not on other clips of the batch.
 
-Axes: B clips, S cells, n vocabularies of V codes.
+Axes: B clips, S cells, D code bits, n vocabularies of V codes.
 """
 
 import math
@@ -25,11 +25,13 @@ class Frame:
 
     Attributes:
         entropy: of the RGB tokens in nats, in the step that decided each cell; None: not asked for.
+        means: likewise the mean codes by branch; empty: not asked for.
     """
 
     tokens: dict[str, Int[Array, "*B S"]]
     mask: Bool[Array, "*B S"]
     entropy: Float[Array, "*B S"] | None = None
+    means: dict[str, Float[Array, "*B S D"]] = struct.field(default_factory=dict)
 
 
 def masked_after(steps: int, cells: int) -> Int[np.ndarray, " K"]:
@@ -117,16 +119,19 @@ def _unmask_clip(
     temperature: Array | None,
 ) -> Frame:
     order_key, *branch_keys = jax.random.split(key, len(logits) + 1)
-    tokens, confidence, entropy = {}, jnp.zeros(frame.mask.shape), frame.entropy
+    tokens, confidence, entropy, means = {}, jnp.zeros(frame.mask.shape), frame.entropy, {}
     temperature = config.temperature if temperature is None else temperature
     if entropy is not None:
         entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
     for branch_key, (branch, branch_logits) in zip(branch_keys, logits.items(), strict=True):
         drawn, log_p = sample_tokens(branch_key, branch_logits, temperature, code_bits, config.top_k)
         tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
+        if branch in frame.means:
+            mean = lfq.mean_codes(branch_logits, code_bits)
+            means[branch] = jnp.where(frame.mask[:, None], mean, frame.means[branch])
         confidence += log_p if branch == "rgb" or no_depth is None else jnp.where(no_depth, 0.0, log_p)
     if config.unmask == "random":
         confidence = jax.random.uniform(order_key, frame.mask.shape)
     # Cells that are already decided stay decided: they get the highest rank.
     rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
-    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step], entropy)
+    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step], entropy, means)

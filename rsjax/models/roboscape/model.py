@@ -123,7 +123,7 @@ def keypoint_term(of: Predictions) -> Term:
     def at_points(codes: Float[Array, "B t S D"], cells: Int[Array, "B t K"]) -> Float[Array, "B t K D"]:
         return jnp.take_along_axis(codes, cells[..., None], axis=2)
 
-    predicted = expected_codes(of.logits["rgb"], bits)  # B T S D
+    predicted = lfq.mean_codes(of.logits["rgb"], bits)  # B T S D
     if loss.keypoint_target == "observed":
         first = lfq.tokens_to_codes(of.clean["rgb"][:, :1], bits)
         anchor = at_points(first.reshape(predicted[:, :1].shape), cells[:, :1])
@@ -135,13 +135,6 @@ def keypoint_term(of: Predictions) -> Term:
         mask = of.mask.reshape(*of.mask.shape[:2], -1)  # B T S
         weight = weight * jnp.take_along_axis(mask[:, 1:], cells[:, 1:], axis=2)
     return jnp.sum(distance * weight), jnp.sum(weight)
-
-
-def expected_codes(logits: Float[Array, "*B n V"], code_bits: int) -> Float[Array, "*B D"]:
-    """Returns ŝ of Eq. 5: each bit's expectation in [-1, 1] under the predicted distribution."""
-    codes = lfq.vocabulary_codes(code_bits, logits.shape[-2])  # V, D/n
-    expected = jax.nn.softmax(logits, axis=-1) @ codes  # … n D/n
-    return expected.reshape(*expected.shape[:-2], code_bits)
 
 
 @implements(RoboScapeConfig)

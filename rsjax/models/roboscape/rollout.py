@@ -8,7 +8,7 @@ A rollout may be longer than ``arch.frames``; ``window.py`` describes the memory
 for each number of clips and prompt frames and each multiple of ``arch.frames`` that the length is rounded up to. Arrays
 grow with that multiple, programs do not.
 
-Axes: B clips, T frames (the first P are the prompt), H×W = S cells, A action dimensions.
+Axes: B clips, T frames (the first P are the prompt), H×W = S cells, D code bits, A action dimensions.
 """
 
 from dataclasses import replace
@@ -24,13 +24,15 @@ from jaxtyping import Bool, Float, Int, Key
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.decode import Decoder
+from rsjax.models.roboscape.decode import Cells, Decoder, Means
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache, repeat_cache
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import cache_slots, room, stride, window_actions, window_start
+from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
 Tokens = dict[str, Int[Array, "B T H W"]]
+Decoded = dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"]]  # tokens, or codes if ``sample.shows_means``
 
 
 @struct.dataclass
@@ -65,7 +67,7 @@ def rollout(
     cached: bool = True,
     index: Int[Array, " B"] | None = None,
     no_depth: Bool[Array, " B"] | None = None,
-) -> Tokens:
+) -> Decoded:
     """Generates the frames after the prompt.
 
     Args:
@@ -78,7 +80,8 @@ def rollout(
             training, and zeros in the result.
 
     Returns:
-        Tokens of all T frames by branch; the first P are the prompt.
+        Tokens of all T frames by branch; the first P are the prompt. If ``sample.shows_means``, the prompt's codes and
+        the others' mean codes instead, from which the tokenizer decodes pictures just as well.
 
     Raises:
         ConfigError: the model does not support these settings.
@@ -128,7 +131,7 @@ def rollout_from(
     actions: Float[Array, "N F A"],
     key: Key[Array, ""],
     index: Int[Array, " N"] | None = None,
-) -> Tokens:
+) -> Decoded:
     """Generates the F frames after an encoded prompt, under N action sequences.
 
     Args:
@@ -138,7 +141,7 @@ def rollout_from(
         index: as for :func:`rollout`; clips with the same number have the same draws.
 
     Returns:
-        Tokens of all P + F frames by branch, the same as from :func:`rollout` with the prompt repeated.
+        All P + F frames by branch, the same as from :func:`rollout` with the prompt repeated.
 
     Raises:
         ConfigError: the model does not support these settings.
@@ -207,28 +210,28 @@ def _rollout(
     actions: Array,
     frames: Array,
     keys: Array,
-) -> Tokens:
+) -> Decoded:
     past = prompt["rgb"].shape[1]
     apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     tokens = _tokens(prompt, actions)
     if cached:
         start = _encode(arch, sample, params, prompt, no_depth, actions[:, :past])
-        return _grids(arch, _decode_cached(decoder, tokens, start.cache, past, frames), no_depth)
-    tokens = jax.lax.fori_loop(past, frames, decoder.uncached, tokens)
-    return _grids(arch, tokens, no_depth)
+        return _decode_cached(decoder, tokens, start.cache, past, frames)
+    made = jax.lax.fori_loop(past, frames, decoder.uncached, (tokens, _means(decoder, tokens)))
+    return _decoded(decoder, *made)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _resume(
     arch: Architecture, sample: SampleConfig, params: Params, prompt: Prompt, actions: Array, frames: Array, keys: Array
-) -> Tokens:
+) -> Decoded:
     (clips, past), n = prompt.actions.shape[:2], len(actions)
     no_depth = None if prompt.no_depth is None else jnp.broadcast_to(prompt.no_depth, n)
     apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
-    return _grids(arch, _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, past, frames), no_depth)
+    return _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, past, frames)
 
 
 def _encode(
@@ -248,14 +251,15 @@ def _encode(
 _encode_jit = jax.jit(_encode, static_argnums=(0, 1))
 
 
-def _decode_cached(decoder: Decoder, tokens: dict, cache: Cache, past: int, frames: Array) -> dict:
+def _decode_cached(decoder: Decoder, tokens: Cells, cache: Cache, past: int, frames: Array) -> Decoded:
     """Decodes frames ``past`` to ``frames`` - 1, window by window, with the cache of the first of these windows."""
     arch, sample, length = decoder.arch, decoder.sample, decoder.actions.shape[1]
+    made = (tokens, _means(decoder, tokens), cache)
     if arch.positions == "rotary" or length <= arch.frames:
-        return jax.lax.fori_loop(past, frames, partial(decoder.cached, 0), (tokens, cache))[0]
+        return _decoded(decoder, *jax.lax.fori_loop(past, frames, partial(decoder.cached, 0), made)[:2])
     by, first = stride(arch, sample), window_start(arch, sample, past)
 
-    def window(number: Array, carry: tuple[dict, Cache]) -> tuple[dict, Cache]:
+    def window(number: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
         base, later = number * by, number * by > first
         carry = jax.lax.cond(later, partial(decoder.encode_anew, base), lambda kept: kept, carry)
         begin = jnp.where(later, base + arch.frames - by, past)
@@ -263,10 +267,10 @@ def _decode_cached(decoder: Decoder, tokens: dict, cache: Cache, past: int, fram
         return jax.lax.fori_loop(begin, end, partial(decoder.cached, base), carry)
 
     last = window_start(arch, sample, frames - 1)
-    return jax.lax.fori_loop(first // by, last // by + 1, window, (tokens, cache))[0]
+    return _decoded(decoder, *jax.lax.fori_loop(first // by, last // by + 1, window, made)[:2])
 
 
-def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
+def _tokens(prompt: Tokens, actions: Array) -> Cells:
     """Returns the prompt's tokens for every action sequence, padded with zeros for the frames to generate."""
     (b, length), out = actions.shape[:2], {}
     for name, grid in prompt.items():
@@ -276,7 +280,17 @@ def _tokens(prompt: Tokens, actions: Array) -> dict[str, Int[Array, "B T S"]]:
     return out
 
 
-def _grids(arch: Architecture, tokens: dict[str, Int[Array, "B T S"]], no_depth: Array | None) -> Tokens:
+def _means(decoder: Decoder, tokens: Cells) -> Means:
+    """Returns the prompt's codes, padded like its tokens; empty if frames are decoded from tokens."""
+    if not decoder.sample.shows_means:
+        return {}
+    return {name: lfq.tokens_to_codes(cells, decoder.arch.code_bits) for name, cells in tokens.items()}
+
+
+def _decoded(decoder: Decoder, tokens: Cells, means: Means) -> Decoded:
+    """Returns the grids that pictures are decoded from, with zeros as depth of clips that have none."""
+    made, grid, no_depth = means or tokens, decoder.arch.grid, decoder.no_depth
+    out = {name: cells.reshape(*cells.shape[:2], grid, grid, *cells.shape[3:]) for name, cells in made.items()}
     if no_depth is not None:
-        tokens = tokens | {"depth": jnp.where(no_depth[:, None, None], 0, tokens["depth"])}
-    return {name: cells.reshape(*cells.shape[:2], arch.grid, arch.grid) for name, cells in tokens.items()}
+        out["depth"] = jnp.where(no_depth.reshape(-1, *[1] * (out["depth"].ndim - 1)), 0, out["depth"])
+    return out

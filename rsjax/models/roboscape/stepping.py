@@ -4,7 +4,7 @@ It gives the frames of :func:`rsjax.models.roboscape.rollout.rollout` with the s
 what is kept of it is one window's tokens. As clips are at different positions, each one's window moves at its own time;
 a step in which none moves costs nothing for it.
 
-Axes: B clips, K frames kept, S cells, A numbers per frame that the action encoder reads.
+Axes: B clips, K frames kept, S cells, D code bits, A numbers per frame that the action encoder reads.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int, Key
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.decode import Decoder, step_keys
+from rsjax.models.roboscape.decode import Decoder, no_means, step_keys
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import cache_slots, stride
@@ -58,6 +58,7 @@ class State:
         frame: the next frame's number in its clip.
         key: decides each clip's draws.
         entropy: of the last frame's RGB tokens in nats; None unless the network says so.
+        means: of the last frame, by branch, if it has been decoded; empty unless ``sample.shows_means``.
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -68,9 +69,10 @@ class State:
     frame: Int[Array, " B"]
     key: Key[Array, " B"]
     entropy: Float[Array, "B S"] | None = None
+    means: dict[str, Float[Array, "B S D"]] = struct.field(default_factory=dict)
 
 
-AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, entropy=0)  # type: ignore[arg-type]  # of clips
+AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, entropy=0, means=0)  # type: ignore[arg-type]  # of clips
 
 
 def remembered_frames(net: Network) -> int:
@@ -98,6 +100,7 @@ def begin(net: Network, clips: int) -> State:
         frame=numbers,
         key=jax.random.split(jax.random.key(0), clips),
         entropy=jnp.zeros((clips, arch.grid**2)) if net.entropy else None,
+        means=no_means(arch, net.sample, clips),
     )
 
 
@@ -170,7 +173,14 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
         position=state.position + 1,
         frame=state.frame + 1,
         entropy=None if frame.entropy is None else frame.entropy[0],
+        means={name: codes[0] for name, codes in frame.means.items()},
     )
+
+
+def last_frame(net: Network, state: State, name: str) -> Int[Array, "B H W"] | Float[Array, "B H W D"]:
+    """Returns what a branch's last frame is decoded from: mean codes if there are any, or tokens."""
+    made = state.means[name] if state.means else state.tokens[name][:, -1]
+    return made.reshape(-1, net.arch.grid, net.arch.grid, *made.shape[2:])
 
 
 def _move_window(net: Network, params: Params, state: State, full: Bool[Array, ""]) -> State:

@@ -89,7 +89,7 @@ def test_a_flat_attention_map_gives_the_rgb_term() -> None:
     assert losses.attention_term(flat) == losses.rgb_term(flat)
 
 
-def plain_expected_codes() -> np.ndarray:
+def plain_mean_codes() -> np.ndarray:
     """ŝ: Σ over all tokens of p(token) · its bits in {-1, +1}."""
     out = np.zeros((B, T, GRID**2, BITS))
     for index in np.ndindex(B, T, GRID**2):
@@ -101,14 +101,14 @@ def plain_expected_codes() -> np.ndarray:
     return out
 
 
-def test_expected_codes_are_the_mean_over_all_tokens() -> None:
-    np.testing.assert_allclose(losses.expected_codes(jnp.array(LOGITS), BITS), plain_expected_codes(), atol=1e-5)
+def test_mean_codes_are_the_mean_over_all_tokens() -> None:
+    np.testing.assert_allclose(lfq.mean_codes(jnp.array(LOGITS), BITS), plain_mean_codes(), atol=1e-5)
 
 
 @pytest.mark.parametrize("masked_only", [False, True])
 @pytest.mark.parametrize("target", ["predicted", "observed"])
 def test_keypoints_are_equation_5(target: str, masked_only: bool) -> None:
-    s_hat = plain_expected_codes()
+    s_hat = plain_mean_codes()
     total = weight = 0.0
     for clip in np.flatnonzero(CLIP_WEIGHT):
         for i in range(5):

@@ -2,6 +2,7 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
 
 
@@ -57,6 +59,28 @@ def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
         for name in out:
             codes = np.asarray(logits[name][:, t]).argmax(-1)
             np.testing.assert_array_equal(out[name][:, t].reshape(BATCH, -1), codes[..., 0] + 8 * codes[..., 1])
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int) -> None:
+    """Tokens stay as they are without them; with one step each frame's mean codes follow from the tokens before it."""
+    model, params, (tokens, actions) = DUAL, random_params(DUAL), given(DUAL, 2)
+    sample = SampleConfig(steps=steps, mean_codes=True)
+    drawn = rollout(model, replace(sample, mean_codes=False), params, tokens, actions, KEY)
+    cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
+    apply = jax.jit(Transformer(model).apply)
+    for name, means in cached.items():
+        assert means.shape == (BATCH, 6, 3, 3, model.code_bits)
+        np.testing.assert_allclose(means, plain[name], atol=1e-5)
+        np.testing.assert_array_equal(means[:, :2], lfq.tokens_to_codes(jnp.asarray(tokens[name]), model.code_bits))
+        for t in range(2, 6) if steps == 1 else ():
+            mask = np.zeros((BATCH, 6, 3, 3), bool)
+            mask[:, t:] = True
+            logits, _ = apply({"params": params}, drawn, mask, actions)
+            expected = lfq.mean_codes(logits[name][:, t], model.code_bits).reshape(means[:, t].shape)
+            np.testing.assert_allclose(means[:, t], expected, atol=1e-5)
+    warm = rollout(model, replace(sample, temperature=1.0), params, tokens, actions, KEY)
+    assert warm["rgb"].dtype == jnp.int32  # what is drawn is shown
 
 
 def test_the_key_decides_the_draws_and_actions_the_video() -> None:
