@@ -56,6 +56,7 @@ def cogvideox_tiny(base: Config) -> Config:
             batch_size=2,
             frames_per_clip=16,
             depth_share=0.0,
+            optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
             checkpoint_every=200,
             eval_every=400,
         ),

@@ -58,7 +58,12 @@ def irasim_tiny(base: Config) -> Config:
     return replace(
         base,
         name="irasim_tiny",
-        tokenizer_train=replace(base.tokenizer_train, steps=2000, depth_share=0.0),
+        tokenizer_train=replace(
+            base.tokenizer_train,
+            steps=2000,
+            depth_share=0.0,
+            optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
+        ),
         model=IRASimConfig(
             autoencoder=KLConfig(
                 network="magvit2",
