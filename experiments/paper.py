@@ -23,7 +23,7 @@ class Options:
     budget: str = "3h"
     """Time that everything may take, on 2 CPU cores: 30min, 3h, 12h, 1h30min …"""
     only: tuple[str, ...] = ()
-    """Claims to test, by name or shell pattern (table1, departure-*). Default: all."""
+    """Claims to test, by name or shell pattern (table1, departure-*), which share the budget. Default: all."""
     dir: Path = Path("runs/paper")
     """Directory of trainings and report; those of several budgets can share it."""
     data_dir: Path = Path("data")
@@ -48,9 +48,8 @@ def main() -> None:
     from rsjax.paper.claim import chosen, claims
     from rsjax.paper.plan import make_plan
 
-    known = claims()
-    wanted = chosen(options.only, known)
-    plan = make_plan(tuple(known.values()), wanted, scale(preset, parse_duration(options.budget)), options.data_dir)
+    wanted = chosen(options.only, claims())
+    plan = make_plan(wanted, scale(preset, parse_duration(options.budget)), options.data_dir)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)
     if options.dry_run:

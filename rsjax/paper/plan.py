@@ -1,6 +1,6 @@
 """The cells that the claims need, in the order in which they run, as far as a budget goes."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,19 +73,19 @@ class Plan:
         return tuple(cell for cell in self.cells.values() if (claim, arm) in cell.uses)
 
 
-def make_plan(known: Sequence[Claim], wanted: Sequence[Claim], scale: Scale, data: Path) -> Plan:
-    """Returns the cells of the wanted claims, and what is to be done in which order.
+def make_plan(claims: Sequence[Claim], scale: Scale, data: Path) -> Plan:
+    """Returns the cells of claims, which share the budget, and what is to be done in which order.
+
+    The sizes of the cells depend on the budget alone, not on the claims.
 
     Args:
-        known: all claims, which share the budget: what is done for a claim does not depend on which others are wanted.
-        wanted: some of these.
         data: the directory of simulated data sets.
     """
     absent: dict[tuple[str, str], str] = {}
     cells: dict[str, Cell] = {}  # by content key
     tasks: dict[tuple[str, str], Task] = {}
     shared = set[str]()
-    for claim, arm, seed in _ordered(known):
+    for claim, arm, seed in _ordered(claims):
         try:
             config = arm_config(arm, scale, seed)
         except ConfigError as error:
@@ -101,21 +101,12 @@ def make_plan(known: Sequence[Claim], wanted: Sequence[Claim], scale: Scale, dat
         for name in claim.measurements(arm.name):
             task = Task(cells[key].name, name, claim.name, seconds_of(name, config))
             tasks.setdefault((key, name), task)
-    needed = _needed(cells, {claim.name for claim in wanted}, wanted)
     fits, left_out, spent = list[Task](), list[Task](), 0.0
     for number, task in enumerate(tasks.values()):
         spent += task.seconds
-        if (task.cell, task.measurement) in needed:
-            (fits if spent <= SLACK * scale.seconds or not number else left_out).append(task)
-    mine = {cell.name: cell for cell in cells.values() if (cell.name, "") in needed}
-    return Plan(scale, tuple(wanted), mine, tuple(fits), tuple(left_out), absent)
-
-
-def _needed(cells: Mapping[str, Cell], names: Collection[str], wanted: Sequence[Claim]) -> set[tuple[str, str]]:
-    """Returns (cell, measurement) of all that the wanted claims need; the measurement is empty for the training."""
-    measurements = {(claim.name, arm.name): claim.measurements(arm.name) for claim in wanted for arm in claim.arms}
-    uses = [(cell.name, use) for cell in cells.values() for use in cell.uses if use[0] in names]
-    return {(cell, name) for cell, use in uses for name in ("", *measurements[use])}
+        (fits if spent <= SLACK * scale.seconds or not number else left_out).append(task)
+    named = {cell.name: cell for cell in cells.values()}
+    return Plan(scale, tuple(claims), named, tuple(fits), tuple(left_out), absent)
 
 
 def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
@@ -126,10 +117,10 @@ def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> 
     return sum(parts[stage](config) for stage in new)
 
 
-def _ordered(known: Sequence[Claim]) -> list[tuple[Claim, Arm, int]]:
+def _ordered(claims: Sequence[Claim]) -> list[tuple[Claim, Arm, int]]:
     """Claims of rank 0 with all seeds; then the first seed of all others, then the second …"""
-    seeds, first = range(budget.SEEDS), [claim for claim in known if not claim.rank]
-    others = [claim for claim in known if claim.rank]
+    seeds, first = range(budget.SEEDS), [claim for claim in claims if not claim.rank]
+    others = [claim for claim in claims if claim.rank]
     return [
         *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
         *((claim, arm, seed) for seed in seeds for claim in others for arm in claim.arms),

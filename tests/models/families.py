@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from rsjax.config import Config, GenieConfig, LoopConfig
+from tests.models.cogvideox import toy as toy_cogvideox
 from tests.models.irasim import toy as toy_irasim
 from tests.models.ivideogpt import toy as toy_ivideogpt
 from tests.pipeline import toy
@@ -37,4 +38,10 @@ def irasim() -> Config:
     return engine(toy_irasim.config(integrate_actions=True))
 
 
-FAMILIES = {"genie": genie, "ivideogpt": ivideogpt, "irasim": irasim}
+def cogvideox() -> Config:
+    """CogVideoX with an autoencoder of its own and learned texts."""
+    base = engine(toy_cogvideox.config())
+    return replace(base, tokenizer_train=replace(base.tokenizer_train, frames_per_clip=base.sim.frames))
+
+
+FAMILIES = {"genie": genie, "ivideogpt": ivideogpt, "irasim": irasim, "cogvideox": cogvideox}

@@ -14,7 +14,7 @@ from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from tests.models import families
 
-GENIE, IVIDEOGPT, IRASIM = (make() for make in families.FAMILIES.values())
+GENIE, IVIDEOGPT, IRASIM, COGVIDEOX = (make() for make in families.FAMILIES.values())
 SDXL = presets.get("irasim_s")
 
 
@@ -42,6 +42,9 @@ def saved(directory: Path, settings: Any) -> Path:
         (world_model, IVIDEOGPT, to_dict(GENIE), "config.json: holds a model of family 'genie'; .* family ivideogpt"),
         (world_model, IRASIM, to_dict(IVIDEOGPT), "config.json: holds a model of family 'ivideogpt'; .* family irasim"),
         (world_model, IRASIM, {"model": to_dict(IVIDEOGPT.model), "inputs": {}}, "holds a model of family 'ivideogpt'"),
+        (world_model, COGVIDEOX, to_dict(IRASIM), "holds a model of family 'irasim'; .* family cogvideox"),
+        (tokenizer, COGVIDEOX, to_dict(IRASIM), "holds a model of family 'irasim'; .* family cogvideox"),
+        (tokenizer, IRASIM, to_dict(COGVIDEOX), "holds a model of family 'cogvideox'; .* family irasim"),
         (world_model, GENIE, {"irasim": {}}, "holds no world_model/weights with their settings"),
         (tokenizer, GENIE, to_dict(IVIDEOGPT), "its tokenizer is that of the family 'ivideogpt'; .* MAGVIT-2's"),
         (tokenizer, GENIE, {"kl_autoencoder": {}}, "holds no tokenizer/weights with their settings"),
@@ -108,7 +111,7 @@ def test_weights_of_something_else_are_refused(
     assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
 
 
-@pytest.mark.parametrize("config", [GENIE, IVIDEOGPT, IRASIM, SDXL], ids=["genie", "ivideogpt", "irasim", "sdxl"])
+@pytest.mark.parametrize("config", [GENIE, IVIDEOGPT, IRASIM, COGVIDEOX, SDXL], ids=[*families.FAMILIES, "sdxl"])
 @pytest.mark.parametrize("read", [world_model, tokenizer])
 def test_a_path_without_weights_is_named(read: Callable[[Config, Path], Any], config: Config, tmp_path: Path) -> None:
     """A directory of something else, and a public file in place of what the converter makes of it."""

@@ -36,7 +36,7 @@ def claim(name: str = "toy", *comparisons: Comparison, rank: int = 0) -> Claim:
 
 
 def plan(*claims: Claim, seconds: float = 10 * budget.HOUR) -> Plan:
-    return make_plan(claims, claims, budget.scale(presets.debug(), seconds), Path("data"))
+    return make_plan(claims, budget.scale(presets.debug(), seconds), Path("data"))
 
 
 def keypoints(config: Config) -> bool:

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rsjax
 from rsjax.bench import inputs
 from rsjax.clip import Video
-from rsjax.config import CogVideoXConfig, ConfigError, NoiseConfig, TextConfig, presets
+from rsjax.config import CogVideoXConfig, ConfigError, NoiseConfig, TextConfig, presets, to_dict
 from rsjax.config.cogvideox import latent_frames, padded_frames
+from rsjax.data.normalization import Normalization
 from rsjax.describe import describe
 from rsjax.errors import UserError
-from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.cogvideox.autoencoder import CausalCodec, filled
 from rsjax.models.cogvideox.model import latent_arrays
 from rsjax.models.cogvideox.pretrained import saved_architecture
@@ -25,9 +25,6 @@ from rsjax.models.cogvideox.rollout import _chunk, rollout
 from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
 from rsjax.models.diffusion.schedule import alphas
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import run_all
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.trainable import StepContext
 from tests.models.cogvideox import toy
@@ -38,38 +35,39 @@ MODEL: Any = create_model(CONFIG)
 RNG = np.random.default_rng(0)
 
 
-def test_a_run_trains_both_networks_generates_and_is_evaluated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clips = store(tmp_path / "clips")
-    run = Run(on_store(CONFIG, clips.path), tmp_path / "run", tmp_path)
-    run.prepare(overwrite=False)
-    run_all(run)
-    assert "clips of 6 frames are encoded as 9, 8k + 1, by repeating the last" in capsys.readouterr().out
-    metrics = json.loads((run.directory / "metrics.json").read_text())
-    assert metrics["psnr"] > 0
-    assert metrics["psnr_tokenizer"] > 0
-    assert metrics["delta_psnr"] is metrics["delta_psnr_uniform"] is None
-    assert metrics["reasons"]["delta_psnr"] == "the model takes no actions"
-    rows = [json.loads(line) for line in (run.directory / "world_model" / "log.jsonl").read_text().splitlines()]
-    assert 0.3 < next(row["error"] for row in rows if "error" in row) < 2, "fresh, it predicts zeros"
-    trained, clip = rsjax.load(run.directory), clips.source("test")[0]
-    video = trained.generate(clip["rgb"][:1], clip["actions"])
-    assert video.rgb.shape == clip["rgb"].shape
-    other = trained.generate(clip["rgb"][:1], clip["actions"] + 1)
-    np.testing.assert_array_equal(other.rgb, video.rgb)
-
-    # The run's weights start another run; those of another network are refused, with the fields that differ.
-    assert MODEL.pretrained_shapes(run.directory).keys() == trained.params.keys()
-    with pytest.raises(UserError, match="holds another network .width is 32 there, 64 here"):
-        create_model(toy.config(width=64)).pretrained_shapes(run.directory)
-    with pytest.raises(UserError, match="model.text.width is 4 there, 5 here"):
-        create_model(toy.config(text=TextConfig(width=5))).pretrained_shapes(run.directory)
-    with pytest.raises(UserError, match="model.image is channels there, first_latent here"):
-        create_model(toy.config(image="first_latent")).pretrained_shapes(run.directory)
+def test_weights_of_a_run_start_another_but_no_other_network(tmp_path: Path) -> None:
+    for part in ("tokenizer", "world_model"):
+        (tmp_path / part / "weights").mkdir(parents=True)
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(CONFIG)))
+    assert MODEL.pretrained_shapes(tmp_path).keys() == toy.params(MODEL.architecture).keys()
+    for line, changes in (
+        ("holds another network .width is 32 there, 64 here", {"width": 64}),
+        ("model.text.width is 4 there, 5 here", {"text": TextConfig(width=5)}),
+        ("model.image is channels there, first_latent here", {"image": "first_latent"}),
+    ):
+        with pytest.raises(UserError, match=line):
+            create_model(toy.config(**changes)).pretrained_shapes(tmp_path)
     wider = replace(toy.AUTOENCODER, res_blocks=2)
     with pytest.raises(UserError, match="holds another network .res_blocks is 1 there, 2 here"):
-        create_autoencoder(toy.config(autoencoder=wider)).pretrained_shapes(run.directory)
+        create_autoencoder(toy.config(autoencoder=wider)).pretrained_shapes(tmp_path)
+
+
+def test_actions_change_nothing_and_the_padding_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    params, weights = toy.params(MODEL.architecture), toy.autoencoder_params(CONFIG)
+    clips = store(tmp_path / "clips")
+    clip = clips.source("test")[0]
+    assets = Assets(Normalization.create(clips), weights)
+    MODEL.prepare(clips, assets, tmp_path / "latents", 0.0)
+    assert "clips of 6 frames are encoded as 9, 8k + 1, by repeating the last" in capsys.readouterr().out
+    prompt = Video(clip["rgb"][None, :1], tasks=np.array(["drift"]))
+    one, other = (MODEL.generate(params, assets, prompt, clip["actions"][None] + more).rgb for more in (0, 1))
+    assert one.shape == clip["rgb"][None].shape
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_missing_file_of_texts_stops_a_run_before_anything_is_trained() -> None:
+    with pytest.raises(UserError, match="nowhere: no such file of text embeddings; make it with"):
+        create_autoencoder(toy.config(text=TextConfig(file="nowhere", tokens=2, width=4)))
 
 
 def batch(clips: int = 3, **changes: Any) -> Any:
