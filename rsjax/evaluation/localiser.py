@@ -100,14 +100,14 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
 
     @jax.jit
     def step(params: Any, state: Any, frames: Array, xy: Array, lifted: Array, number: int) -> tuple[Any, Any]:
-        frames, xy = jax.vmap(_varied)(jax.random.split(jax.random.key(number), len(frames)), frames, xy)
+        frames, xy = jax.vmap(varied)(jax.random.split(jax.random.key(number), len(frames)), frames, xy)
         updates, state = optimizer.update(jax.grad(loss)(params, frames, xy, lifted), state)
         return optax.apply_updates(params, updates), state
 
     return step
 
 
-def _varied(
+def varied(
     key: Key[Array, ""], frame: UInt8[Array, "H W 3"], xy: Float[Array, "2 2"]
 ) -> tuple[Float[Array, "H W 3"], Float[Array, "2 2"]]:
     """Moves a frame and its places at random, repeating the border, and blurs it more or less."""

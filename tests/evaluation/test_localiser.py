@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.evaluation.localiser import Localiser, recorded_places, train_localiser
+from rsjax.evaluation.localiser import Localiser, recorded_places, train_localiser, varied
 from rsjax.evaluation.metrics.localisation import cube_error, gripper_error, lifted_accuracy
 from rsjax.evaluation.registry import Located, Places, Scene, Unavailable
 
@@ -67,6 +69,23 @@ def test_a_picture_of_another_place_has_the_distance_as_its_error(localiser: Loc
     expected = np.linalg.norm(np.roll(xy, 1, axis=0) - xy, axis=-1) * SIDE / WIDTH
     assert np.median(np.abs(scores[""] - expected)) < 0.3
     assert np.median(scores["_truth"]) < 0.3
+
+
+def test_a_varied_frame_shows_its_objects_where_its_places_say() -> None:
+    frame = np.zeros((32, 48, 3), np.uint8)
+    frame[12:15, 20:25] = 200
+    xy = jnp.array([[22.5 / 48, 13.5 / 32]] * 2)
+    rows, columns = np.mgrid[:32, :48] + 0.5
+    seen = set()
+    for number in range(20):
+        image, places = map(np.asarray, varied(jax.random.key(number), jnp.asarray(frame), xy))
+        np.testing.assert_allclose(image.sum(), frame.sum(), rtol=1e-4)
+        weights = image[..., 0] / image[..., 0].sum()
+        centre = [(weights * columns).sum() / 48, (weights * rows).sum() / 32]
+        np.testing.assert_allclose(places, [centre, centre], atol=1e-4)
+        seen.add((round(float(image.max())), *np.round(places[0] * (48, 32)).astype(int)))
+    assert len(seen) > 15
+    assert max(abs(x - 22) for _, x, _ in seen) > 3
 
 
 def test_training_depends_on_the_clips_alone() -> None:
