@@ -10,14 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import linen as nn
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Float32, Int, UInt8
 
 from rsjax.data.codec import Record
+from rsjax.data.shift import moved
 from rsjax.evaluation.registry import Places
 from rsjax.progress import Progress
 
@@ -87,7 +89,8 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
     with Progress("localiser", steps, "steps") as progress:
         for number in range(steps):
             rows: Int[np.ndarray, " B"] = rng.integers(0, len(frames), BATCH)
-            params, state = step(params, state, frames[rows], xy[rows], lifted[rows], number)
+            images, places = varied(rng, frames[rows], xy[rows])
+            params, state = step(params, state, images, places, lifted[rows])
             progress.update(number + 1)
     return Localiser(params)
 
@@ -99,8 +102,7 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
         return 10 * jnp.abs(places - xy).mean() + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()
 
     @jax.jit
-    def step(params: Any, state: Any, frames: Array, xy: Array, lifted: Array, number: int) -> tuple[Any, Any]:
-        frames, xy = jax.vmap(varied)(jax.random.split(jax.random.key(number), len(frames)), frames, xy)
+    def step(params: Any, state: Any, frames: Array, xy: Array, lifted: Array) -> tuple[Any, Any]:
         updates, state = optimizer.update(jax.grad(loss)(params, frames, xy, lifted), state)
         return optax.apply_updates(params, updates), state
 
@@ -108,26 +110,17 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
 
 
 def varied(
-    key: Key[Array, ""], frame: UInt8[Array, "H W 3"], xy: Float[Array, "2 2"]
-) -> tuple[Float[Array, "H W 3"], Float[Array, "2 2"]]:
-    """Moves a frame and its places at random, repeating the border, and blurs it more or less."""
-    move_key, blur_key = jax.random.split(key)
-    size = np.array(frame.shape[1::-1])  # width, height
-    move = jax.random.randint(move_key, (2,), -(size // MOVE), size // MOVE + 1)  # right, down
-    columns, rows = (jnp.clip(jnp.arange(n) - by, 0, n - 1) for n, by in zip(size, move, strict=True))
-    image = frame[rows][:, columns].astype(jnp.float32)
-    for share in jax.random.uniform(blur_key, (2,)):
-        image += share * (_blurred(image) - image)
-    return image, jnp.clip(xy + move / size, 0, 1)
-
-
-def _blurred(image: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
-    """Returns the image under a binomial filter of 5 × 5 pixels."""
-    for axis, size in enumerate(image.shape[:2]):
-        wide = jnp.pad(image, [(2, 2) if i == axis else (0, 0) for i in range(3)], mode="edge")
-        shifted = (jax.lax.slice_in_dim(wide, i, i + size, axis=axis) for i in range(5))
-        image = sum((weight / 16 * part for weight, part in zip((1, 4, 6, 4, 1), shifted, strict=True)), jnp.zeros(()))
-    return image
+    rng: np.random.Generator, frames: UInt8[np.ndarray, "B H W 3"], xy: Float[np.ndarray, "B 2 2"]
+) -> tuple[Float32[np.ndarray, "B H W 3"], Float[np.ndarray, "B 2 2"]]:
+    """Moves frames and their places at random, repeating borders, and blurs each frame more or less."""
+    size = np.array(frames.shape[2:0:-1])  # width, height
+    moves = rng.integers(-(size // MOVE), size // MOVE + 1, (len(frames), 2))  # right, down
+    images = np.empty(frames.shape, np.float32)
+    for image, frame, move, shares in zip(images, frames, moves, rng.random((len(frames), 2)), strict=True):
+        image[:] = moved(frame[None], *move)[0]
+        for share in shares:
+            image += share * (cv2.GaussianBlur(image, (5, 5), 0, borderType=cv2.BORDER_REPLICATE) - image)
+    return images, np.clip(xy + moves[:, None] / size, 0, 1)
 
 
 @jax.jit
