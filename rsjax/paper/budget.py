@@ -17,9 +17,9 @@ from rsjax.models.base import create_model
 from rsjax.tokenizers.flops import tokenizer_flops
 
 EPISODE = 0.41  # seconds to simulate an episode
-TOKENS = 1 / 35  # seconds to make a clip's tokens
+TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
-TOKENIZER_RATE = 7.1e10  # operations a second of the tokenizer's training
+TOKENIZER_RATE = 4.1e10  # operations a second of the tokenizer's training, with Muon
 START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
 EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds: of each evaluation, a localiser's step, a rollout
 
@@ -145,7 +145,8 @@ def tokenizer_seconds(config: Config) -> float:
     """Returns the seconds of the tokenizer's training, and of making tokens."""
     if not config.model.uses_tokenizer or config.model.own_autoencoder is not None:
         return 0.0
-    return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * config.sim.episodes
+    clips = config.sim.episodes * (1 + sum(config.model.token_shifts[:1]))
+    return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * clips
 
 
 def trained_seconds(config: Config) -> float:
@@ -161,6 +162,7 @@ def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0
         frames: of a rollout; 0: the clips'.
     """
     draws = config.eval.action_draws if draws is None else draws
+    draws = draws if config.model.takes_actions else 0
     rollouts = config.eval.clips * (1 + 2 * draws) * (frames or config.clips.frames) / config.clips.frames
     return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
 
