@@ -71,3 +71,25 @@ _departure(
     {"model.loss.keypoint_target": "predicted", "model.loss.keypoint_masked_only": False},
     ("delta_psnr_uniform", *_METRICS),
 )
+
+_departure(
+    "moved-copies",
+    "Moved copies of the training clips",
+    "A scene that is moved by less than a token has other tokens everywhere, so few clips are not learned by heart.",
+    {"model.shifts": 0},
+    _METRICS,
+)
+_departure(
+    "read-previous",
+    "Every frame's input has the tokens of the frame before it",
+    "What stays need not be found by temporal attention first.",
+    {"model.read_previous": False},
+    _METRICS,
+)
+_departure(
+    "mean-codes",
+    "Pictures of mean codes instead of the most probable ones",
+    "Where the model is unsure, the mean of what may be there is closer to the truth than a guess.",
+    {"model.sample.mean_codes": False},
+    _METRICS,
+)
