@@ -17,7 +17,7 @@ from rsjax.files import write_file
 Resample = Literal["nearest", "bicubic"]
 
 _FILTERS = {"nearest": Image.Resampling.NEAREST, "bicubic": Image.Resampling.BICUBIC}
-_HOLD = 4  # the last frame of a looping animation lasts this many times longer
+_HOLD = 4  # the last frame of a GIF lasts this many times longer
 _H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
 
 
@@ -50,14 +50,19 @@ def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
 def write_gif(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upscale: int = 1) -> None:
     """Writes a GIF that loops and shows its last frame longer. Arguments and errors as in :func:`write_mp4`."""
     _check(frames, fps)
-    write_file(path, _encode_animation("GIF", resize(frames, upscale, "nearest"), fps))
+    milliseconds = round(1000 / fps)
+    durations = [milliseconds] * (len(frames) - 1) + [milliseconds * _HOLD]
+    first, *rest = [Image.fromarray(frame) for frame in resize(frames, upscale, "nearest")]
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
+    write_file(path, buffer.getvalue())
 
 
 def webp_uri(image: UInt8[np.ndarray, "H W 3"], quality: int = 90) -> str:
     """Returns an RGB image as a lossy ``data:image/webp`` URI, about a tenth the size of a PNG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "WEBP", quality=quality)
-    return _webp_uri(buffer.getvalue())
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def sprite_uri(frames: UInt8[np.ndarray, "T H W 3"]) -> str:
@@ -69,16 +74,6 @@ def sprite_uri(frames: UInt8[np.ndarray, "T H W 3"]) -> str:
     tiles[:count] = frames
     sheet = tiles.reshape(lines, columns, height, width, 3).swapaxes(1, 2)
     return webp_uri(sheet.reshape(lines * height, columns * width, 3), quality=95)
-
-
-def animation_uri(frames: UInt8[np.ndarray, "T H W 3"], fps: float) -> str:
-    """Returns frames as a looping ``data:image/webp`` URI that shows the last frame longer.
-
-    Raises:
-        ValueError: as :func:`write_mp4`.
-    """
-    _check(frames, fps)
-    return _webp_uri(_encode_animation("WEBP", frames, fps, quality=85, method=4))
 
 
 def resize(
@@ -96,16 +91,3 @@ def _check(frames: UInt8[np.ndarray, "T H W 3"], fps: float) -> None:
         raise ValueError(f"a video needs uint8 frames [T, H, W, 3] with T ≥ 1, not {frames.dtype} {frames.shape}")
     if not fps > 0:
         raise ValueError(f"a video's fps must be positive, not {fps}")
-
-
-def _encode_animation(kind: str, frames: UInt8[np.ndarray, "T H W 3"], fps: float, **options: int) -> bytes:
-    milliseconds = round(1000 / fps)
-    durations = [milliseconds] * (len(frames) - 1) + [milliseconds * _HOLD]
-    first, *rest = [Image.fromarray(frame) for frame in frames]
-    buffer = io.BytesIO()
-    first.save(buffer, kind, save_all=True, append_images=rest, duration=durations, loop=0, **options)
-    return buffer.getvalue()
-
-
-def _webp_uri(data: bytes) -> str:
-    return f"data:image/webp;base64,{base64.b64encode(data).decode()}"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rsjax.report.video import animation_uri, resize, webp_uri, write_gif, write_mp4
+from rsjax.report.video import resize, webp_uri, write_gif, write_mp4
 
 _COLORS = np.array([[200, 40, 40], [40, 180, 60], [40, 60, 200], [220, 220, 220], [20, 20, 20]], np.uint8)
 
@@ -58,10 +58,6 @@ def test_gif_loops_in_order(tmp_path):
 def test_uris_decode_to_their_images():
     assert webp_uri(_flat_frames(16, 16)[1]).startswith("data:image/webp;base64,")
     np.testing.assert_allclose(np.asarray(_decode(webp_uri(_flat_frames(16, 16)[1])))[8, 8], _COLORS[1], atol=6)
-    moving = _decode(animation_uri(_flat_frames(16, 16), fps=4))
-    assert (moving.n_frames, moving.info["loop"]) == (5, 0)
-    moving.seek(2)
-    np.testing.assert_allclose(np.asarray(moving.convert("RGB"))[8, 8], _COLORS[2], atol=8)
 
 
 def test_nearest_enlargement_repeats_pixels():
