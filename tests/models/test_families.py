@@ -39,7 +39,7 @@ PUBLIC = {
     "genie": "genie_35m_actions",
     "ivideogpt": "ivideogpt_64",
     "irasim": "irasim_s",
-    "cogvideox": "cogvideox_2b_i2v",
+    "cogvideox": "cogvideox_2b",
 }
 SETTING = {"genie": "steps", "ivideogpt": "top_k", "irasim": "steps", "cogvideox": "steps"}  # of sampling
 TERM = {"genie": "rgb", "ivideogpt": "token", "irasim": "error", "cogvideox": "error"}
@@ -176,6 +176,6 @@ def test_a_public_size_is_cut_over_devices_and_described(family: str) -> None:
 @every_family
 def test_a_grid_has_the_familys_own_fields(family: str) -> None:
     config = families.FAMILIES[family]()
-    grid = expand(config, parse_axes(config, ["model.width=16,32", f"model.sample.{SETTING[family]}=1,2"]), [0, 1])
+    grid = expand(config, parse_axes(config, ["model.width=32,64", f"model.sample.{SETTING[family]}=1,2"]), [0, 1])
     assert len(grid.cells) == 8
-    assert {config.model.width for config in grid.cells.values()} == {16, 32}  # type: ignore[attr-defined]
+    assert {config.model.width for config in grid.cells.values()} == {32, 64}  # type: ignore[attr-defined]

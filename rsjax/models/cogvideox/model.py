@@ -56,8 +56,6 @@ class CogVideoX(WorldModel[Batch]):
 
     @classmethod
     def autoencoder(cls, config: Config) -> Autoencoder[Any]:
-        assert isinstance(config.model, CogVideoXConfig)
-        check_tasks(config.model.text, ())  # before hours of training end at the texts
         return CausalVAETraining.create(config)
 
     @property
@@ -96,6 +94,7 @@ class CogVideoX(WorldModel[Batch]):
             UserError: a task of the clips has no text.
         """
         codec, frames = self._codec(assets), self.clips.frames
+        check_tasks(self.config.text, ())  # before the long work
         if padded_frames(frames) != frames:
             note(f"clips of {frames} frames are encoded as {padded_frames(frames)}, 8k + 1, by repeating the last")
 

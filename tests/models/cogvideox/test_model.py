@@ -65,11 +65,6 @@ def test_actions_change_nothing_and_the_padding_is_said(tmp_path: Path, capsys: 
     np.testing.assert_array_equal(one, other)
 
 
-def test_a_missing_file_of_texts_stops_a_run_before_anything_is_trained() -> None:
-    with pytest.raises(UserError, match="nowhere: no such file of text embeddings; make it with"):
-        create_autoencoder(toy.config(text=TextConfig(file="nowhere", tokens=2, width=4)))
-
-
 def batch(clips: int = 3, **changes: Any) -> Any:
     return inputs.batch(create_model(toy.config(**changes)), toy.config(**changes), clips)
 
