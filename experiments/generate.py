@@ -48,6 +48,8 @@ class Options:
     """Unmask random cells first, or those of highest confidence."""
     top_k: int | None = None
     """Draw from the k most probable codes of each vocabulary; 0: from all."""
+    mean_codes: bool | None = None
+    """Decode pictures from mean codes instead of the most probable ones; no effect at temperatures above 0."""
     guidance: float | None = None
     """Strength of guidance by actions; 1: none; other values need a model trained with model.action_dropout."""
     window_stride: int | None = None
