@@ -21,7 +21,7 @@ test: setup  ## the tests
 
 extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
 	@scripts/extras.sh "$(VENV)"
-	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright)' tests) $(ARGS)
+	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
 
 lint: setup  ## ruff and mypy
 	@$(python) -m ruff check
