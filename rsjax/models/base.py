@@ -106,6 +106,14 @@ class WorldModel(Trainable[B], Protocol[B]):
         """The weight λ of each active loss term by name, from ``config.model``."""
         return self.config.model.loss_weights
 
+    def check_files(self) -> None:
+        """Checks the files that the settings name, before anything is trained.
+
+        Raises:
+            UserError: one is missing or does not fit.
+        """
+        return
+
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store | None:
         """Makes the store that training reads instead of clips (tokens, latents), unless it exists.
 

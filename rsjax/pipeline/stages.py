@@ -72,7 +72,7 @@ def _do(run: Run, name: str, work: Callable[[], None]) -> None:
 
 
 def _check_starts(run: Run) -> None:
-    """Raises for a wrong path, a missing package or a batch that does not divide or fit, before hours of work."""
+    """Raises for a wrong path, a missing file or package, or a batch that does not fit, before hours of work."""
     cfg = run.config
     if not cfg.data.key and not run.finished("collect"):
         check_episodes(cfg.sim, run.clips)
@@ -88,6 +88,8 @@ def _check_starts(run: Run) -> None:
         starting(create(cfg), loop.start_from, name)
         if loop.wandb:
             find_wandb()
+    if "world_model" in run.stages and not run.finished("world_model"):
+        create_model(cfg).check_files()
     if not run.finished("evaluation"):
         evaluation.check_files(cfg.eval)
 

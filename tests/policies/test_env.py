@@ -150,7 +150,7 @@ def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedMode
 
 
 def test_somebody_elses_agent_learns_in_it(env: WorldModelEnv) -> None:
-    agents = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is in requirements-extras.txt (make extras)")
+    agents = pytest.importorskip("stable_baselines3", reason="it is in requirements-extras.txt (make extras)")
     agent = agents.PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0)
     agent.learn(8)
     assert agent.num_timesteps == 8

@@ -87,6 +87,10 @@ class CogVideoX(WorldModel[Batch]):
         weight = batch["weight"].astype(jnp.float32)
         return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
 
+    def check_files(self) -> None:
+        """Checks the file of texts, if there is one."""
+        check_tasks(self.config.text, ())
+
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Makes the latents of every clip and its image, stored beside the clips for all runs with this autoencoder.
 
@@ -94,7 +98,6 @@ class CogVideoX(WorldModel[Batch]):
             UserError: a task of the clips has no text.
         """
         codec, frames = self._codec(assets), self.clips.frames
-        check_tasks(self.config.text, ())  # before the long work
         if padded_frames(frames) != frames:
             note(f"clips of {frames} frames are encoded as {padded_frames(frames)}, 8k + 1, by repeating the last")
 

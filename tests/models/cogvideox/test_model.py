@@ -25,6 +25,8 @@ from rsjax.models.cogvideox.rollout import _chunk, rollout
 from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
 from rsjax.models.diffusion.schedule import alphas
+from rsjax.pipeline.run import Run
+from rsjax.pipeline.stages import run_all
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.trainable import StepContext
 from tests.models.cogvideox import toy
@@ -227,6 +229,14 @@ def test_texts_come_from_a_file_or_are_learned(tmp_path: Path) -> None:
     assert texts_of(TextConfig(), ["whatever"], 1).tolist() == [1]
     with pytest.raises(UserError, match="model.text.tasks: no text of the task 'x'"):
         texts_of(learned, ["x"], 1)
+
+
+def test_a_missing_file_of_texts_is_an_error_before_anything_is_simulated(tmp_path: Path) -> None:
+    text = replace(toy.MODEL.text, file=str(tmp_path / "absent"))
+    run = Run(toy.config(text=text), tmp_path / "run", tmp_path / "data")
+    with pytest.raises(UserError, match="absent: no such file of text embeddings; make it with"):
+        run_all(run)
+    assert not run.clips.exists() and not run.mark("collect")
 
 
 @pytest.mark.parametrize(
