@@ -19,7 +19,7 @@ class Options:
     batch: int = 1
     """Clips per training step, rollout and loader batch; the part feed uses the preset's batch size."""
     only: str = ""
-    """Parts to measure, separated by commas: matmul,train,sample,tokenizer,environment,loader,feed; default: all."""
+    """Parts, separated by commas: matmul,train,roofline,sample,tokenizer,environment,loader,feed; default: all."""
     horizons: tuple[int, ...] = ()
     """Lengths of rollouts in frames, one prompt frame included; default: the clips' length and three times that."""
     torch: bool = False

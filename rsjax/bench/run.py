@@ -11,12 +11,13 @@ import jax
 from rich.table import Table
 
 from rsjax.bench import parts
+from rsjax.bench.roofline import roofline
 from rsjax.bench.timing import peak_memory_bytes
 from rsjax.bench.torch_part import check_torch, torch_baseline
 from rsjax.config import Config, require
 from rsjax.errors import did_you_mean
 
-PARTS = ("matmul", "train", "sample", "tokenizer", "environment", "loader", "feed")
+PARTS = ("matmul", "train", "roofline", "sample", "tokenizer", "environment", "loader", "feed")
 MODEL_FACTS = ("blocks", "width", "use_depth", "compute_dtype", "remat")  # reported if the family has them
 BUDGET_SECONDS = 20.0  # per quantity, unless three runs take longer
 
@@ -56,6 +57,7 @@ def bench(
     works: dict[str, Callable[[], dict[str, Any]]] = {
         "matmul": lambda: parts.matmul(dtype, budget),
         "train": lambda: parts.train(config, batch, budget),
+        "roofline": lambda: roofline(config, batch, numbers["matmul_ceiling_flops"], budget),
         "sample": lambda: parts.sample(config, batch, budget, horizons),
         "tokenizer": lambda: parts.tokenizer(config, batch, budget),
         "environment": lambda: parts.environment(config, budget),
@@ -79,6 +81,8 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
     for name in only:
         known = f"{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})"
         require(name in PARTS, f"--only has no part {name!r}{known}")
+    needs = "--only roofline needs the ceiling of matrix products too: --only matmul,roofline"
+    require("roofline" not in only or "matmul" in only, needs)
     require(batch >= 1, f"--batch is {batch}; at least 1 clip is needed")
     for frames in horizons:
         problem = f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
@@ -140,6 +144,8 @@ def table(numbers: dict[str, Any]) -> Table:
 
 
 def _shown(name: str, value: Any) -> str:
+    if name.endswith("_bytes_per_s"):
+        return f"{value / 1e9:,.1f} GB/s"
     if name.endswith("_bytes"):
         return f"{value / 2**20:,.0f} MiB"
     if not isinstance(value, float):

@@ -28,6 +28,7 @@ def numbers() -> dict[str, Any]:
         patch.setattr(parts, "CPU_PRODUCTS", ((64, 16, 32), (128, 64, 64)))
         patch.setattr(parts, "ACCELERATOR_PRODUCTS", ((64, 16, 32), (128, 64, 64)))
         patch.setattr(parts, "ENVIRONMENTS", (1,))
+        patch.setattr("rsjax.bench.roofline.STREAM", 2**12)
         return bench(toy(), batch=2, horizons=(4, 6), budget=0.0)
 
 
@@ -39,6 +40,9 @@ def test_every_quantity_is_there_positive_and_flat(numbers: dict[str, Any]) -> N
         "train_flops",
         "train_share_of_ceiling",
         "compile_s",
+        "roofline_qkv_s",
+        "roofline_optimizer_least_s",
+        "roofline_sum_share",
         "sample_s_per_frame_cached",
         "sample_s_per_frame_cached_4",
         "sample_s_per_frame_cached_6",
@@ -65,6 +69,8 @@ def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     assert numbers["train_tokens_per_s"] == pytest.approx(2 * config.clips.frames * config.grid**2 / step)
     assert numbers["train_flops"] == pytest.approx(numbers["train_step_flops"] / step)
     assert numbers["matmul_ceiling_flops"] == max(numbers["matmul_flops_64x16x32"], numbers["matmul_flops_128x64x64"])
+    assert numbers["roofline_sum_s"] > sum(numbers[f"roofline_{name}_s"] for name in ("qkv", "gelu", "loss"))
+    assert numbers["roofline_sum_share"] == numbers["roofline_sum_least_s"] / numbers["roofline_sum_s"]
     assert numbers["sample_s_per_frame_cached"] == numbers["sample_s_per_frame_cached_4"]
     ratio = numbers["sample_s_per_frame_cached_6"] / numbers["sample_s_per_frame_cached_4"]
     assert numbers["sample_cost_ratio_6_over_4"] == pytest.approx(ratio)
@@ -77,6 +83,7 @@ def test_quantities_agree_with_one_another(numbers: dict[str, Any]) -> None:
     ("name", "text"),
     [
         ("environment_steps_per_s_64", "73.8 /s"),
+        ("roofline_bandwidth_bytes_per_s", "0.0 GB/s"),
         ("train_tokens_per_s", "73.8 /s"),
         ("train_step_s", "73.760 s"),
         ("sample_s_per_frame_cached_16", "73.760 s"),
