@@ -16,8 +16,9 @@ from rsjax.pipeline.evaluations import FOLDER
 ALIKE = {
     "protocol": None,
     "settings": None,
-    "data": ("key", "split", "frames", "image_size"),
+    "data": ("key", "split", "frames", "image_size", "fps"),
 }
+MAYBE_UNKNOWN = ("fps", "physics_iq_threshold")  # None where nothing says it, as in older results: fits any value
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
 
@@ -133,13 +134,14 @@ def check_alike(groups: Sequence[Group]) -> None:
 
 
 def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...] | None]) -> list[str]:
-    """Returns a line for each of these fields in which two results differ."""
+    """Returns a line for each of these fields in which two results are known to differ."""
     lines = []
     for section, names in wanted.items():
         there, here = getattr(first, section), getattr(other, section)
         for name in names or dict.fromkeys((*there, *here)):
             values: tuple[Any, Any] = there.get(name), here.get(name)
-            if values[0] != values[1]:
+            unknown = name in MAYBE_UNKNOWN and None in values
+            if values[0] != values[1] and not unknown:
                 lines.append(f"{section}.{name} is {values[0]} in the first, {values[1]} in the other")
     return lines
 

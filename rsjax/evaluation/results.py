@@ -27,8 +27,10 @@ class Result:
         key: changes with whatever decides the scores, the code excepted.
         protocol: every field of the protocol.
         sampling: all settings of sampling, of which the protocol may fix some; empty for a family without any.
-        settings: of the metrics; files of weights by a hash of their content.
-        data: ``path``, ``key``, ``manifest_sha256``, ``split``, ``frames`` and ``image_size`` of the scored clips.
+        settings: of the metrics; files of weights by a hash of their content. ``physics_iq_threshold``: grey levels of
+            255 above which a pixel moves; results of earlier versions lack it.
+        data: ``path``, ``key``, ``manifest_sha256``, ``split``, ``frames``, ``image_size`` and ``fps`` of the scored
+            clips; ``fps``, frames per second, is None where nothing says it and absent in results of earlier versions.
         model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters``, ``weights_sha256``, and the key
             of the data that it learned from as ``trained_on``.
         code: version and git revision of rsjax.

@@ -14,9 +14,11 @@ import jax
 
 import rsjax
 from rsjax.config import Config, EvalConfig, SimConfig, content_key, to_dict
+from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, StoreError, open_store
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, lock
@@ -140,13 +142,14 @@ def _evaluate(folder: Path, name: str, trained: TrainedModel, run: Run, store: S
 
 def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
     """Returns protocol, sampling, data, model and machine for the file."""
-    config, clips = trained.config, held_out.clips
+    config, (frames, size) = trained.config, held_out.clips.rgb.shape[1:3]
+    rate = frame_rate(held_out.records[0], held_out.store.manifest)
     data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
     return {
         "protocol": held_out.protocol.described(),
         "sampling": _sample_settings(config),
         "settings": _settings(config.eval),
-        "data": data | {"split": held_out.split, "frames": clips.rgb.shape[1], "image_size": clips.rgb.shape[2]},
+        "data": data | {"split": held_out.split, "frames": frames, "image_size": size, "fps": rate},
         "model": {
             "run": str(run.directory),
             "preset": config.name,
@@ -186,10 +189,11 @@ def _parts(folder: Path, key: str) -> Path:
 
 
 def _settings(settings: EvalConfig) -> dict[str, Any]:
-    """Returns what the metrics depend on: files by their content."""
+    """Returns what the metrics depend on: files by their content, and the constant of the masks of what moves."""
     values = {name: value for name, value in to_dict(settings).items() if name not in NOT_OF_METRICS}
     files = {name: Path(value) for name, value in values.items() if name.endswith("_weights") and value}
-    return values | {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
+    hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
+    return values | hashes | {"physics_iq_threshold": THRESHOLD}
 
 
 def _sample_settings(config: Config) -> dict[str, Any]:

@@ -78,6 +78,8 @@ def test_better_is_only_said_where_seeds_bear_it_out(make: Make) -> None:
         ({"data": {"split": "unseen_task"}}, "data.split is test in the first, unseen_task in the other"),
         ({"data": {"key": "other"}}, "data.key is toy in the first, other in the other"),
         ({"data": {"image_size": 32}}, "data.image_size is 16 in the first, 32 in the other"),
+        ({"data": {"fps": 10.0}}, "data.fps is 5.0 in the first, 10.0 in the other"),
+        ({"settings": {"physics_iq_threshold": 20}}, "settings.physics_iq_threshold is 10 in the first, 20 in the"),
         ({"protocol": {"horizon": 48, "temperature": 1.0}}, "protocol.temperature is None in the first, 1.0 in"),
         ({"clips": [{"number": 0, "sha256": "0"}]}, "the scored clips differ in their content"),
     ],
@@ -89,6 +91,13 @@ def test_unlike_evaluations_are_refused_by_field(make: Make, changes: dict, says
     }
     with pytest.raises(UserError, match=f"were not evaluated alike: .*{re.escape(says)}"):
         read_groups([make("a", plain), make("b", replace(plain, **merged))], None)
+
+
+def test_results_that_do_not_say_their_rate_compare_with_any(make: Make) -> None:
+    new = toy.result(0.0)
+    old = replace(new, data={k: v for k, v in new.data.items() if k != "fps"}, settings={"localiser_steps": 800})
+    unknown = replace(new, data=new.data | {"fps": None})
+    assert len(read_groups([make("new", new), make("old", old, old), make("unknown", unknown)], None)) == 3
 
 
 def test_files_have_published_numbers_apart_and_reasons(make: Make, tmp_path: Path) -> None:

@@ -50,8 +50,12 @@ def scored(
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """A run of random parameters on a store of clips; nothing is generated for its evaluations."""
-    base = tmp_path_factory.mktemp("evaluated")
-    store = toy.store(base / "clips")
+    base, plain = tmp_path_factory.mktemp("evaluated"), toy.clip
+    with pytest.MonkeyPatch.context() as patch:  # frames of a recording at 10 frames a second, of which every other
+        timing = {"fps": 10.0, "frames": list(range(0, 2 * FRAMES, 2))}
+        timed = lambda *numbers: replace(clip := plain(*numbers), provenance=clip.provenance | timing)  # noqa: E731
+        patch.setattr(toy, "clip", timed)
+        store = toy.store(base / "clips")
     config = on_store(toy.config(), base / "clips")
     run = Run(config, base / "run", base)
     for stage in ("tokenizer", "world_model", "tokens"):
@@ -88,6 +92,7 @@ def test_a_result_says_all_that_decided_it(run: Run, folder: Path) -> None:
     assert result.protocol["prompt_frames"] == 1
     assert result.data["key"] == "toy"
     assert (result.data["split"], result.data["frames"]) == ("test", FRAMES)
+    assert (result.data["fps"], result.settings["physics_iq_threshold"]) == (5.0, 10)
     assert result.sampling["unmask"] == "greedy"
     assert result.model["parameters"] > 0
     assert len(result.model["weights_sha256"]) == 16
