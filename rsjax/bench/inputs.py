@@ -3,6 +3,10 @@
 Axes: B clips, T frames, H×W token cells, A action dimensions.
 """
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -10,10 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rsjax.clip import Video
-from rsjax.config import Config
+from rsjax.config import CogVideoXConfig, Config
+from rsjax.config.leaves import with_values
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
 from rsjax.models.base import Assets, WorldModel, create_autoencoder
+from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.roboscape.architecture import Architecture
 
 
@@ -30,6 +36,23 @@ def assets(config: Config) -> Assets:
     autoencoder = create_autoencoder(config)
     params = jax.jit(lambda key: autoencoder.tokenizer_params(autoencoder.init(key)))(jax.random.key(0))
     return Assets(normalization(config), params)
+
+
+@contextmanager
+def random_texts(config: Config) -> Iterator[Config]:
+    """Provides the configuration with a temporary file of text embeddings, random ones, in place of the one it names.
+
+    A configuration that names none is left as it is.
+    """
+    if not (isinstance(config.model, CogVideoXConfig) and config.model.text.file):
+        yield config
+        return
+    text = config.model.text
+    embeddings = np.random.default_rng(0).normal(size=(1, text.tokens, text.width)).astype(np.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "text.safetensors"
+        path.write_bytes(write_texts([EMPTY], embeddings))
+        yield with_values(config, {"model.text.file": str(path)})
 
 
 def video(config: Config, size: int, frames: int) -> Video:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 from rich.table import Table
 
-from rsjax.bench import parts
+from rsjax.bench import inputs, parts
 from rsjax.bench.roofline import roofline
 from rsjax.bench.timing import peak_memory_bytes
 from rsjax.bench.torch_part import check_torch, torch_baseline
@@ -52,27 +52,28 @@ def bench(
             installed, or the PyTorch baseline cannot be compared with the model.
     """
     check_request(config, batch, only, horizons, torch)
-    horizons = horizons or (config.clips.frames, 3 * config.clips.frames)
-    dtype = getattr(config.model, "compute_dtype", "float32")
-    works: dict[str, Callable[[], dict[str, Any]]] = {
-        "matmul": lambda: parts.matmul(dtype, budget),
-        "train": lambda: parts.train(config, batch, budget),
-        "roofline": lambda: roofline(config, batch, numbers["matmul_ceiling_flops"], budget),
-        "sample": lambda: parts.sample(config, batch, budget, horizons),
-        "tokenizer": lambda: parts.tokenizer(config, batch, budget),
-        "environment": lambda: parts.environment(config, budget),
-        "loader": lambda: parts.load(config, batch, budget),
-        "feed": lambda: parts.feed(config, budget),
-        "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),
-    }
-    numbers = facts(config, batch)
-    for name in [part for part in PARTS if part in only] + ["torch"] * torch:
-        say(f"measuring {name}")
-        numbers |= works[name]() | {"peak_memory_bytes": peak_memory_bytes()}
-        if name != "torch":  # jax does not see torch's memory on an accelerator
-            numbers[f"{name}_peak_memory_bytes"] = numbers["peak_memory_bytes"]
-        numbers |= ratios(numbers, config.model.uses_depth)
-        keep(dict(numbers))
+    with inputs.random_texts(config) as config:
+        horizons = horizons or (config.clips.frames, 3 * config.clips.frames)
+        dtype = getattr(config.model, "compute_dtype", "float32")
+        works: dict[str, Callable[[], dict[str, Any]]] = {
+            "matmul": lambda: parts.matmul(dtype, budget),
+            "train": lambda: parts.train(config, batch, budget),
+            "roofline": lambda: roofline(config, batch, numbers["matmul_ceiling_flops"], budget),
+            "sample": lambda: parts.sample(config, batch, budget, horizons),
+            "tokenizer": lambda: parts.tokenizer(config, batch, budget),
+            "environment": lambda: parts.environment(config, budget),
+            "loader": lambda: parts.load(config, batch, budget),
+            "feed": lambda: parts.feed(config, budget),
+            "torch": lambda: torch_baseline(config, batch, budget, horizons[0]),
+        }
+        numbers = facts(config, batch)
+        for name in [part for part in PARTS if part in only] + ["torch"] * torch:
+            say(f"measuring {name}")
+            numbers |= works[name]() | {"peak_memory_bytes": peak_memory_bytes()}
+            if name != "torch":  # jax does not see torch's memory on an accelerator
+                numbers[f"{name}_peak_memory_bytes"] = numbers["peak_memory_bytes"]
+            numbers |= ratios(numbers, config.model.uses_depth)
+            keep(dict(numbers))
     return numbers
 
 

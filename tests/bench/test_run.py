@@ -2,6 +2,7 @@ import contextlib
 import dataclasses
 import io
 import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,9 +11,11 @@ from rich.console import Console
 
 from rsjax.bench import parts
 from rsjax.bench.run import PARTS, _shown, bench, ratios, table
-from rsjax.config import Config, ConfigError, presets
+from rsjax.config import Config, ConfigError, TextConfig, presets
 from rsjax.config.leaves import with_values
 from rsjax.errors import UserError
+from rsjax.models.cogvideox.text import texts_of
+from tests.models.cogvideox import toy as cogvideox
 
 
 def toy(**model: Any) -> Config:
@@ -134,6 +137,21 @@ def test_the_share_of_waiting_is_that_of_a_slow_loader(
     measured = bench(toy(), only=["feed"], budget=0.0)
     assert measured["data_wait_share"] == share
     assert (measured["feed_steps"], measured["feed_batch"]) == (parts.LEAST, toy().train.batch_size)
+
+
+def test_a_file_of_texts_need_not_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sampling reads one of the right shape, which is gone after the benchmark."""
+    files = []
+
+    def sample(config: Config, *_: Any) -> dict[str, Any]:
+        text = config.model.text  # type: ignore[attr-defined]
+        files.append(text.file)
+        return {"sample_shape": str(texts_of(text, None, 3).shape)}
+
+    monkeypatch.setattr(parts, "sample", sample)
+    config = cogvideox.config(text=TextConfig(tokens=2, width=4, file="missing.safetensors"))
+    assert bench(config, only=["sample"])["sample_shape"] == "(3, 2, 4)"
+    assert not Path(files[0]).exists()
 
 
 def test_rollouts_begin_with_one_frame_whatever_the_preset_trains_with(monkeypatch: pytest.MonkeyPatch) -> None:
