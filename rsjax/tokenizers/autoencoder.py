@@ -53,7 +53,10 @@ class Autoencoder(Trainable[B], Protocol[B]):
         ...
 
     def batch(self, arrays: Arrays) -> Any:
-        """Returns the batch for ``loss_terms`` from stacked arrays; each array's rows are clips, or a multiple."""
+        """Returns the batch for ``loss_terms`` from a loader's stacked arrays; its rows are clips, or a multiple.
+
+        Random draws of a row must follow from the array ``index``, the clip's place in the batch over all processes.
+        """
         ...
 
     def tokenizer_params(self, params: Params) -> Params:

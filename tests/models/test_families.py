@@ -138,7 +138,7 @@ def batches_of(config: Config) -> Iterator[tuple[Any, Any, Any]]:
         autoencoder, rng = create_autoencoder(config), np.random.default_rng(0)
         transform = autoencoder.transform()
         rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(4)]
-        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"index": np.arange(4)}
         yield autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
     yield model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, 4)
 
@@ -160,6 +160,21 @@ def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
         for name, (value, weight) in whole.items():
             np.testing.assert_allclose(summed[name], (value, weight), rtol=2e-4, atol=1e-5, err_msg=name)
         assert np.isfinite(combine(whole, model.loss_weights)[0])
+
+
+@pytest.mark.parametrize("family", ["ivideogpt", "irasim", "cogvideox"])
+def test_rows_of_an_autoencoders_batch_keep_their_place_over_all_hosts(family: str) -> None:
+    """Otherwise the clips of two hosts would share their noise and dropout."""
+    autoencoder = create_autoencoder(families.FAMILIES[family]())
+    clip = autoencoder.transform()({"rgb": toy.clip(0).rgb, "depth": None}, np.random.default_rng(0))
+    arrays = {name: np.repeat(x[None], 4, axis=0) for name, x in clip.items()} | {"index": np.arange(4, dtype=np.int32)}
+    whole = autoencoder.batch(arrays)
+    rows = len(whole["index"]) // 4
+    np.testing.assert_array_equal(whole["index"], np.arange(4 * rows))
+    hosts = [autoencoder.batch({name: x[host::2] for name, x in arrays.items()}) for host in range(2)]
+    for host, batch in enumerate(hosts):
+        assert batch["index"].dtype == np.int32
+        np.testing.assert_array_equal(batch["index"], whole["index"].reshape(4, rows)[host::2].reshape(-1))
 
 
 @every_family

@@ -105,7 +105,7 @@ class CausalVAETraining(Autoencoder[Batch]):
         return partial(_window, self.train.frames_per_clip, self.train.flip)
 
     def batch(self, arrays: Arrays) -> Batch:
-        return {"frames": arrays["frames"], "index": np.arange(len(arrays["frames"]), dtype=np.int32)}
+        return {name: arrays[name] for name in ("frames", "index")}
 
     def codec(self, params: Params, normalization: Normalization) -> "CausalCodec":
         return CausalCodec(self.config, params)

@@ -113,8 +113,9 @@ class KLTraining(Autoencoder[Batch]):
         return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
 
     def batch(self, arrays: Arrays) -> Batch:
-        images = image_batch(arrays)
-        return {"images": images, "index": np.arange(len(images), dtype=np.int32)}
+        count = arrays["images"].shape[1]  # of a clip
+        index = count * arrays["index"][:, None] + np.arange(count, dtype=np.int32)
+        return {"images": image_batch(arrays), "index": index.reshape(-1)}
 
     def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
         return KLCodec(self.config, params)

@@ -98,7 +98,7 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         return partial(_draw, self.config.context_frames, self.train.frames_per_clip, self.train.flip)
 
     def batch(self, arrays: Arrays) -> Batch:
-        return {"frames": arrays["frames"], "index": np.arange(len(arrays["frames"]), dtype=np.int32)}
+        return {name: arrays[name] for name in ("frames", "index")}
 
     def codec(self, params: Params, normalization: Normalization) -> "ConditionalCodec":
         return ConditionalCodec(self.config, params)
