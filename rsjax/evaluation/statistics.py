@@ -204,6 +204,15 @@ def share_difference(one: ArrayLike, other: ArrayLike) -> Estimate:
     return Estimate(gap, float(gap - below), float(gap + above))
 
 
+def can_lose(success: ArrayLike, margin: float) -> bool:
+    """Returns whether trials succeed often enough for a loss of ``margin`` to show: Wilson's interval lies above it.
+
+    Where nothing succeeds, nothing is worse by a margin, so "as good as this" would always hold.
+    """
+    low = wilson(int(np.sum(success)), np.size(success)).low
+    return margin <= 0 or (low is not None and low > margin)
+
+
 def verdict(interval: Estimate | None, direction: Direction = "higher", margin: float = 0.0) -> Verdict:
     """Returns what the interval of a difference a - b says of the claim that a is better than b by more than a margin.
 

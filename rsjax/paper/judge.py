@@ -9,11 +9,22 @@ from jaxtyping import Float
 
 from rsjax.ablation.table import Result, Spread, read_result, spread
 from rsjax.evaluation.registry import Metric, Unavailable, metrics
-from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
+from rsjax.evaluation.statistics import (
+    Estimate,
+    Verdict,
+    Welch,
+    can_lose,
+    paired_bootstrap,
+    share_difference,
+    verdict,
+    welch,
+)
 from rsjax.paper.claim import Claim, Comparison
 from rsjax.paper.measurements import read_scores
 from rsjax.paper.plan import Cell, Plan
 from rsjax.pipeline.run import Run
+
+SUCCESS = "success"  # the name of scores that are 1 or 0, of trials that may all end alike
 
 
 @dataclass(frozen=True)
@@ -25,6 +36,7 @@ class Judged:
         metric: by which.
         seeds: finished seeds of both arms.
         published: the paper's difference, if it has one.
+        sides: both scores, means over seeds.
         difference: of the arm claimed to be better minus the other, with an interval over seeds and clips.
         test: Welch's t-test over the seeds; None with fewer than two seeds.
         clips: that have a score in all of them.
@@ -36,6 +48,7 @@ class Judged:
     metric: Metric
     seeds: tuple[int, int]
     published: float | None = None
+    sides: tuple[float, float] | None = None
     difference: Estimate | None = None
     test: Welch | None = None
     clips: int = 0
@@ -131,12 +144,17 @@ def _judge(claim: Claim, comparison: Comparison, arms: Mapping[str, Trained], re
     except Unavailable as reason:
         return replace(judged, reason=str(reason))
     summarise = np.mean if metric.statistic == "mean" else np.median
-    difference = paired_bootstrap(a, b, statistic=metric.statistic)
-    judged = replace(judged, difference=difference, clips=a.shape[1])
-    test = welch(summarise(a, axis=1), summarise(b, axis=1))
+    one, other = (summarise(scores, axis=1) for scores in (a, b))
+    success = comparison.metric == SUCCESS
+    difference = share_difference(a, b) if success else paired_bootstrap(a, b, statistic=metric.statistic)
+    judged = replace(judged, sides=(one.mean(), other.mean()), difference=difference, clips=a.shape[1])
+    test = welch(one, other)
     if test is None:
         return replace(judged, reason="one seed says nothing about others")
-    return replace(judged, test=test, verdict=verdict(_wider(difference, test), metric.better, comparison.margin))
+    judged = replace(judged, test=test)
+    if success and not can_lose(b, -comparison.margin):
+        return replace(judged, reason="the other side succeeds too seldom for a loss of the margin to show")
+    return replace(judged, verdict=verdict(_wider(difference, test), metric.better, comparison.margin))
 
 
 def _paired(
@@ -187,7 +205,11 @@ def _published(claim: Claim, comparison: Comparison) -> float | None:
 
 
 def _wider(interval: Estimate, test: Welch) -> Estimate:
-    """Returns the interval that contains both, as few seeds make the bootstrap's too narrow."""
-    if interval.low is None or interval.high is None or test.difference.low is None or test.difference.high is None:
-        return Estimate(interval.value, None, None)
-    return Estimate(interval.value, min(interval.low, test.difference.low), max(interval.high, test.difference.high))
+    """Returns the interval that contains both, as few seeds make the bootstrap's too narrow.
+
+    Of a single score per seed, such as a correlation, there is no bootstrap, and Welch's is returned.
+    """
+    low, high = test.difference.low, test.difference.high
+    if interval.low is None or interval.high is None or low is None or high is None:
+        return test.difference
+    return Estimate(interval.value, min(interval.low, low), max(interval.high, high))

@@ -4,6 +4,7 @@ A measurement is a function of a run that returns a score per clip by name. It r
 run's directory.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -60,7 +61,8 @@ def measure(run: Run, name: str) -> None:
         return
     result: dict[str, Any] = {}
     try:
-        result["scores"] = {key: list(map(float, values)) for key, values in _MEASUREMENTS[name][0](run).items()}
+        scores = _MEASUREMENTS[name][0](run)
+        result["scores"] = {key: [x if math.isfinite(x) else None for x in values] for key, values in scores.items()}
     except Exception as error:
         line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         note(f"{name} failed: {line}")

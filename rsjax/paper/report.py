@@ -99,6 +99,7 @@ def _claim(outcome: Outcome) -> dict[str, Any]:
         "verdict": outcome.verdict,
         "counts": outcome.counts,
         "header": [column.heading for column in columns],
+        "published_header": [column.heading for column in _published_columns(outcome)],
         "arms": [_arm(arm, outcome, columns) for arm in outcome.arms],
         "baselines": _baselines(outcome, columns),
         "published": any(arm.published for arm in claim.arms),
@@ -108,8 +109,17 @@ def _claim(outcome: Outcome) -> dict[str, Any]:
 
 
 def _columns(outcome: Outcome) -> list[Metric]:
+    """Returns the metrics by which a claim compares the arms' own evaluations."""
+    return _known([each.metric for each in outcome.claim.comparisons if not each.measurement])
+
+
+def _published_columns(outcome: Outcome) -> list[Metric]:
+    return _known([each.metric for each in outcome.claim.comparisons])
+
+
+def _known(names: Sequence[str]) -> list[Metric]:
     known = metrics()
-    return [known[name] for name in dict.fromkeys(each.metric for each in outcome.claim.comparisons) if name in known]
+    return [known[name] for name in dict.fromkeys(names) if name in known]
 
 
 def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str, Any]:
@@ -123,7 +133,10 @@ def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str,
         "seeds": f"{len(arm.finished)} of {len(arm.cells)}",
         "failed": sum(result.state == "failed" for result in arm.results),
         "scores": [_spread(arm, column) for column in columns],
-        "published": [f"{published[c.name]:.{c.decimals}f}" if c.name in published else ABSENT for c in columns],
+        "published": [
+            f"{published[c.name]:.{c.decimals}f}" if c.name in published else ABSENT
+            for c in _published_columns(outcome)
+        ],
         "values": {name: spread._asdict() for name, spread in arm.spreads.items()},
         "steps": config.train.steps if config and not config.train.curriculum else None,
         "parameters": f"{budget.parameters(config) / 1e6:.2f} M" if config and arm.finished else None,
@@ -165,6 +178,7 @@ def _comparison(judged: Judged) -> dict[str, Any]:
         "metric": metric.heading,
         "where": compared.measurement,
         "margin": compared.margin,
+        "sides": None if judged.sides is None else " / ".join(f"{side:.{digits}f}" for side in judged.sides),
         "difference": ABSENT if judged.difference is None else f"{judged.difference.value:+.{digits}f}",
         "interval": _interval(judged.difference, digits),
         "p": None if judged.test is None else f"{judged.test.p:.3f}",
@@ -177,11 +191,12 @@ def _comparison(judged: Judged) -> dict[str, Any]:
     }
 
 
-def _numbers(judged: Judged) -> dict[str, float | None]:
+def _numbers(judged: Judged) -> dict[str, Any]:
     """Returns the numbers of a comparison, as the texts beside them are rounded."""
     interval, test = judged.difference or Estimate(math.nan, None, None), judged.test
     welch = test.difference if test else Estimate(math.nan, None, None)
     return {
+        "sides": None if judged.sides is None else list(map(float, judged.sides)),
         "difference": interval.value if judged.difference else None,
         "low": interval.low,
         "high": interval.high,

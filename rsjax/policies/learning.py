@@ -9,7 +9,7 @@ import numpy as np
 
 from rsjax.config.policy import PolicyConfig
 from rsjax.errors import UserError
-from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wilson
+from rsjax.evaluation.statistics import Estimate, can_lose, share_difference, verdict, wilson
 from rsjax.files import write_file, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.figures import success_curves
@@ -132,7 +132,7 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     for claim, one, other, margin in wanted:
         if one != other and one in success and other in success:
             interval = share_difference(success[one], success[other])
-            holds = verdict(interval, "higher", margin)
+            holds = verdict(interval, "higher", margin) if can_lose(success[other], -margin) else "cannot tell"
             found.append(
                 {"claim": claim, "compares": [one, other], **asdict(interval), "margin": margin, "verdict": holds}
             )

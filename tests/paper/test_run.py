@@ -140,6 +140,41 @@ def longer() -> Iterator[list[str]]:
     measurements._MEASUREMENTS.pop("longer")
 
 
+def test_a_single_score_per_seed_is_judged_by_welchs_interval(tmp_path: Path) -> None:
+    """Such as a correlation over policies, of which no clips can be drawn."""
+
+    @measurement("correlation", lambda config: 1.0)
+    def correlation(run: Run) -> dict[str, list[float]]:
+        return {"r": [0.97 + 0.01 * run.config.train.seed], "strong": [0.9], "none": [float("nan")]}
+
+    same: dict[str, Any] = {"better": "with", "than": "with", "measurement": "correlation"}
+    holds = Comparison("r", score="r", than_score="strong", **same)
+    undefined = Comparison("r", score="none", than_score="strong", **same)
+    (claim,) = run(toy.plan(toy.claim("toy", holds, undefined)), tmp_path)["claims"]
+    measurements._MEASUREMENTS.pop("correlation")
+    one, other = claim["comparisons"]
+    assert (one["verdict"], one["sides"], one["clips"]) == ("holds", "0.980 / 0.900", 1)
+    assert one["values"]["sides"] == pytest.approx([0.98, 0.9]) and one["values"]["low"] is None
+    assert (other["verdict"], other["reason"]) == ("not measured", "no clip has a score in all seeds of both")
+
+
+@pytest.mark.parametrize(("rate", "verdict"), [(0.0, "cannot tell"), (0.9, "holds")])
+def test_policies_that_never_succeed_are_not_as_good_as_one_another(
+    tmp_path: Path, rate: float, verdict: Verdict
+) -> None:
+    @measurement("trials", lambda config: 1.0)
+    def trials(run: Run) -> dict[str, list[float]]:
+        hits = [float(number < 100 * rate) for number in range(100)]
+        return {"many": hits, "real": hits}
+
+    compared = Comparison("success", "with", "with", "many", "real", "trials", margin=-0.1)
+    (claim,) = run(toy.plan(toy.claim("toy", compared)), tmp_path)["claims"]
+    measurements._MEASUREMENTS.pop("trials")
+    (found,) = claim["comparisons"]
+    assert found["verdict"] == verdict and found["values"]["low"] < 0 < found["values"]["high"]
+    assert claim["header"] == [], "the arms' own evaluations have no such score"
+
+
 def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Path, longer: list[str]) -> None:
     plan = toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="longer")))
     (claim,) = run(plan, tmp_path)["claims"]

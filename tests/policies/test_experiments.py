@@ -63,6 +63,9 @@ def test_without_a_difference_nothing_is_claimed() -> None:
         for kind in ("synthetic", "real")
     ]
     assert [claim["verdict"] for claim in claims(rows, 8)] == ["cannot tell"]
+    for rate, verdict in ((0, "cannot tell"), (0.9, "holds")):  # where nothing succeeds, nothing is as good as another
+        alike = [row | {"success": [[number < 200 * rate for number in range(200)]]} for row in rows]
+        assert [claim["verdict"] for claim in claims(alike, 8)] == [verdict]
 
 
 def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
