@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.cli import main_errors, parse_options
-from rsjax.config import presets
+from rsjax.config import presets, require
+from rsjax.config.leaves import with_values
 from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.paper"
+FILES = ("lpips_alex_weights", "lpips_vgg_weights", "fvd_weights", "depth_estimator")  # fields of EvalConfig
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,13 @@ class Options:
     """Directory of simulated data sets."""
     preset: str = "tiny"
     """The preset that the trainings are variations of."""
+    seeds: int = 3
+    """Trainings of each arm."""
+    lpips_alex_weights: str = ""
+    """Weights of LPIPS and of FVD, and an estimator of depth (docs/evaluation.md); scores without are null."""
+    lpips_vgg_weights: str = ""
+    fvd_weights: str = ""
+    depth_estimator: str = ""
     dry_run: bool = False
     """Print the trainings with their estimated minutes and states, and run nothing."""
     report: bool = False
@@ -41,7 +50,9 @@ def main() -> None:
     """Runs what has not finished, and prints the report's path; exits with 1 where a training failed."""
     tune_process()
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
-    preset = presets.get(options.preset)
+    require(options.seeds >= 1, f"--seeds is {options.seeds}; it must be at least 1")
+    given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
+    preset = with_values(presets.get(options.preset), given)
     # Loads JAX, so only after the arguments have been parsed.
     from rsjax.paper import run
     from rsjax.paper.budget import parse_duration, scale
@@ -49,7 +60,7 @@ def main() -> None:
     from rsjax.paper.plan import make_plan
 
     wanted = chosen(options.only, claims())
-    plan = make_plan(wanted, scale(preset, parse_duration(options.budget)), options.data_dir)
+    plan = make_plan(wanted, scale(preset, parse_duration(options.budget)), options.data_dir, options.seeds)
     command = shlex.join([*PROG.split(), *sys.argv[1:]])
     run.print_plan(plan, options.dir, options.data_dir)
     if options.dry_run:

@@ -8,18 +8,21 @@ again finds them.
 import re
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import Literal
 
 import jax
 
 from rsjax.config import Config, LoopConfig, TokenizerConfig, require
 from rsjax.config.leaves import with_values
-from rsjax.models.base import create_model
+from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tokenizers.flops import tokenizer_flops
 
 EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
 TOKENIZER_RATE = 4.1e10  # operations a second of the tokenizer's training, with Muon
+# Seconds of a step of autoencoder and model in each family's small preset.
+FAMILY_STEPS = {"ivideogpt": (0.5, 1.0), "irasim": (0.25, 0.5), "cogvideox": (0.5, 1.0)}
 START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
 EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds: of each evaluation, a localiser's step, a rollout
 
@@ -55,12 +58,10 @@ class Scale:
     Attributes:
         seconds: the budget.
         base: the base preset at this size.
-        share: its trained seconds relative to the whole preset's; other presets' loops are cut to the same share.
     """
 
     seconds: float
     base: Config
-    share: float
 
 
 def scale(preset: Config, seconds: float) -> Scale:
@@ -88,7 +89,7 @@ def scale(preset: Config, seconds: float) -> Scale:
     base = with_values(preset, values)
     steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
     base = with_values(base, {"train.steps": min(preset.train.steps, max(LEAST_STEPS, _round(steps)))})
-    return Scale(seconds, base, trained_seconds(base) / trained_seconds(preset))
+    return Scale(seconds, base)
 
 
 def _round(number: float) -> int:
@@ -97,7 +98,7 @@ def _round(number: float) -> int:
 
 
 def cut(config: Config, share: float) -> Config:
-    """Returns the configuration with each of its training loops cut to a share of its steps, at least one."""
+    """Returns the configuration with each of its training loops at a share of its steps, at least one."""
     loops = {
         field.name: replace(loop, steps=max(1, round(share * loop.steps)), eval_every=0)
         for field in fields(config)
@@ -113,20 +114,25 @@ def train_flops(config: Config) -> int | None:
 
 
 @cache
-def parameters(config: Config) -> int:
-    """Returns the number of parameters of the world model."""
-    shapes = jax.eval_shape(create_model(config).init, jax.random.key(0))
-    return sum(x.size for x in jax.tree.leaves(shapes))
+def parameters(config: Config) -> tuple[int, int]:
+    """Returns the numbers of parameters of the world model and of its autoencoder."""
+    model = jax.eval_shape(create_model(config).init, jax.random.key(0))
+    autoencoder = create_autoencoder(config).shapes() if config.model.uses_tokenizer else {}
+    return tuple(sum(x.size for x in jax.tree.leaves(shapes)) for shapes in (model, autoencoder))  # type: ignore[return-value]
 
 
 def step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the world model; of a family without counts, 0."""
+    if config.model.family in FAMILY_STEPS:
+        return FAMILY_STEPS[config.model.family][1]
     flops = train_flops(config)
     return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
 
 
 def tokenizer_step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the tokenizer."""
+    if config.model.family in FAMILY_STEPS:
+        return FAMILY_STEPS[config.model.family][0]
     loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
     return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
 
@@ -149,9 +155,14 @@ def tokenizer_seconds(config: Config) -> float:
     return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * clips
 
 
-def trained_seconds(config: Config) -> float:
-    """Returns the seconds of all steps of tokenizer and world model."""
-    return config.tokenizer_train.steps * tokenizer_step_seconds(config) + config.train.steps * step_seconds(config)
+def training_cost(config: Config, unit: Literal["seconds", "flops"]) -> tuple[float, float]:
+    """Returns what the trainings of autoencoder and world model take: estimated seconds, or operations."""
+    loop = config.tokenizer_train
+    if unit == "seconds":
+        return loop.steps * tokenizer_step_seconds(config), config.train.steps * step_seconds(config)
+    frame = create_autoencoder(config).flops() if config.model.uses_tokenizer else {}
+    images = loop.steps * loop.batch_size * loop.frames_per_clip
+    return 3.0 * images * sum(frame.values()), float(train_flops(config) or 0)
 
 
 def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0) -> float:
@@ -167,12 +178,8 @@ def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0
     return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
 
 
-def cell_seconds(config: Config, base: Config) -> float:
-    """Returns the seconds of a cell beyond what it shares.
-
-    A family with an autoencoder of its own, or without counts of operations, takes the time that it gets: the base
-    preset's.
-    """
-    per_step = step_seconds(config) if config.model.own_autoencoder is None else 0.0
-    training = config.train.steps * per_step if per_step else trained_seconds(base)
-    return START + training + evaluation_seconds(config)
+def cell_seconds(config: Config) -> float:
+    """Returns the seconds of a cell beyond what it shares: no other has an autoencoder of its family's own."""
+    own = config.model.own_autoencoder is not None
+    training = sum(training_cost(config, "seconds")[0 if own else 1 :])
+    return START * (1 + own) + training + evaluation_seconds(config)

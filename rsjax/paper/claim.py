@@ -19,9 +19,10 @@ class Arm:
         name: in tables.
         values: fields that differ from the base preset, by dotted name.
         model: the family of the model, with the base preset's size; empty: the base preset's.
-        preset: instead, the preset ``PRESET_BASE`` (``irasim_tiny``), with the base preset's clips and evaluation.
-            An arm without such a preset is left out.
-        equal: whether it trains for as many steps as the base preset, or for as many estimated seconds.
+        preset: instead, the small preset of this family (``irasim``: ``irasim_tiny``), with the base preset's clips and
+            evaluation. An arm without such a preset is left out.
+        equal: whether it trains for as many steps as the base preset, for as many estimated seconds, or for as many
+            operations. A family's small preset trains autoencoder and model; both are cut or prolonged alike.
         curriculum: the stages of its training, whose epochs are scaled to the cell's steps.
         mixed: the clips of these stages are mixed instead, each as often as in the curriculum.
         data: the share of the training clips that the world model learns from.
@@ -32,7 +33,7 @@ class Arm:
     values: Mapping[str, Any] = field(default_factory=dict)
     model: str = ""
     preset: str = ""
-    equal: Literal["steps", "seconds"] = "steps"
+    equal: Literal["steps", "seconds", "flops"] = "steps"
     curriculum: tuple[str, ...] = ()
     mixed: bool = False
     data: float = 1.0
@@ -72,6 +73,7 @@ class Claim:
         place: where: "Table 2".
         arms: what is trained. Arms of the same configuration are trained once for all claims.
         comparisons: its parts.
+        beside: scores that stand beside each arm's in the report, by the measurement that they are from.
         rank: claims of rank 0 come first, with all their seeds; then the others by rank, seed by seed.
         notes: what differs from the paper, one line each.
     """
@@ -82,6 +84,7 @@ class Claim:
     place: str
     arms: tuple[Arm, ...]
     comparisons: tuple[Comparison, ...]
+    beside: Mapping[str, str] = field(default_factory=dict)
     rank: int = 5
     notes: tuple[str, ...] = ()
 
@@ -99,7 +102,7 @@ class Claim:
     def measurements(self, arm: str) -> tuple[str, ...]:
         """Returns the names of the measurements that its comparisons need of an arm."""
         used = (each.measurement for each in self.comparisons if arm in (each.better, each.than))
-        return tuple(dict.fromkeys(filter(None, used)))
+        return tuple(dict.fromkeys([*filter(None, used), *self.beside.values()]))
 
 
 def pairs(better: str, than: str, *metrics: str) -> tuple[Comparison, ...]:

@@ -24,6 +24,7 @@ from rsjax.paper.measurements import read_scores
 from rsjax.paper.plan import Cell, Plan
 from rsjax.pipeline.run import Run
 
+CEILING = "psnr_tokenizer"  # of the reconstruction, which each family's own autoencoder limits
 SUCCESS = "success"  # the name of scores that are 1 or 0, of trials that may all end alike
 
 
@@ -65,7 +66,7 @@ class Trained:
         cells: one for each seed, those left out too.
         results: of the same cells.
         absent: why it cannot be trained; empty if it can.
-        spreads: mean and deviation over finished seeds of the claim's scores.
+        spreads: mean and deviation over finished seeds of the claim's scores, by metric or name in ``Claim.beside``.
     """
 
     name: str
@@ -114,8 +115,9 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
     """
     results = {name: read_result(runs[name]) for name in plan.cells}
     read: dict[tuple[str, str], tuple[Mapping[str, Sequence[float]], str]] = {}
+    sources = {"", *(name for claim in plan.claims for arm in claim.arms for name in claim.measurements(arm.name))}
     for name, result in results.items():
-        for source in {each.measurement for claim in plan.claims for each in claim.comparisons}:
+        for source in sources:
             if result.state == "finished":
                 read[name, source] = read_scores(runs[name], source)
     return [_judge_claim(claim, plan, results, read) for claim in plan.claims]
@@ -127,8 +129,11 @@ def _judge_claim(claim: Claim, plan: Plan, results: Mapping[str, Result], read: 
         cells = plan.of(claim.name, arm.name)
         found = tuple(results[cell.name] for cell in cells)
         finished = [result.metrics for result in found if result.state == "finished"]
-        names = dict.fromkeys(each.metric for each in claim.comparisons)
+        names = dict.fromkeys([*(each.metric for each in claim.comparisons), CEILING])
         values = {name: [scores[name] for scores in finished if name in scores] for name in names}
+        for name, source in claim.beside.items():
+            measured = [read[result.name, source][0] for result in found if result.state == "finished"]
+            values[name] = [float(np.mean(scores[name])) for scores in measured if name in scores]
         spreads = {name: spread(numbers) for name, numbers in values.items() if numbers}
         arms[arm.name] = Trained(arm.name, cells, found, plan.absent.get((claim.name, arm.name), ""), spreads)
     judged = tuple(_judge(claim, each, arms, read) for each in claim.comparisons)

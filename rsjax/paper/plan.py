@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from rsjax.ablation.grid import SEED, Value, cell_name
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets
@@ -16,6 +17,7 @@ from rsjax.pipeline.run import Run
 from rsjax.sim.expert import MODES, SIMPLE
 
 SLACK = 1.05  # of the budget that the estimates may take
+KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
 
 
 @dataclass(frozen=True)
@@ -73,19 +75,20 @@ class Plan:
         return tuple(cell for cell in self.cells.values() if (claim, arm) in cell.uses)
 
 
-def make_plan(claims: Sequence[Claim], scale: Scale, data: Path) -> Plan:
+def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS) -> Plan:
     """Returns the cells of claims, which share the budget, and what is to be done in which order.
 
     The sizes of the cells depend on the budget alone, not on the claims.
 
     Args:
         data: the directory of simulated data sets.
+        seeds: trainings of each arm.
     """
     absent: dict[tuple[str, str], str] = {}
     cells: dict[str, Cell] = {}  # by content key
     tasks: dict[tuple[str, str], Task] = {}
     shared = set[str]()
-    for claim, arm, seed in _ordered(claims):
+    for claim, arm, seed in _ordered(claims, range(seeds)):
         try:
             config = arm_config(arm, scale, seed)
         except ConfigError as error:
@@ -95,7 +98,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path) -> Plan:
         key, use = keys["evaluation"], (claim.name, arm.name)
         if key not in cells:
             cells[key] = Cell(f"{cell_name(_label(arm), seed)}-{key[:8]}", config, ())
-            seconds = budget.cell_seconds(config, scale.base) + _shared_seconds(config, keys, shared)
+            seconds = budget.cell_seconds(config) + _shared_seconds(config, keys, shared)
             tasks[key, ""] = Task(cells[key].name, "", claim.name, seconds)
         cells[key] = replace(cells[key], uses=(*cells[key].uses, use))
         for name in claim.measurements(arm.name):
@@ -117,9 +120,9 @@ def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> 
     return sum(parts[stage](config) for stage in new)
 
 
-def _ordered(claims: Sequence[Claim]) -> list[tuple[Claim, Arm, int]]:
+def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
     """Claims of rank 0 with all seeds; then the first seed of all others, then the second …"""
-    seeds, first = range(budget.SEEDS), [claim for claim in claims if not claim.rank]
+    first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
     return [
         *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
@@ -140,26 +143,39 @@ def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
     Raises:
         ConfigError: there is no such preset, or the base preset lacks a field of the arm's.
     """
-    base, config = scale.base, scale.base
-    if arm.preset:
-        name = f"{arm.preset}_{base.name}"
-        if name not in presets.PRESETS:
-            raise ConfigError(f"there is no preset {name} in this version")
-        whole = budget.cut(presets.get(name), scale.share)
-        kept = {field: getattr(base, field) for field in ("prompt_frames", "sim", "data", "eval")}
-        config = replace(whole, **kept)
-    elif arm.model:
-        config = base.with_family(arm.model)
+    base = scale.base
+    config = _small(arm, base) if arm.preset else base.with_family(arm.model) if arm.model else base
     try:
         config = with_values(config, {**arm.values, SEED: seed})
     except (AttributeError, TypeError) as error:
         raise ConfigError(f"the preset {config.name} has no such field ({error})") from error
-    per_step = budget.step_seconds(config)
-    if arm.equal == "seconds" and per_step and not arm.preset:
-        steps = round(base.train.steps * budget.step_seconds(base) / per_step)
-        config = with_values(config, {"train.steps": steps})
+    if arm.equal != "steps":
+        config = _equal(config, base, arm.equal, alone=bool(arm.preset))
     stages = _stages(arm, config)
     return with_values(config, {"train.curriculum": stages}) if stages else config
+
+
+def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alone: bool) -> Config:
+    """Returns a configuration whose trainings take as much as the base preset's.
+
+    Args:
+        alone: whether its autoencoder is its own, to be cut or prolonged too; otherwise it is the base preset's.
+    """
+    (tokenizer, model), whole = budget.training_cost(config, unit), sum(budget.training_cost(base, unit))
+    if alone:
+        return budget.cut(config, whole / (tokenizer + model))
+    steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
+    return with_values(config, {"train.steps": steps})
+
+
+def _small(arm: Arm, base: Config) -> Config:
+    """Returns the small preset of an arm's family, with the base preset's clips and evaluation."""
+    name = f"{arm.preset}_tiny"
+    if name not in presets.PRESETS:
+        raise ConfigError(f"there is no preset {name} in this version")
+    config = replace(presets.get(name), **{field: getattr(base, field) for field in KEPT})
+    tasks = base.sim.train_tasks
+    return with_values(config, {"model.text.tasks": tasks}) if tasks and hasattr(config.model, "text") else config
 
 
 def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:

@@ -14,11 +14,12 @@ import jinja2
 
 from rsjax.ablation.figure import draw
 from rsjax.ablation.table import Result, Row
+from rsjax.config import Config
 from rsjax.evaluation.registry import ABSENT, Metric, metrics
 from rsjax.evaluation.statistics import Estimate
 from rsjax.files import disk_guard, write_file, write_json
 from rsjax.paper import budget
-from rsjax.paper.judge import Judged, Outcome, Trained
+from rsjax.paper.judge import CEILING, Judged, Outcome, Trained
 from rsjax.paper.plan import Plan
 from rsjax.progress import duration
 from rsjax.report.score_charts import SCENES
@@ -99,6 +100,7 @@ def _claim(outcome: Outcome) -> dict[str, Any]:
         "verdict": outcome.verdict,
         "counts": outcome.counts,
         "header": [column.heading for column in columns],
+        "beside": ["PSNR of the reconstruction"] * bool(columns) + list(claim.beside),
         "published_header": [column.heading for column in _published_columns(outcome)],
         "arms": [_arm(arm, outcome, columns) for arm in outcome.arms],
         "baselines": _baselines(outcome, columns),
@@ -126,7 +128,7 @@ def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str,
     published = outcome.claim.arm(arm.name).published
     config = arm.cells[0].config if arm.cells else None
     seconds = [sum(_trained(result).values()) for result in arm.finished]
-    flops = budget.train_flops(config) if config else None
+    flops = sum(budget.training_cost(config, "flops")) if config else None
     return {
         "name": arm.name,
         "absent": arm.absent,
@@ -139,18 +141,32 @@ def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str,
         ],
         "values": {name: spread._asdict() for name, spread in arm.spreads.items()},
         "steps": config.train.steps if config and not config.train.curriculum else None,
-        "parameters": f"{budget.parameters(config) / 1e6:.2f} M" if config and arm.finished else None,
+        "beside": [_beside(arm, name) for name in [CEILING] * bool(columns) + list(outcome.claim.beside)],
+        "parameters": _parameters(config) if config and arm.finished else None,
         "tflop": None if flops is None else round(flops / 1e12, 1),
         "minutes": round(sum(seconds) / len(seconds) / 60, 1) if seconds else None,
         "runs": [str(result.run.directory) for result in arm.results],
     }
 
 
+def _beside(arm: Trained, name: str) -> str:
+    return f"{arm.spreads[name].mean:.3g}" if name in arm.spreads else ABSENT
+
+
+def _parameters(config: Config) -> str:
+    """Returns the trained parameters of model and autoencoder in millions, and how many more are frozen."""
+    model, autoencoder = budget.parameters(config)
+    trained = model + autoencoder * (config.tokenizer_train.steps > 0)
+    frozen = model + autoencoder - trained
+    return f"{trained / 1e6:.2f} M" + (f", {frozen / 1e6:.2f} M frozen" if frozen else "")
+
+
 def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, Any]]:
     """Returns the scores of repeating the first frame and of the reconstruction, of the first arm that has any."""
     finished = [result for arm in outcome.arms for result in arm.finished][:1]
+    of = next((f" of {arm.name}" for arm in outcome.arms if arm.finished), "")
     rows = []
-    for suffix, name in (("_repeat_first", SCENES["_repeat_first"]), ("_tokenizer", SCENES["_tokenizer"])):
+    for suffix, name in (("_repeat_first", SCENES["_repeat_first"]), ("_tokenizer", SCENES["_tokenizer"] + of)):
         numbers = [result.metrics.get(f"{column.name}{suffix}") for result in finished for column in columns]
         if any(number is not None for number in numbers):
             texts = [ABSENT if n is None else f"{n:.{c.decimals}f}" for n, c in zip(numbers, columns, strict=True)]

@@ -72,6 +72,8 @@ def print_plan(plan: Plan, out: Path, data: Path) -> None:
         f"{base.name} in {duration(plan.scale.seconds)}: {base.sim.episodes} episodes, {base.tokenizer_train.steps} "
         f"steps of the tokenizer, {base.train.steps} of the model, {base.eval.clips} test clips"
     )
+    for (claim, arm), reason in plan.absent.items():
+        print(f"{claim}: {arm} is left out: {reason}")
     states = {task: _state(task, runs[task.cell]) for task in plan.tasks}
     for task, state in states.items():
         what = f"{task.cell}: {task.measurement}" if task.measurement else task.cell

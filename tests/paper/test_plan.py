@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from rsjax.config import Config, ConfigError, presets
 from rsjax.paper import budget
-from rsjax.paper.budget import HOUR, parse_duration, scale, step_seconds
+from rsjax.paper.budget import HOUR, parse_duration, scale, step_seconds, training_cost
 from rsjax.paper.claim import Arm, Comparison, chosen, claims
 from rsjax.paper.plan import Plan, arm_config, make_plan
+from rsjax.paper.run import print_plan
 from rsjax.pipeline.run import Run
 from tests.paper import toy
 
@@ -94,7 +95,7 @@ def test_named_claims_have_the_same_trainings_and_more_of_them(three_hours: Plan
     assert all(whole[name] == cell.config for name, cell in some.cells.items())
     done, left = ({task.cell for task in plan.tasks} for plan in (some, three_hours))
     assert done - left  # the budget of the other claims
-    assert not any(task.measurement for task in some.tasks)
+    assert {task.measurement for task in some.tasks} == {"", "seconds a frame"}
     assert some.of("table1", "Genie") and some.of("departure-actions", "to the letter")
 
 
@@ -133,23 +134,46 @@ def test_a_share_of_the_data_is_read_for_as_many_steps(three_hours: Plan) -> Non
     assert stage.epochs * stage.components[0].clips == pytest.approx(base.train.steps * base.train.batch_size)
 
 
-def test_a_family_has_the_base_presets_clips_and_the_same_share_of_its_own_steps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    other = replace(presets.debug(), name="other_tiny", train=replace(TINY.train, steps=1000, eval_every=10))
-    monkeypatch.setitem(presets.PRESETS, "other_tiny", other)
+@pytest.mark.parametrize("name", ["ivideogpt", "irasim", "cogvideox"])
+def test_a_family_has_the_base_presets_clips_and_as_many_seconds_or_operations(name: str) -> None:
     at = scale(TINY, HOUR)
-    config = arm_config(Arm("", preset="other", equal="seconds"), at, 2)
-    assert (config.sim, config.eval, config.train.seed) == (at.base.sim, at.base.eval, 2)
-    assert config.train.steps == round(1000 * at.share) < 1000
-    assert config.train.eval_every == 0
+    whole = presets.get(f"{name}_tiny")
+    for equal in ("seconds", "flops"):
+        config = arm_config(Arm("", preset=name, equal=equal), at, 2)  # type: ignore[arg-type]
+        assert (config.sim, config.eval, config.train.seed) == (at.base.sim, at.base.eval, 2)
+        one, other = (sum(training_cost(each, equal)) for each in (config, at.base))  # type: ignore[arg-type]
+        assert one == pytest.approx(other, rel=0.02)
+        both = config.tokenizer_train.steps / whole.tokenizer_train.steps, config.train.steps / whole.train.steps
+        assert both[0] == pytest.approx(both[1], rel=0.02) and config.train.eval_every == 0
 
 
-def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason() -> None:
+def test_equal_operations_count_the_shared_tokenizer(three_hours: Plan) -> None:
+    base, genie = three_hours.scale.base, arm_config(Arm("", model="genie", equal="flops"), three_hours.scale, 0)
+    one, other = (sum(training_cost(each, "flops")) for each in (genie, base))
+    assert one == pytest.approx(other, rel=0.01)
+    assert genie.tokenizer_train == base.tokenizer_train and genie.train.steps > base.train.steps
+
+
+def test_all_families_can_be_compared_on_several_tasks() -> None:
+    plan = make_plan(chosen(["table1"], claims()), scale(presets.get("multitask"), 12 * HOUR), DATA)
+    assert not plan.absent
+    models = {arm.name: plan.of("table1", arm.name)[0].config for arm in plan.claims[0].arms}
+    assert {config.sim for config in models.values()} == {plan.scale.base.sim}
+    assert models["CogVideoX"].model.text.tasks == plan.scale.base.sim.train_tasks  # type: ignore[attr-defined]
+
+
+def test_more_seeds_are_more_trainings() -> None:
+    plan = make_plan(chosen(["table2"], claims()), scale(TINY, HOUR), DATA, seeds=5)
+    assert [cell.config.train.seed for cell in plan.of("table2", "full")] == [0, 1, 2, 3, 4]
+
+
+def test_an_arm_that_cannot_be_trained_is_absent_with_its_reason(capsys: pytest.CaptureFixture[str]) -> None:
     claim = replace(toy.claim(), arms=(*toy.claim().arms, Arm("other", preset="other"), Arm("odd", {"model.x": 1})))
-    absent = toy.plan(claim).absent
-    assert absent["toy", "other"] == "there is no preset other_debug in this version"
-    assert "no such field" in absent["toy", "odd"]
+    plan = toy.plan(claim)
+    assert plan.absent["toy", "other"] == "there is no preset other_tiny in this version"
+    assert "no such field" in plan.absent["toy", "odd"]
+    print_plan(plan, Path("out"), DATA)
+    assert "toy: other is left out: there is no preset other_tiny" in capsys.readouterr().out
 
 
 def test_claims_name_their_arms_and_are_chosen_by_name() -> None:

@@ -3,19 +3,24 @@
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from experiments import paper
 from rsjax.ablation import sweep
 from rsjax.ablation.figure import draw
+from rsjax.clip import Video
 from rsjax.errors import Preempted
 from rsjax.evaluation.statistics import Verdict
 from rsjax.paper import measurements
 from rsjax.paper import report as page
 from rsjax.paper.claim import Comparison
+from rsjax.paper.claims import baselines
 from rsjax.paper.judge import judge_all
 from rsjax.paper.measurements import measurement
 from rsjax.paper.plan import Plan
@@ -227,6 +232,34 @@ def test_a_run_of_the_preset_is_a_cell_and_its_scores_are_in_the_report(
         assert found["values"]["psnr"]["mean"] == metrics["psnr"]
     assert {claim["verdict"] for claim in claims.values()} == {"cannot tell"}
     assert (tmp_path / "report.html").exists() and (tmp_path / "figures" / "table2.png").exists()
+
+
+def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the predicted frames of one clip, from its prompt."""
+    clip: dict[str, Any] = {
+        "rgb": np.zeros((6, 4, 4, 3), np.uint8),
+        "depth": None,
+        "actions": np.zeros((6, 2), np.float32),
+    }
+    asked: list[Any] = []
+
+    def generate(*given: Any, index: Any) -> Video:
+        asked.append(given)
+        return Video(clip["rgb"][None])
+
+    trained = SimpleNamespace(model=SimpleNamespace(generate=generate), params={}, assets=None)
+    monkeypatch.setattr(baselines, "load", lambda directory: trained)
+    monkeypatch.setattr(baselines, "median_seconds", lambda call, budget: (call(), 1.5)[1])
+    monkeypatch.setattr(Run, "open_clips", lambda run: SimpleNamespace(source=lambda split: [clip]))
+    claim = replace(toy.claim(), beside={"seconds a frame": "seconds a frame"})
+    (found,) = run(toy.plan(claim), tmp_path)["claims"]
+    assert found["beside"] == ["PSNR of the reconstruction", "seconds a frame"]
+    assert [arm["beside"] for arm in found["arms"]] == [["–", "0.3"]] * 2
+    assert asked[0][2].rgb.shape == (1, 1, 4, 4, 3) and asked[0][3].shape == (1, 6, 2)
+    assert (
+        "| PSNR of the reconstruction | seconds a frame | trained parameters |"
+        in (tmp_path / "out" / "report.md").read_text()
+    )
 
 
 def test_mistakes_are_one_line(command: Commands) -> None:
