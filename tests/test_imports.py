@@ -31,8 +31,8 @@ ORDER = [
     "play",
     "ablation",
     "compare",
-    "paper",
     "bench",
+    "paper",
     "describe",
     "convert",
 ]

@@ -11,18 +11,25 @@ from typing import Any
 
 import jax
 import jinja2
+import numpy as np
+from jaxtyping import UInt8
 
 from rsjax.ablation.figure import draw
 from rsjax.ablation.table import Result, Row
+from rsjax.compare.page import ComparedClip
 from rsjax.config import Config
+from rsjax.errors import UserError
 from rsjax.evaluation.registry import ABSENT, Metric, metrics
+from rsjax.evaluation.results import read_frames
 from rsjax.evaluation.statistics import Estimate
 from rsjax.files import disk_guard, write_file, write_json
 from rsjax.paper import budget
 from rsjax.paper.judge import CEILING, Judged, Outcome, Trained
 from rsjax.paper.plan import Plan
 from rsjax.progress import duration
+from rsjax.report.figures import filmstrip
 from rsjax.report.score_charts import SCENES
+from rsjax.report.video import webp, webp_uri
 
 OWN_STAGES = ("world_model", "evaluation", "report")  # of which every cell has its own
 LEGEND = (
@@ -54,14 +61,17 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
         autoescape=lambda name: bool(name) and "html" in str(name),
     )
     with disk_guard(out):
-        figures = {}
+        figures, strips = dict[str, str](), dict[str, str]()
         for outcome in outcomes:
             if picture := _figure(outcome):
                 figures[outcome.claim.name] = base64.b64encode(picture).decode()
                 write_file(out / "figures" / f"{outcome.claim.name}.png", picture)
+            if (strip := _strip(outcome)) is not None:
+                strips[outcome.claim.name] = webp_uri(strip)
+                write_file(out / "figures" / f"{outcome.claim.name}-clip.webp", webp(strip))
         write_json(out / "report.json", content)
         for name in ("report.md", "report.html"):
-            text = environment.get_template(f"{name}.j2").render(**content, figures=figures)
+            text = environment.get_template(f"{name}.j2").render(**content, figures=figures, strips=strips)
             write_file(out / name, text.encode())
     return out / "report.html"
 
@@ -242,3 +252,23 @@ def _figure(outcome: Outcome) -> bytes | None:
         if arm.spreads
     ]
     return draw(rows, f"{outcome.claim.place}: {outcome.claim.title}") if rows else None
+
+
+def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Draws the clip that is in the middle by the first arm's PSNR, as the first seed of every arm predicts it.
+
+    None with fewer than two arms, or where their frames were not kept.
+    """
+    arms = [(arm.name, arm.finished[0]) for arm in outcome.arms if arm.finished]
+    try:
+        kept = [(name, read_frames(result.run.output("evaluation"))) for name, result in arms]
+    except UserError:
+        return None
+    if len(kept) < 2 or len({frames["truth"].tobytes() for _, frames in kept}) > 1:
+        return None
+    truth, prompt = kept[0][1]["truth"], arms[0][1].run.config.prompt_frames
+    error = np.square(kept[0][1]["prediction"].astype(float) - truth).mean((1, 2, 3, 4))
+    middle = int(np.argsort(error)[len(error) // 2])
+    others = tuple((name, frames["prediction"][middle]) for name, frames in kept)
+    title = f"the clip in the middle by {arms[0][0]}'s PSNR, first seed of each"
+    return filmstrip(ComparedClip(title, truth[middle], None, prompt_frames=prompt, others=others))

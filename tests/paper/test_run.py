@@ -262,6 +262,30 @@ def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pyte
     )
 
 
+def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one in the middle by the first arm's error, if all arms kept frames of the same clips."""
+    truth = np.zeros((3, 4, 8, 8, 3), np.uint8)
+    shift = {"with": np.array([40, 0, 20]), "without": np.array([1, 2, 3])}
+
+    def frames(folder: Path) -> dict[str, np.ndarray]:
+        arm = "without" if "use_keypoints" in str(folder) else "with"
+        return {"truth": truth, "prediction": truth + shift[arm][:, None, None, None, None].astype(np.uint8)}
+
+    drawn: list[Any] = []
+
+    def sheet(clip: Any) -> np.ndarray:
+        drawn.append(clip)
+        return truth[0, 0]
+
+    monkeypatch.setattr(page, "read_frames", frames)
+    monkeypatch.setattr(page, "filmstrip", sheet)
+    run(toy.plan(toy.claim()), tmp_path)
+    shown = {name: int(video.max()) for name, video in drawn[-1].others}
+    assert shown == {"with": 20, "without": 3}
+    assert (tmp_path / "out" / "figures" / "toy-clip.webp").exists()
+    assert "(figures/toy-clip.webp)" in (tmp_path / "out" / "report.md").read_text()
+
+
 def test_mistakes_are_one_line(command: Commands) -> None:
     assert "not a duration" in command.refused("experiments.paper", "--budget", "long")
     assert "unknown preset" in command.refused("experiments.paper", "--preset", "tinny")
