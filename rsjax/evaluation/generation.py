@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rsjax.clip import Video
-from rsjax.data.clips import Clips, spread
+from rsjax.data.clips import Clips
 from rsjax.data.codec import Record, decode, encode
 from rsjax.evaluation.protocols import Protocol
 from rsjax.files import write_file
@@ -23,7 +23,6 @@ from rsjax.progress import Progress
 
 OWN = "own"  # the kind of videos under the clips' own actions
 SAMPLE = "sample"  # the kind of further samples under them, of which only scores are kept
-TOKEN_CLIPS = 20  # clips whose tokens are scored under teacher forcing
 
 
 @dataclass(frozen=True)
@@ -166,13 +165,12 @@ class Generation:
 def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
     """Predicts every frame's tokens from the true frames before it; None if the model cannot.
 
-    Of ``TOKEN_CLIPS`` clips, spread evenly, which have thousands of tokens each; of all in a teacher-forced protocol.
+    This costs less than one of the several rollouts of each clip.
     """
     size, video, parts = trained.config.eval.batch_size, clips.video, list[TeacherForced]()
-    numbers = spread(clips.rgb, len(clips.rgb) if protocol.teacher_forced else TOKEN_CLIPS)
-    count = len(numbers)
+    count = len(clips.rgb)
     for start in range(0, count, size):
-        rows = np.take(numbers, np.arange(start, start + size), mode="clip")
+        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is filled up
         inputs = (trained.params, trained.assets, video[rows], clips.actions[rows])
         part = trained.model.teacher_forced(*inputs, protocol.prompt_frames)
         if part is None:
