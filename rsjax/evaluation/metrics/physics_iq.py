@@ -160,6 +160,24 @@ def _register(kind: Kind, title: str, better: Literal["higher", "lower"], **sett
         return {part: values if values.ndim == 1 else values.mean(1) for part, values in scores.items()}
 
 
+def _masks(scene: Scene) -> tuple[Bool[np.ndarray, "B P h w"], Bool[np.ndarray, "B P h w"]]:
+    """Returns what moves in the predicted frames: truth, prediction."""
+    truth, prediction = scene.of_truth(_small_truth), scene.shared(_small)
+    return truth.masks[:, scene.prompt_frames :], prediction.masks[:, scene.prompt_frames :]
+
+
+def spatial_frames(scene: Scene) -> PerFrame:
+    """Scores what has moved up to every predicted frame; the last value is the clip's score."""
+    one, other = (np.logical_or.accumulate(masks, axis=1) for masks in _masks(scene))
+    return _iou(one, other)
+
+
+def weighted_frames(scene: Scene) -> PerFrame:
+    """Scores how often things have moved up to every predicted frame; the last value is the clip's score."""
+    one, other = (np.cumsum(masks, axis=1) for masks in _masks(scene))  # counts: the ratio is that of the shares
+    return _iou(one, other)
+
+
 def spatiotemporal_frames(scene: Scene) -> PerFrame:
     """Scores what moves in every predicted frame."""
     return scene.shared(_four, scene.prompt_frames).spatiotemporal
@@ -170,9 +188,9 @@ def mse_frames(scene: Scene) -> PerFrame:
     return scene.shared(_four, scene.prompt_frames).mse
 
 
-_register("spatial", "spatial IoU", "higher", decimals=4)
+_register("spatial", "spatial IoU", "higher", decimals=4, per_frame=spatial_frames)
 _register("spatiotemporal", "spatiotemporal IoU", "higher", decimals=4, per_frame=spatiotemporal_frames)
-_register("weighted", "weighted spatial IoU", "higher", decimals=4)
+_register("weighted", "weighted spatial IoU", "higher", decimals=4, per_frame=weighted_frames)
 _register("mse", "MSE", "lower", decimals=4, per_frame=mse_frames)
 
 

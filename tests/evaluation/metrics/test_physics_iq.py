@@ -136,6 +136,11 @@ def test_registered_scores_are_of_predicted_frames_and_of_all() -> None:
     for kind in ("spatiotemporal", "mse"):
         frames = per_frame(f"physics_iq_{kind}", scene)
         np.testing.assert_array_equal(frames, getattr(parts[""], kind))
+    for kind in ("spatial", "weighted"):  # up to a frame: the score of videos that end there
+        curve = per_frame(f"physics_iq_{kind}", scene)
+        ends = [four_metrics(shrink(truth[:, :end]), shrink(made[:, :end]), 2) for end in range(3, truth.shape[1] + 1)]
+        np.testing.assert_allclose(curve, np.stack([getattr(each, kind) for each in ends], 1))
+        assert np.ptp(curve) > 0.01
     takes = four_metrics(shrink(truth), shrink(truth[::-1]))
     assert score("physics_iq_score", scene) == physics_iq_score(parts["_all_frames"], takes)
 
