@@ -44,8 +44,8 @@ class Evaluation:
         metrics: scores by name.
         reasons: why a registered metric has no score, by name.
         shown: arrays of the clips in the report, with a leading axis over clips.
-        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the split, without clips that
-            have no score; with several repetitions, their means.
+        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the split, without clips
+            that have no score; with several repetitions, their means.
         curves: means over the clips at each predicted frame, as in curves.json.
         repetitions: the scores of each repetition.
         clips: the scored clips: ``number`` in the split, ``episode`` if known, ``sha256`` of frames and actions.
