@@ -46,24 +46,25 @@ class Options:
 
 @main_errors()
 def main() -> None:
-    """Writes RUN/plan/result.json and prints a table; an interrupted comparison goes on."""
+    """Writes result.json, results.md and videos to RUN/plan/KEY, and prints a table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.plan", Options.__doc__ or "", Options())
     from rich.console import Console
 
     from rsjax.pipeline.trained import load
     from rsjax.policies.planner import PlannerConfig
-    from rsjax.policies.planning import PlanSettings, compare, policy_actors, table
+    from rsjax.policies.planning import PlanSettings, compare, folder, table
+    from rsjax.policies.policy import load_policy
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
     planner = PlannerConfig(**{name: getattr(options, name) for name in fields})
     limits = (options.episodes, options.max_steps)
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
     trained = load(options.run)
-    others = {f"policy {options.policy}": policy_actors(options.policy, trained)} if options.policy else {}
-    result = compare(trained, options.run, settings, others)
+    policies = {f"policy {options.policy}": load_policy(options.policy)} if options.policy else {}
+    result = compare(trained, options.run, settings, policies)
     Console().print(table(result))
-    print(options.run / "plan" / "result.json")
+    print(folder(options.run, result["key"]) / "result.json")
 
 
 if __name__ == "__main__":

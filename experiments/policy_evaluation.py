@@ -53,7 +53,10 @@ def main() -> None:
     runs = {name: RunData(run, options.data_dir) for name, run in named(options.runs).items()}
     first, trials = next(iter(runs.values())), part(options, Trials)
     out, judge = options.out or first.run / "policy_evaluation", options.judge or first.run / FOLDER
-    first.judge(judge)  # before hours of training
+    for run in runs.values():  # before hours of training
+        run.check_world(first)
+    first.judge(judge)
+    config = first.simulator
     if options.policies:
         policies = {name: load_policy(place) for name, place in named(options.policies).items()}
     else:
@@ -61,7 +64,7 @@ def main() -> None:
         policies = checkpoints(sized_policy(options.size, options.steps), demos, out / "policy", options.checkpoints)
     common_size(policies.values())
     worlds = {name: partial(run.world, trials.together, judge) for name, run in runs.items()}
-    with lift_simulators(first.simulator, trials) as simulator:
+    with lift_simulators(config, trials) as simulator:
         compare(policies, simulator, worlds, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 

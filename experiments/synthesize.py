@@ -52,7 +52,8 @@ def main() -> None:
             judge=judge,
             report=lambda done, total: progress.update(done),
         )
-    labelled = "" if made["success"] is None else f", {made['success']} of them judged a success"
+    counts = f"{made['success']} of them judged a success, {made['uninterpretable']} uninterpretable"
+    labelled = "" if made["success"] is None else f", {counts}"
     print(f"{made['demos']} demonstrations from {made['sources']} clips{labelled}; {made['clipped']} numbers clipped")
     print(*(out / name for name in (CLIPS, "lerobot-v3.0", "lerobot-v2.1")), sep="\n")
 

@@ -13,12 +13,13 @@ from rsjax.files import write_file, write_json
 from rsjax.policies.agreement import agreement
 from rsjax.policies.demos import Demos
 from rsjax.policies.figures import scatter, side_by_side
+from rsjax.policies.judge_validation import markdown, summary
 from rsjax.policies.learning import interval_text, percent
 from rsjax.policies.policy import Policy, load_policy
 from rsjax.policies.rollouts import FirstFrame, World
 from rsjax.policies.simulator import Episode
 from rsjax.policies.training import train_policy
-from rsjax.policies.trials import FPS, Trials, first_frames, save_arrays, try_policy
+from rsjax.policies.trials import FPS, Result, Trials, first_frames, save_arrays, try_policy
 from rsjax.progress import stage
 from rsjax.report.video import write_mp4
 
@@ -47,13 +48,14 @@ def compare(
         policies: by name.
         simulator: the true one.
         models: makes the world of each run, by the run's name.
-        out: for ``results.json``, ``results.md``, ``scatter.png`` and videos (left: simulator, right: world model).
+        out: for ``results.json`` (null: not defined, as a correlation without variation), ``results.md``,
+            ``scatter.png`` and videos (left: simulator, right: world model).
 
     Returns:
         The content of ``results.json``.
     """
     frames = first_frames(simulator, trials.seeds, out / "starts.npz")
-    true: dict[str, list[bool]] = {}
+    true: dict[str, Result] = {}
     for name, policy in policies.items():
         true[name] = _tried(policy, simulator, trials.seeds, trials, out / "simulator" / name, f"{name} in simulator")
     rows: list[dict[str, Any]] = []
@@ -64,7 +66,7 @@ def compare(
             folder = out / run / name
             imagined[name] = _tried(policy, world, frames, trials, folder, f"{name} in {run}")
             _videos(out, run, name, trials)
-        rows.append(_row(run, true, imagined))
+        rows.append(_row(run, true, imagined) | {"judge": summary(world.validation)})
         _write(out, rows, trials)
     return {"trials": asdict(trials), "runs": rows}
 
@@ -76,12 +78,12 @@ def _tried(
     trials: Trials,
     folder: Path,
     name: str,
-) -> list[bool]:
+) -> Result:
     def see(number: int, episode: Episode) -> None:
         if number < trials.videos:
             save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
 
-    return try_policy(policy, world, starts, trials, folder, name, see).success
+    return try_policy(policy, world, starts, trials, folder, name, see)
 
 
 def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
@@ -93,12 +95,27 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
             write_mp4(out / "videos" / f"{run}-{name}-{number:02d}.mp4", side_by_side(sides), FPS, 4)
 
 
-def _row(run: str, true: Mapping[str, list[bool]], imagined: Mapping[str, list[bool]]) -> dict[str, Any]:
-    x, y = (np.array([np.mean(results[name]) for name in true]) for results in (true, imagined))
-    found = asdict(agreement(x, y)) if len(true) > 1 else {}
-    policies = {name: {"simulator": true[name], "world_model": imagined[name]} for name in true}
-    same = float(np.mean([np.mean(np.array(true[name]) == imagined[name]) for name in true]))
-    return {"run": run, "policies": policies, "same_outcome": same, **found}
+def _row(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result]) -> dict[str, Any]:
+    x, y = (np.array([np.mean(results[name].success) for name in true]) for results in (true, imagined))
+    policies: dict[str, dict[str, Any]] = {
+        name: {
+            "simulator": true[name].success,
+            "world_model": made.success,
+            "uninterpretable": made.uninterpretable,
+            "clipped": {"simulator": true[name].clipped, "world_model": made.clipped},
+        }
+        for name, made in imagined.items()
+    }
+    same = np.mean([np.equal(each["simulator"], each["world_model"]) for each in policies.values()])
+    spoilt = np.mean([each["uninterpretable"] for each in policies.values()])
+    found = _defined(asdict(agreement(x, y))) if len(true) > 1 else {}
+    return {"run": run, "policies": policies, "same_outcome": float(same), "uninterpretable": float(spoilt), **found}
+
+
+def _defined(numbers: dict[str, Any]) -> dict[str, Any]:
+    """Returns None in place of NaN, which JSON does not have."""
+    parts = {name: _defined(value) if isinstance(value, dict) else value for name, value in numbers.items()}
+    return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in parts.items()}
 
 
 def _write(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
@@ -118,27 +135,35 @@ def _shares(row: Mapping[str, Any]) -> tuple[list[Estimate], list[Estimate]]:
 def _title(row: Mapping[str, Any]) -> str:
     if "pearson" not in row:
         return ""
-    r = Estimate(**row["pearson"])
-    bounds = "" if r.low is None or r.high is None else f" [{r.low:.2f}, {r.high:.2f}]"
-    return f"r = {r.value:.2f}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
+    value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
+    r = "no variation" if value is None else f"r = {value:.2f}"
+    bounds = "" if low is None or high is None else f" [{low:.2f}, {high:.2f}]"
+    return f"{r}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Returns the results in Markdown."""
-    lines = ["| run | Pearson r | 95 % | R² of the line | R² of y = x | Spearman | MMRV | bias | same outcome |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
+    """Returns the results in Markdown: agreement, success, and the judges that decided on it."""
+    names = ("Pearson r", "95 %", "R² of the line", "R² of y = x", "Spearman", "MMRV", "bias", "same outcome")
+    lines = [f"| run | {' | '.join(names)} | uninterpretable |", "|---" * (len(names) + 2) + "|"]
     for row in rows:
         if "pearson" in row:
-            r = Estimate(**row["pearson"])
-            bounds = "" if r.low is None or r.high is None else f"{r.low:.2f} … {r.high:.2f}"
-            numbers = " | ".join(f"{row[name]:.3f}" for name in ("r2_line", "r2_identity", "spearman", "mmrv"))
-            same = f"{100 * row['same_outcome']:.0f} %"
-            lines.append(f"| {row['run']} | {r.value:.3f} | {bounds} | {numbers} | {row['bias']:+.3f} | {same} |")
-    lines += ["", "| policy | in | success | 95 % |", "|---|---|---|---|"]
+            value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
+            bounds = "" if low is None or high is None else f"{low:.2f} … {high:.2f}"
+            numbers = [value, *(row[name] for name in ("r2_line", "r2_identity", "spearman", "mmrv"))]
+            r, *others = ["–" if number is None else f"{number:.3f}" for number in numbers]
+            cells = [row["run"], r, "no variation" if value is None else bounds, *others, f"{row['bias']:+.3f}"]
+            cells += [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
+            lines.append(f"| {' | '.join(cells)} |")
+    lines += ["", "| policy | in | success | 95 % | uninterpretable | numbers clipped |", "|---|---|---|---|---|---|"]
     for number, row in enumerate(rows):
         for world in ("simulator", "world_model") if not number else ("world_model",):
             place = "the simulator" if world == "simulator" else row["run"]
             for name, each in row["policies"].items():
-                share = wilson(sum(each[world]), len(each[world]))
-                lines.append(f"| {name} | {place} | {percent(share)} | {interval_text(share)} |")
+                share, spoilt = wilson(sum(each[world]), len(each[world])), each["uninterpretable"]
+                unclear = percent(wilson(sum(spoilt), len(spoilt))) if world == "world_model" else ""
+                cells = [name, place, percent(share), interval_text(share), unclear, str(each["clipped"][world])]
+                lines.append(f"| {' | '.join(cells)} |")
+    for number, row in enumerate(rows):
+        if row["judge"] not in [before["judge"] for before in rows[:number]]:
+            lines += markdown(row["judge"])
     return "\n".join([*lines, ""])

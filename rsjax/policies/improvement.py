@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.config import content_key
 from rsjax.config.policy import PolicyConfig
 from rsjax.data.codec import Record, decode, encode
 from rsjax.errors import UserError
@@ -14,6 +15,8 @@ from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wil
 from rsjax.files import write_file, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.figures import success_curves
+from rsjax.policies.judge_validation import markdown, summary
+from rsjax.policies.keys import arrays_key
 from rsjax.policies.learning import interval_text, percent
 from rsjax.policies.policy import Policy
 from rsjax.policies.rollouts import FirstFrame, World, run_together
@@ -75,23 +78,30 @@ def improve(
     """
     rows: list[dict[str, Any]] = []
     arms = {"imagined": policy, "control": policy}
-    before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before").success
+    before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before")
     for number in range(1, settings.rounds + 1):
         stage(
             number, settings.rounds, f"round {number}", f"{settings.imagined} imagined episodes, {settings.steps} steps"
         )
-        made = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}")
+        made, counts = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}")
         row: dict[str, Any] = {"round": number, "episodes": settings.imagined, "kept": len(made), "demos": len(demos)}
+        row |= {"uninterpretable": counts["uninterpretable"], "clipped": {"imagining": counts["clipped"]}}
         for arm, old in arms.items():
             learns = mixed(demos, made, settings.share, number) if arm == "imagined" and made else demos
             folder = out / f"round-{number}" / arm
             config = _tuning(old.model.config, settings)
             arms[arm] = train_policy(config, learns, folder, name=f"round {number} {arm}", seed=number, start=old)
-            row[arm] = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}").success
+            tried = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}")
+            row[arm], row["clipped"][arm] = tried.success, tried.clipped
         if not made:
             note("the judge called no imagined episode a success: this round learns from the old demonstrations")
         rows.append(row)
-        results = {"settings": asdict(settings), "trials": asdict(trials), "before": before, "rounds": rows}
+        results: dict[str, Any] = {
+            "settings": asdict(settings),
+            "trials": asdict(trials),
+            "judge": summary(model.validation),
+        }
+        results |= {"before": before.success, "clipped": before.clipped, "rounds": rows}
         results["differences"] = differences(results)
         write_json(out / "results.json", results)
         write_file(out / "results.md", table(results).encode())
@@ -108,16 +118,25 @@ def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
 
 def imagine(
     policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
-) -> list[Record]:
-    """Returns the episodes that the judge calls successes, as demonstrations; each group of them is kept in a file."""
+) -> tuple[list[Record], dict[str, int]]:
+    """Imagines the episodes of a round; each group of them is kept in a file that is named after all it depends on.
+
+    Returns:
+        Those that the judge calls successes, as demonstrations; and of all, how many the judge calls uninterpretable
+        at their end, and how many numbers of actions were clipped.
+    """
     begins = (number - 1) * settings.imagined
     # A start that is used again has other draws.
     chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
     made: list[Record] = []
+    counts = {"uninterpretable": 0, "clipped": 0}
     folder.mkdir(parents=True, exist_ok=True)
+    files = _files(policy, chosen, model, settings, folder)
+    if others := len({*folder.glob("imagined-*.clips")} - {*files}):
+        note(f"{folder}: {others} files of imagined episodes are of another policy, model, judge or start; not used")
     with Progress(f"round {number}: imagining", len(chosen), "episodes") as progress:
-        for first in range(0, len(chosen), model.count):
-            group, file = chosen[first : first + model.count], folder / f"imagined-{first:05d}.clips"
+        for first, file in zip(range(0, len(chosen), model.count), files, strict=True):
+            group = chosen[first : first + model.count]
             if not file.exists():
                 actor = policy.actor(begins + first)
                 episodes = run_together(model, actor, group, settings.max_steps)
@@ -126,10 +145,25 @@ def imagine(
                     for one in episodes
                     if one.success.any() and len(one.rgb) > 1
                 ]
-                write_file(file, encode({"clips": [encode(one) for one in good]}))
-            made += [decode(payload) for payload in decode(file.read_bytes())["clips"]]
+                done = {name: int(sum(getattr(one, name) for one in episodes)) for name in counts}
+                write_file(file, encode({"clips": [encode(one) for one in good], **done}))
+            kept = decode(file.read_bytes())
+            made += [decode(payload) for payload in kept["clips"]]
+            counts = {name: count + kept[name] for name, count in counts.items()}
             progress.update(first + len(group), kept=len(made))
-    return made
+    return made, counts
+
+
+def _files(
+    policy: Policy, chosen: Sequence[FirstFrame], model: World, settings: Improvement, folder: Path
+) -> list[Path]:
+    """Returns the file of each group of imagined episodes."""
+    files = []
+    for first in range(0, len(chosen), model.count):
+        starts = arrays_key([(start.rgb, start.depth, start.draw) for start in chosen[first : first + model.count]])
+        key = content_key("imagined", policy.key, model.key, model.count, settings.max_steps, first, starts)
+        files.append(folder / f"imagined-{first:05d}-{key[:8]}.clips")
+    return files
 
 
 def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demos:
@@ -156,21 +190,25 @@ def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
 def table(results: dict[str, Any]) -> str:
     """Returns the results in Markdown."""
     lines = [
-        "| round | imagined | judged a success | policy | success in the simulator | 95 % |",
-        "|---|---|---|---|---|---|",
+        "| round | imagined | judged a success | uninterpretable | policy | success in the simulator | 95 % |",
+        "|---|---|---|---|---|---|---|",
     ]
     share = _share(results["before"])
-    lines.append(f"| 0 | | | before | {percent(share)} | {interval_text(share)} |")
+    lines.append(f"| 0 | | | | before | {percent(share)} | {interval_text(share)} |")
     for row in results["rounds"]:
         for arm in ("imagined", "control"):
-            share, counts = _share(row[arm]), f"{row['episodes']} | {row['kept']}" if arm == "imagined" else " | "
+            share, counts = _share(row[arm]), " | | "
+            if arm == "imagined":
+                counts = (
+                    f"{row['episodes']} | {row['kept']} | {percent(wilson(row['uninterpretable'], row['episodes']))}"
+                )
             lines.append(f"| {row['round']} | {counts} | {arm} | {percent(share)} | {interval_text(share)} |")
     lines += ["", "| last round | difference | 95 % | better? |", "|---|---|---|---|"]
     for gap in results["differences"]:
         estimate = Estimate(gap["value"], gap["low"], gap["high"])
         names = " - ".join(gap["compares"])
         lines.append(f"| {names} | {percent(estimate)} | {interval_text(estimate)} | {gap['verdict']} |")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *markdown(results["judge"]), ""])
 
 
 def _share(success: Sequence[bool]) -> Estimate:

@@ -7,7 +7,8 @@ Axes: B videos, F frames of a history, H×W pixels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,13 +20,16 @@ from flax import linen as nn
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from rsjax.config import content_key
 from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
-from rsjax.files import write_file
+from rsjax.files import read_json, write_file
+from rsjax.policies.keys import arrays_key
 from rsjax.policies.verdicts import FAIL, HISTORY, LABELS, SUCCESS, UNINTERPRETABLE, last_frames
 from rsjax.progress import Progress
 
 FILE = "judge.msgpack"
+VALIDATION = "validation.json"
 SIDE = 64  # most pixels along each side of what the network reads; larger frames are made smaller
 BATCH = 64  # histories of a step, of which a quarter are spoilt
 SPOILT = BATCH // 4
@@ -49,10 +53,20 @@ class Network(nn.Module):
 
 @dataclass(frozen=True)
 class TrainedJudge:
-    """A trained network with the temperature that calibrates it; a :class:`rsjax.policies.verdicts.Judge`."""
+    """A trained network with the temperature that calibrates it; a :class:`rsjax.policies.verdicts.Judge`.
+
+    Attributes:
+        validation: the content of its ``validation.json``, if it was validated.
+    """
 
     params: Any
     temperature: float
+    validation: dict[str, Any] | None = None
+
+    @cached_property
+    def key(self) -> str:
+        """Changes with the weights and the temperature."""
+        return content_key("judge", arrays_key(self.params), self.temperature)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
         history, parts = last_frames(frames), []
@@ -67,12 +81,12 @@ class TrainedJudge:
 
 
 def load_judge(folder: Path) -> TrainedJudge:
-    """Reads a judge that ``python -m experiments.judge`` trained.
+    """Reads a judge that ``python -m experiments.judge`` trained, with its validation unless that is another judge's.
 
     Raises:
         UserError: there is none, or its file is damaged.
     """
-    path = folder / FILE
+    path, report = folder / FILE, folder / VALIDATION
     try:
         record = decode(path.read_bytes())
         temperature = float(record.pop("temperature"))
@@ -80,7 +94,10 @@ def load_judge(folder: Path) -> TrainedJudge:
         raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path}: damaged ({error}); train it again with python -m experiments.judge RUN") from error
-    return TrainedJudge(unflatten_dict({tuple(name.split("/")): x for name, x in record.items()}), temperature)
+    judge = TrainedJudge(unflatten_dict({tuple(name.split("/")): x for name, x in record.items()}), temperature)
+    found = read_json(report, cure="train the judge again") if report.exists() else None
+    # An interrupted training may have left the validation of the judge before; older ones do not name theirs.
+    return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from rsjax.evaluation.statistics import wilson
 from rsjax.policies.judge import Footage, spoilt
 from rsjax.policies.verdicts import FAIL, LABELS, SUCCESS, UNINTERPRETABLE, Judge
 
+KINDS = ("raw", "reconstructed", "generated")
 BINS = 10
 AT_ONCE = 1024  # histories judged at once
 
@@ -72,12 +73,34 @@ def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]
     }
 
 
+def summary(validation: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Returns what results say of their judge: of each kind of video, the validation without its bins."""
+    if validation is None:
+        return None
+    kinds = {kind: validation[kind] for kind in KINDS if kind in validation}
+    return {kind: {name: part[name] for name in part if name != "bins"} for kind, part in kinds.items()}
+
+
+def markdown(judge: dict[str, Any] | None) -> list[str]:
+    """Returns lines of Markdown of a :func:`summary`: confusion matrix and calibration, for each kind of video."""
+    if judge is None:
+        return ["", "The judge has no validation.json: how far it can be trusted is unknown."]
+    found = " / ".join(LABELS)
+    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", ""]
+    lines += [f"| video | {' | '.join(LABELS)} | right | calibration error |", "|---|---|---|---|---|---|"]
+    for kind, part in judge.items():
+        rows = [" / ".join(map(str, row)) if any(row) else "–" for row in part["confusion"]]
+        right, error = f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"
+        lines.append(f"| {kind} | {' | '.join(rows)} | {right} | {error} |")
+    return lines
+
+
 def table(result: dict[str, Any]) -> Table:
     """Formats a validation: a row for each kind of video and true label."""
     out = Table(title=f"judge on {result['clips']} held-out clips: frames by label")
     for heading in ("video", "truth", *LABELS, "right", "calibration error"):
         out.add_column(heading, justify="left" if heading in ("video", "truth") else "right")
-    for kind in ("raw", "reconstructed", "generated"):
+    for kind in KINDS:
         part = result.get(kind)
         for i, row in enumerate(part["confusion"] if part else ()):
             if any(row):

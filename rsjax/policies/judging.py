@@ -18,13 +18,12 @@ from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
-from rsjax.policies.judge import Footage, TrainedJudge, load_judge, train_judge
+from rsjax.policies.judge import VALIDATION, Footage, TrainedJudge, load_judge, train_judge
 from rsjax.policies.judge_validation import validate
 from rsjax.policies.verdicts import Judge
 from rsjax.progress import Progress
 
 FOLDER = "judge"  # in the run directory
-VALIDATION = "validation.json"
 FITTED = 10  # every tenth training clip fits the temperature instead
 
 
@@ -80,7 +79,7 @@ def make_judge(
     judge = train_judge(learned, fitted, settings.steps, settings.seed)
     numbers = spread(clips.source("test"), settings.validation_clips)
     held = [clip for _, clip in readable(clips.source("test"), numbers)]
-    result = validation(trained, judge, held) | {"settings": vars(settings)}
+    result = validation(trained, judge, held) | {"settings": vars(settings), "judge": judge.key}
     judge.save(run / FOLDER)
     write_json(run / FOLDER / VALIDATION, result)
     return result

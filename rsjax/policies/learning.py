@@ -88,7 +88,7 @@ def learn(
         _demos(cell, real, synthetic)
     for number, cell in enumerate(cells, 1):
         stage(number, len(cells), cell.name, f"{cell.real} real and {cell.synthetic} synthetic demonstrations")
-        success = []
+        success, clipped = [], []
         for seed in range(settings.seeds):
             folder = out / f"{cell.name}-seed{seed}"
             loop = replace(config.train, steps=config.train.steps * cell.steps)
@@ -96,8 +96,10 @@ def learn(
             policy = train_policy(
                 replace(config, train=loop), _demos(cell, real, synthetic), folder, seed=seed, name=name
             )
-            success.append(try_policy(policy, world, trials.seeds, trials, folder, name).success)
-        rows.append(asdict(cell) | {"success": success})
+            tried = try_policy(policy, world, trials.seeds, trials, folder, name)
+            success.append(tried.success)
+            clipped.append(tried.clipped)
+        rows.append(asdict(cell) | {"success": success, "clipped": clipped})
         results: dict[str, Any] = {"trials": asdict(trials), "rows": rows, "claims": claims(rows, max(settings.counts))}
         write_json(out / "results.json", results)
         write_file(out / "results.md", table(rows, results["claims"]).encode())

@@ -5,8 +5,7 @@ expert reaches from the same start; it is not shown how.
 """
 
 import time
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -19,22 +18,25 @@ from rsjax.config import content_key
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
-from rsjax.files import parse_json, write_json
+from rsjax.files import parse_json, write_file, write_json
 from rsjax.models.trained import TrainedModel
-from rsjax.pipeline.run import Run
 from rsjax.policies.energies import Score, Seen, imagined, judged, lpips_distance, pixel_distance, token_distance
-from rsjax.policies.judge import FILE
-from rsjax.policies.judging import FOLDER, saved_judge
+from rsjax.policies.judge_validation import markdown, summary
+from rsjax.policies.judging import saved_judge
+from rsjax.policies.keys import judge_key, model_key
 from rsjax.policies.planner import Planner, PlannerConfig
-from rsjax.policies.policy import load_policy
+from rsjax.policies.policy import Policy
 from rsjax.policies.simulator import Actor, Episode, LiftEnv, Observation, run_episode, skilled_expert
+from rsjax.policies.trials import FPS
 from rsjax.progress import Progress
+from rsjax.report.video import write_mp4
 
 EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
 MEMORY = 2  # last frames that the world model starts from; one at an episode's beginning
 FIRST_SEED = 1_000_000  # of episodes
-RESULT = "result.json"
+HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
+VIDEOS = 3  # of each way to act
 
 
 @dataclass(frozen=True)
@@ -134,16 +136,16 @@ def actors(
     return {"random": random, "expert": expert, **(others or {}), **{name: planning(name) for name in settings.methods}}
 
 
-def policy_actors(directory: Path, trained: TrainedModel) -> MakeActor:
-    """Returns how a policy that ``experiments.policy_learning`` trained acts.
+def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
+    """Returns how a policy acts.
 
     Raises:
-        UserError: it is missing or damaged, or its actions or frames are not those of the run's clips.
+        UserError: its actions or frames are not those of the run's clips.
     """
-    policy, clips = load_policy(directory), trained.config.clips
+    clips = trained.config.clips
     if (policy.action_dim, policy.model.image_size) != (clips.action_dim, clips.image_size):
         raise UserError(
-            f"{directory}: the policy sees {policy.model.image_size} pixels and answers with {policy.action_dim} "
+            f"{name}: it sees {policy.model.image_size} pixels and answers with {policy.action_dim} "
             f"numbers; the run's clips have {clips.image_size} and {clips.action_dim}"
         )
 
@@ -155,15 +157,15 @@ def policy_actors(directory: Path, trained: TrainedModel) -> MakeActor:
 
 
 def compare(
-    trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
+    trained: TrainedModel, run: Path, settings: PlanSettings, policies: Mapping[str, Policy] | None = None
 ) -> dict[str, Any]:
-    """Acts in the simulator in every way, and returns success rates and times; also in ``RUN/plan/result.json``.
+    """Acts in the simulator in every way, and returns success rates and times; also in a :func:`folder` of the run.
 
-    Finished episodes are kept in the result, so an interrupted comparison goes on where it was.
+    Finished episodes are kept there, so an interrupted comparison goes on where it was.
 
     Args:
         trained: the model of ``run``, which was trained on simulated clips.
-        others: further ways to act, such as a policy.
+        policies: further ways to act, by name.
 
     Raises:
         UserError: the run is of recordings, or something that the energy needs is missing.
@@ -171,12 +173,17 @@ def compare(
     config = trained.config
     if config.data.key:
         raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
+    policies = policies or {}
+    others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
     ways = actors(trained, run, settings, others)
     score_of(
         trained, run, settings, np.zeros((config.sim.image_size,) * 2 + (3,), np.uint8)
     )  # fails before episodes do
-    path, key = run / "plan" / RESULT, _key(trained, run, settings, ways)
-    done = _kept(path, key)
+    judge = saved_judge(run) if settings.energy == "judge" else None
+    used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
+    key = content_key("plan", settings, config.sim, tuple(ways), used)
+    place, validation = folder(run, key), judge.validation if judge else None
+    done = _kept(place / "result.json", key)
     env = LiftEnv(config.sim, settings.max_steps)
     total = settings.episodes * len(ways)
     with Progress("episodes", total, "episodes") as progress:
@@ -185,33 +192,51 @@ def compare(
             for name, make in ways.items():
                 if not any(row["way"] == name and row["seed"] == seed for row in done):
                     goal = _goal(env, seed) if goal is None else goal
-                    done.append(_row(env, name, make(seed, goal), seed))
-                    write_json(path, _summary(done, settings, key))
+                    video = place / f"{name.replace('/', '-')}-{number:02d}.mp4" if number < VIDEOS else None
+                    done.append(_row(env, name, make(seed, goal), seed, video))
+                    write_json(place / "result.json", _summary(done, settings, key, validation))
                 progress.update(len(done))
     env.close()
-    return _summary(done, settings, key)
+    result = _summary(done, settings, key, validation)
+    write_file(place / "results.md", _markdown(result).encode())
+    return result
+
+
+def folder(run: Path, key: str) -> Path:
+    """Returns the folder of a comparison of that key: ``result.json``, ``results.md`` and videos."""
+    return run / "plan" / key[:8]
 
 
 def table(result: dict[str, Any]) -> Table:
     """Formats a comparison."""
-    out = Table(
-        title=f"success in the simulator, {result['settings']['episodes']} episodes; energy: "
-        f"{result['settings']['energy']}"
-    )
-    for heading in ("way to act", "success", "95 % interval", "steps", "seconds a decision"):
-        out.add_column(heading, justify="left" if heading == "way to act" else "right")
-    for name, way in result["ways"].items():
-        seconds = "–" if way["seconds_per_decision"] is None else f"{way['seconds_per_decision']:.2f}"
-        interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
-        out.add_row(name, f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds)
+    out = Table(title=_title(result))
+    for heading in HEADINGS:
+        out.add_column(heading, justify="left" if heading == HEADINGS[0] else "right")
+    for row in _cells(result):
+        out.add_row(*row)
     return out
 
 
-def _key(trained: TrainedModel, run: Path, settings: PlanSettings, ways: dict[str, MakeActor]) -> str:
-    """Returns the key of what episodes depend on: settings, ways to act, the world model and, if used, the judge."""
-    judge = (run / FOLDER / FILE).read_bytes() if settings.energy == "judge" else b""
-    model = Run(trained.config, run, Path("data")).keys()["world_model"]
-    return content_key("plan", settings, sorted(ways), model, zlib.crc32(judge))
+def _markdown(result: dict[str, Any]) -> str:
+    rows = [list(HEADINGS), ["---"] * len(HEADINGS), *_cells(result)]
+    lines = [_title(result), "", *(f"| {' | '.join(row)} |" for row in rows)]
+    judge = markdown(result["judge"]) if result["settings"]["energy"] == "judge" else []
+    return "\n".join([*lines, *judge, ""])
+
+
+def _title(result: dict[str, Any]) -> str:
+    settings = result["settings"]
+    return f"success in the simulator, {settings['episodes']} episodes; energy: {settings['energy']}"
+
+
+def _cells(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for name, way in result["ways"].items():
+        seconds = "–" if way["seconds_per_decision"] is None else f"{way['seconds_per_decision']:.2f}"
+        interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
+        numbers = [f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds, str(way["clipped"])]
+        rows.append([name, *numbers])
+    return rows
 
 
 def _goal(env: LiftEnv, seed: int) -> UInt8[np.ndarray, "S S 3"]:
@@ -221,19 +246,24 @@ def _goal(env: LiftEnv, seed: int) -> UInt8[np.ndarray, "S S 3"]:
     return last
 
 
-def _row(env: LiftEnv, name: str, act: Actor, seed: int) -> dict[str, Any]:
+def _row(env: LiftEnv, name: str, act: Actor, seed: int, video: Path | None) -> dict[str, Any]:
     episode: Episode = run_episode(env, act, seed)
+    if video:
+        write_mp4(video, episode.rgb, FPS, 4)
     seconds = act.seconds[1:] or act.seconds if isinstance(act, PlanningActor) else []  # the first one compiles
     return {
         "way": name,
         "seed": seed,
         "success": bool(episode.success.any()),
         "steps": len(episode.rgb) - 1,
+        "clipped": episode.clipped,
         "seconds_per_decision": float(np.median(seconds)) if seconds else None,
     }
 
 
-def _summary(rows: list[dict[str, Any]], settings: PlanSettings, key: str) -> dict[str, Any]:
+def _summary(
+    rows: list[dict[str, Any]], settings: PlanSettings, key: str, validation: dict[str, Any] | None
+) -> dict[str, Any]:
     ways = {}
     for name in dict.fromkeys(row["way"] for row in rows):
         of = [row for row in rows if row["way"] == name]
@@ -242,9 +272,16 @@ def _summary(rows: list[dict[str, Any]], settings: PlanSettings, key: str) -> di
             **wilson(sum(row["success"] for row in of), len(of)).flat("success"),
             "episodes": len(of),
             "steps": float(np.mean([row["steps"] for row in of])),
+            "clipped": sum(row["clipped"] for row in of),
             "seconds_per_decision": float(np.median(seconds)) if seconds else None,
         }
-    return {"key": key, "settings": asdict(settings), "ways": ways, "episodes": rows}
+    return {
+        "key": key,
+        "settings": asdict(settings),
+        "judge": summary(validation),
+        "ways": ways,
+        "episodes": rows,
+    }
 
 
 def _kept(path: Path, key: str) -> list[dict[str, Any]]:

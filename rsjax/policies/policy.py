@@ -5,7 +5,7 @@ Axes: B episodes, O observed frames, S×S pixels, H controls of a plan, D number
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.config import ConfigError, LoopConfig, from_dict, to_dict
+from rsjax.config import ConfigError, LoopConfig, content_key, from_dict, to_dict
 from rsjax.config.policy import PolicyConfig
 from rsjax.errors import UserError
 from rsjax.files import read_json, write_json
 from rsjax.policies.diffusion_policy import DiffusionPolicy, Range
+from rsjax.policies.keys import arrays_key
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights, save_weights
 
@@ -37,6 +38,12 @@ class Policy:
     def action_dim(self) -> int:
         """A, numbers of an action of a clip."""
         return self.model.controls * self.model.width
+
+    @cached_property
+    def key(self) -> str:
+        """Changes with everything that actions depend on: weights, range and settings, those of training excepted."""
+        model = replace(self.model, config=replace(self.model.config, train=LoopConfig()))
+        return content_key("policy", str(model), str(self.range), arrays_key(self.params))
 
     def actor(self, seed: int = 0) -> "Actor":
         """Returns what acts in new episodes; its draws follow from the seed."""

@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from rsjax.clip import Video
+from rsjax.config import content_key
 from rsjax.policies.actions import checked_actions
+from rsjax.policies.keys import arrays_key, judge_key, model_key
 from rsjax.policies.simulator import UNIT, Episode
-from rsjax.policies.verdicts import SUCCESS, Judge, last_frames
+from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
 
 Acts = Callable[[UInt8[np.ndarray, "B S S 3"]], Float32[np.ndarray, "B A"]]
 FIRST_SEED = 2**31  # of the test episodes: collections draw theirs from anywhere, few of which will be these
@@ -29,6 +31,7 @@ class Seen:
         success: (B,), whether the task is done, by the world's own judgement.
         actions: (B, A), what was done to get here, after clipping.
         clipped: (B,), numbers of these actions that were clipped.
+        uninterpretable: (B,), whether the judge can say nothing of it; None without a judge.
     """
 
     rgb: UInt8[np.ndarray, "B S S 3"]
@@ -36,6 +39,7 @@ class Seen:
     success: Bool[np.ndarray, " B"]
     actions: Float32[np.ndarray, "B A"]
     clipped: np.ndarray
+    uninterpretable: Bool[np.ndarray, " B"] | None = None
 
 
 class World(Protocol):
@@ -43,6 +47,16 @@ class World(Protocol):
 
     @property
     def count(self) -> int: ...
+
+    @property
+    def key(self) -> str:
+        """Changes with all that success depends on beside policy and starts: the simulator, or model and judge."""
+        ...
+
+    @property
+    def validation(self) -> dict[str, Any] | None:
+        """The validation of the judge that looks at episodes, if there is one and it was validated."""
+        ...
 
     def restart(self, starts: Sequence[Any]) -> Seen:
         """Begins an episode from each start, at most ``count``."""
@@ -58,10 +72,13 @@ class Simulated:
 
     Args:
         envs: environments like :class:`rsjax.policies.simulator.LiftEnv`.
+        key: of their settings.
     """
 
-    def __init__(self, envs: Sequence[Any]) -> None:
-        self._envs = list(envs)
+    validation = None
+
+    def __init__(self, envs: Sequence[Any], key: str = "simulator") -> None:
+        self._envs, self.key = list(envs), key
         self._last: list[tuple[Any, dict[str, Any]]] = []
 
     @property
@@ -103,6 +120,8 @@ class Imagined:
     def __init__(self, trained: Any, count: int, judge: Judge, low: np.ndarray, high: np.ndarray) -> None:
         self._imagination = trained.model.imagine(trained.params, trained.assets, count)
         self._count, self._judge, self._low, self._high = count, judge, low, high
+        self.key = content_key("imagined", model_key(trained), judge_key(judge), arrays_key(low, high))
+        self.validation = getattr(judge, "validation", None)
 
     @property
     def count(self) -> int:
@@ -130,8 +149,9 @@ class Imagined:
         alive = slice(self._alive)
         verdict = self._judge(last_frames(self._frames))
         depth = None if video.depth is None else np.asarray(video.depth)[alive, -1]
-        success = verdict.argmax(-1)[alive] == SUCCESS
-        return Seen(np.asarray(video.rgb)[alive, -1], depth, success, done[alive], clipped[alive])
+        label = verdict.argmax(-1)[alive]
+        rgb, spoilt = np.asarray(video.rgb)[alive, -1], label == UNINTERPRETABLE
+        return Seen(rgb, depth, label == SUCCESS, done[alive], clipped[alive], spoilt)
 
 
 @dataclass(frozen=True)
@@ -168,6 +188,7 @@ def _episode(history: list[Seen], number: int, end: int) -> Episode:
         np.stack([seen.actions[number] for seen in mine]),
         np.array([seen.success[number] for seen in mine]),
         int(sum(seen.clipped[number] for seen in mine)),
+        bool(mine[-1].uninterpretable is not None and mine[-1].uninterpretable[number]),
     )
 
 

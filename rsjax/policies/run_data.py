@@ -10,6 +10,7 @@ from rsjax.config.policy import PolicyConfig, policy_preset
 from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
+from rsjax.models.base import WorldModel, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
@@ -73,6 +74,26 @@ class RunData:
         """
         low, high, _ = action_range(self.config, self.trained.assets.normalization)
         return Imagined(self.trained, count, self.judge(judge), low, high)
+
+    def check_world(self, like: "RunData") -> None:
+        """Checks, without loading weights, that policies can act in the run's model, on clips like another run's.
+
+        Raises:
+            UserError: it is unfinished, its family cannot generate frame by frame, or frames or actions differ.
+        """
+        shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
+        if type(create_model(self.config)).imagine is WorldModel.imagine:
+            raise UserError(
+                f"{self.run}: a model of family {self.config.model.family!r} cannot generate frame by frame, so no "
+                f"policy can act in it; leave this run out"
+            )
+        if shapes[0] != shapes[1]:
+            raise UserError(
+                f"{self.run}: frames of {shapes[0][0]} pixels and actions of {shapes[0][1]} numbers, {like.run} has "
+                f"{shapes[1][0]} and {shapes[1][1]}; compare runs on the same clips"
+            )
+        if not (self.run / "world_model" / "weights").exists():
+            raise UserError(f"{self.run}: its world model is not trained yet; the train command of this run goes on")
 
     def judge(self, folder: Path | None = None) -> Judge:
         """Returns the run's judge, or the one in another folder.

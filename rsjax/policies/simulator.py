@@ -150,6 +150,7 @@ class Episode:
         actions: row t led into frame t, row 0 is zeros, as in clips.
         success: whether the task was done at each frame.
         clipped: numbers of the actions that were clipped to their range.
+        uninterpretable: whether a judge can say nothing of the last frame.
     """
 
     rgb: UInt8[np.ndarray, "T S S 3"]
@@ -157,6 +158,7 @@ class Episode:
     actions: Float32[np.ndarray, "T A"]
     success: Bool[np.ndarray, " T"]
     clipped: int
+    uninterpretable: bool = False
 
 
 def run_episode(env: gymnasium.Env[Any, Any], act: Actor, seed: int, options: dict[str, Any] | None = None) -> Episode:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from rsjax.config import content_key
 from rsjax.data.build import write_clips
@@ -22,7 +22,9 @@ from rsjax.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.files import disk_guard, making, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.policies.demos import Only, controls_of
-from rsjax.policies.verdicts import SUCCESS, Judge, last_frames
+from rsjax.policies.judge_validation import summary
+from rsjax.policies.keys import arrays_key, judge_key, model_key
+from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
 
 MARK = "synthesis.json"
 CLIPS = "clips"  # folder of the store
@@ -75,17 +77,22 @@ def synthesize(
         report: called with (demonstrations done, demonstrations in all).
 
     Returns:
-        The content of ``out/synthesis.json``: ``demos``, ``clipped`` (numbers of actions), ``success`` (how many the
-        judge calls one at their end, None without), the options and the sources.
+        The content of ``out/synthesis.json``: ``demos``, ``clipped`` (numbers of actions), ``success`` and
+        ``uninterpretable`` (how many the judge calls that at their end, None without), ``judge`` (its validation, if
+        it has one), the options and the sources.
 
     Raises:
         UserError: the data set has no clip to begin with, does not fit the model, or ``out`` holds other clips.
     """
-    key = content_key(3, str(trained.config), str(store.manifest.get("key")), str(asdict(options)), bool(judge))
+    inputs = (model_key(trained), judge_key(judge), arrays_key(limits))
+    key = content_key(4, *inputs, str(store.manifest.get("key")), str(asdict(options)))
     if (out / MARK).exists():
         mark = read_json(out / MARK, cure=f"delete {out}")
         if mark.get("key") != key:
-            raise UserError(f"{out}: holds demonstrations of other settings; choose another --out, or delete it")
+            raise UserError(
+                f"{out}: holds demonstrations of other settings, another model or judge, or an older version of rsjax; "
+                f"choose another --out, or delete it"
+            )
         return mark
     partial = out / "partial"
     with disk_guard(out), making(out, wait=False):
@@ -99,7 +106,7 @@ def synthesize(
             if place.exists():  # of an attempt that ended before its mark
                 shutil.rmtree(place)
             export_lerobot(clips, place, LeRobotOptions(version))
-        mark = {"key": key, **asdict(options), **_summary(clips, judge is not None)}
+        mark = {"key": key, **asdict(options), **_summary(clips, judge)}
         write_json(out / MARK, mark)
         shutil.rmtree(partial)
     return mark
@@ -153,7 +160,7 @@ def _generated(
     actions = np.stack([actions for actions, _ in noisy])
     index = np.array(numbers)[rows] + options.seed % 2**11 * 2**20
     video = trained.model.generate(trained.params, trained.assets, prompt[rows], actions[rows], index=index)
-    success = None if judge is None else judged(video.rgb[: len(clips)], judge)
+    found = None if judge is None else labels(video.rgb[: len(clips)], judge)
     for row, (clip, number, (taken, clipped)) in enumerate(zip(clips, numbers, noisy, strict=True)):
         made = {
             "rgb": np.asarray(video.rgb[row]),
@@ -163,8 +170,8 @@ def _generated(
         }
         if video.depth is not None and not np.isnan(video.depth[row]).any():
             made["depth"] = np.maximum(np.asarray(video.depth[row], np.float32), 1e-3)
-        if success is not None:
-            made["success"] = success[row]
+        if found is not None:
+            made["success"] = found[row] == SUCCESS
         if rate := frame_rate(clip, store.manifest):
             made["fps"] = rate
         origin = clip["provenance"]
@@ -175,6 +182,7 @@ def _generated(
             "noise": options.noise,
             "seed": options.seed,
             "clipped": clipped,
+            "uninterpretable": None if found is None else bool(found[row, -1] == UNINTERPRETABLE),
             "camera": str(origin.get("camera") or "image"),
             "control_steps": controls_of(clip, store.manifest),
         }
@@ -224,10 +232,9 @@ def perturb(
     return taken, int((taken[1:] != noisy[1:]).sum())
 
 
-def judged(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Bool[np.ndarray, "B T"]:
-    """Returns whether the judge sees success at each frame."""
-    labels = [judge(last_frames(rgb[:, : frame + 1])).argmax(-1) for frame in range(rgb.shape[1])]
-    return np.stack(labels, 1) == SUCCESS
+def labels(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Int[np.ndarray, "B T"]:
+    """Returns the number of the judge's label of each frame."""
+    return np.stack([judge(last_frames(rgb[:, : frame + 1])).argmax(-1) for frame in range(rgb.shape[1])], 1)
 
 
 def _file(folder: Path, number: int) -> Path:
@@ -238,12 +245,14 @@ def _records(folder: Path, count: int) -> Iterator[Record]:
     return (decode(_file(folder, number).read_bytes()) for number in range(count))
 
 
-def _summary(clips: Store, scored: bool) -> dict[str, Any]:
+def _summary(clips: Store, judge: Judge | None) -> dict[str, Any]:
     made = [clip for _, clip in readable(clips.source("train"))]
     origins = [clip["provenance"] for clip in made]
     return {
         "clipped": sum(origin["clipped"] for origin in origins),
-        "success": sum(bool(clip["success"][-1]) for clip in made) if scored else None,
+        "success": None if judge is None else sum(bool(clip["success"][-1]) for clip in made),
+        "uninterpretable": None if judge is None else sum(origin["uninterpretable"] for origin in origins),
+        "judge": summary(getattr(judge, "validation", None)),
         "sources": len({str(origin["from"]["episode"]) for origin in origins}),
         "from": origins[0]["from"]["key"],
         "manifest": str(clips.path / MANIFEST),

@@ -15,6 +15,7 @@ from rsjax.errors import UserError
 from rsjax.files import read_json, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.diffusion_policy import DiffusionPolicy, Range, Windows
+from rsjax.policies.keys import arrays_key
 from rsjax.policies.policy import Policy, load_policy
 from rsjax.training.loop import Monitor, fit
 
@@ -48,10 +49,9 @@ def train_policy(
     model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
     span = start.range if start else demos.range
     loop = replace(config.train, seed=seed)
-    key = content_key(
-        replace(config, train=loop), *map(_content, demos.records[:1]), len(demos), str(span), bool(start)
-    )
-    _check(directory, key)
+    before = start.key if start else False
+    key = content_key(replace(config, train=loop), *map(_content, demos.records[:1]), len(demos), str(span), before)
+    _check(directory, {"key": key, "data": arrays_key([(each["rgb"], each["actions"]) for each in demos.records])})
     if (directory / "policy.json").exists():
         return load_policy(directory)
     for stop in (*sorted(set(stops)), loop.steps):
@@ -92,9 +92,9 @@ def _content(record: dict[str, Any]) -> str:
     return f"{record['rgb'].sum(dtype=int)} {record['actions'].sum():.6f}"
 
 
-def _check(directory: Path, key: str) -> None:
+def _check(directory: Path, wanted: dict[str, str]) -> None:
     mark = directory / MARK
     if not mark.exists():
-        write_json(mark, {"key": key})
-    elif read_json(mark, cure=f"delete {directory}").get("key") != key:
+        write_json(mark, wanted)
+    elif wanted | read_json(mark, cure=f"delete {directory}") != wanted:  # an older mark has no "data"
         raise UserError(f"{directory}: holds a policy of other settings or data; choose another directory or delete it")

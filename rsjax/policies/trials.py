@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rsjax.config import SimConfig
+from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import Estimate, wilson
 from rsjax.files import read_json, write_file, write_json
@@ -51,10 +51,17 @@ class Trials:
 
 @dataclass
 class Result:
-    """What came of a policy's trials: success by episode, and numbers of actions that were clipped."""
+    """What came of a policy's trials.
+
+    Attributes:
+        success: by episode.
+        clipped: numbers of actions that were clipped.
+        uninterpretable: by episode, whether the judge can say nothing of its last frame; False in the simulator.
+    """
 
     success: list[bool] = field(default_factory=list)
     clipped: int = 0
+    uninterpretable: list[bool] = field(default_factory=list)
 
     @property
     def share(self) -> Estimate:
@@ -77,17 +84,18 @@ def try_policy(
         folder: of ``success.json``, which grows as episodes end, and of a few videos.
         name: for the progress line.
         see: called with the number and the episode of each that is run now.
+
+    Raises:
+        UserError: the result in ``folder`` is of other trials, another policy, or another world or judge.
     """
     file = folder / "success.json"
-    kept: dict[str, Any] = read_json(file, cure=f"delete {file}") if file.exists() else {"success": [], "clipped": 0}
-    settings = [len(starts), trials.max_steps, trials.together]
-    if kept.setdefault("trials", settings) != settings:
-        raise UserError(f"{file}: is of (episodes, steps, together) {kept['trials']}, not {settings}; delete it")
+    kept = _kept(file, [len(starts), trials.max_steps, trials.together], content_key(policy.key, world.key))
     begins = len(kept["success"])
     with Progress(f"{name}: trials", len(starts), "episodes", begins) as progress:
 
         def keep(number: int, episode: Episode) -> None:
             kept["success"].append(bool(episode.success.any()))
+            kept["uninterpretable"].append(bool(episode.uninterpretable))
             kept["clipped"] += episode.clipped
             if begins + number < trials.videos:
                 write_mp4(folder / f"episode-{begins + number:02d}.mp4", episode.rgb, FPS, 4)
@@ -99,7 +107,22 @@ def try_policy(
 
         # Draws depend on an episode's group, which begins at a multiple of ``together``.
         run_all(world, lambda first: policy.actor(begins + first), starts[begins:], trials.max_steps, keep, report)
-    return Result([bool(one) for one in kept["success"]], int(kept["clipped"]))
+    success, spoilt = ([bool(one) for one in kept[name]] for name in ("success", "uninterpretable"))
+    return Result(success, int(kept["clipped"]), spoilt)
+
+
+def _kept(file: Path, settings: list[int], key: str) -> dict[str, Any]:
+    """Returns the content of a file of successes so far, or that of one to begin with."""
+    empty = {"success": [], "uninterpretable": [], "clipped": 0, "trials": settings, "key": key}
+    kept = read_json(file, cure=f"delete {file}") if file.exists() else empty
+    if kept.get("trials") != settings:
+        raise UserError(f"{file}: is of (episodes, steps, together) {kept.get('trials')}, not {settings}; delete it")
+    if kept.get("key") != key:
+        older = "" if "key" in kept else ", or of an older version of rsjax"
+        raise UserError(
+            f"{file}: is of another policy, simulator, world model or judge{older}; choose another --out, or delete it"
+        )
+    return kept
 
 
 @contextmanager
@@ -109,17 +132,17 @@ def lift_simulators(config: SimConfig, trials: Trials) -> Iterator[Simulated]:
     try:
         for _ in range(min(trials.together, trials.episodes)):
             envs.append(LiftEnv(config, max_steps=trials.max_steps))
-        yield Simulated(envs)
+        yield Simulated(envs, content_key("lift", config))
     finally:
         for env in envs:
             env.close()
 
 
 def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFrame]:
-    """Returns the simulator's first frames for these seeds, from a file if it has them."""
+    """Returns the simulator's first frames for these seeds, from a file if it has them of this simulator."""
     if file.exists():
         with np.load(file) as arrays:
-            if arrays["seeds"].tolist() == list(seeds):
+            if arrays["seeds"].tolist() == list(seeds) and "key" in arrays and str(arrays["key"]) == world.key:
                 return _frames(arrays["rgb"], arrays["depth"])
     rgb, depth = [], []
     for first in range(0, len(seeds), world.count):
@@ -127,7 +150,7 @@ def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFr
         rgb.append(seen.rgb)
         depth.append(np.zeros((len(seen.rgb), 0)) if seen.depth is None else seen.depth)
     stacked = np.concatenate(rgb), np.concatenate(depth)
-    save_arrays(file, seeds=np.array(seeds), rgb=stacked[0], depth=stacked[1])
+    save_arrays(file, key=np.array(world.key), seeds=np.array(seeds), rgb=stacked[0], depth=stacked[1])
     return _frames(*stacked)
 
 

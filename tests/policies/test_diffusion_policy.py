@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -151,8 +152,14 @@ def test_training_stopped_and_resumed_is_the_same(policy: tuple[Policy, Path], t
     assert any(
         not np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (early.params, whole.params)), strict=True)
     )
-    with pytest.raises(UserError, match="holds a policy of other settings or data"):
-        train_policy(toy(), demos(3), directory)
+    assert whole.key == load_policy(directory).key == straight.key != early.key
+    last = Demos((*demos(3).records, demos(5).records[4]), CONTROLS)
+    for others, start in ((demos(3), None), (last, None), (demos(), early)):
+        with pytest.raises(UserError, match="holds a policy of other settings or data"):
+            train_policy(toy(), others, directory, start=start)
+    mark = tmp_path / "straight" / "training.json"
+    mark.write_text(json.dumps({"key": json.loads(mark.read_text())["key"]}))
+    assert train_policy(toy(), demos(), tmp_path / "straight").key == whole.key  # an older mark will do
 
 
 def test_going_on_from_a_policy_starts_with_its_weights(

@@ -18,6 +18,7 @@ from rsjax.policies.run_data import named
 from rsjax.policies.trials import Trials, first_frames
 from tests.policies.toy import demos
 from tests.policies.worlds import ToyPolicy, imagined, simulated
+from tests.policies.worlds import judge as toy_judge
 
 TRIALS = Trials(episodes=10, max_steps=4, together=5, videos=1)  # the dot begins in columns 3 … 4, 0 … 4, 0 … 2
 
@@ -83,8 +84,41 @@ def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
     text = (tmp_path / "results.md").read_text()
     assert "| true | 1.000 |" in text and "| speed-1.0 | the simulator | 60 % |" in text
     assert (tmp_path / "scatter.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "results.json").read_text()) == results
     again = compare(policies, simulated(5), {}, TRIALS, tmp_path)  # nothing is run again
     assert again["runs"] == []
+
+
+def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_path: Path) -> None:
+    def blind(frames: np.ndarray) -> np.ndarray:
+        """Finds frames with the dot in column 5 or farther uninterpretable, and the others no success."""
+        far = frames[:, -1, 7, :, 0].argmax(-1) >= 5
+        return np.stack([np.zeros_like(far), ~far, far], -1).astype(float)
+
+    policies: Any = {"a": ToyPolicy(0.8), "b": ToyPolicy(0.8)}
+    compare(policies, simulated(5), {"run": lambda: imagined(5)}, TRIALS, tmp_path)
+    for world in (imagined(5, judge=blind), imagined(5, pace=0.5)):
+        with pytest.raises(
+            UserError, match=r"run/a/success.json: is of another policy, simulator, world model or judge"
+        ):
+            compare(policies, simulated(5), {"run": lambda world=world: world}, TRIALS, tmp_path)  # type: ignore[misc]
+    with pytest.raises(UserError, match=r"simulator/b/success.json: is of another policy"):
+        compare({**policies, "b": ToyPolicy(0.9)}, simulated(5), {}, TRIALS, tmp_path)  # type: ignore[dict-item]
+    file = tmp_path / "simulator" / "a" / "success.json"
+    file.write_text(json.dumps({"success": [], "clipped": 0, "trials": [10, 4, 5]}))
+    with pytest.raises(UserError, match=r"or of an older version of rsjax; choose another --out, or delete it"):
+        compare(policies, simulated(5), {}, TRIALS, tmp_path)
+
+    results = compare(policies, simulated(5), {"run": lambda: imagined(5, judge=blind)}, TRIALS, tmp_path / "new")
+    (row,) = results["runs"]
+    assert row["uninterpretable"] == 1 and not any(row["policies"]["a"]["world_model"])
+    assert row["pearson"]["value"] is None and row["policies"]["a"]["clipped"] == {"simulator": 0, "world_model": 0}
+    text = (tmp_path / "new" / "results.json").read_text()
+    assert "NaN" not in text and json.loads(text) == results
+    table = (tmp_path / "new" / "results.md").read_text()
+    assert "| run | – | no variation | – |" in table and "| a | run | 0 % | 0 … 28 % | 100 % | 0 |" in table
+    assert "The judge has no validation.json" in table
+    assert toy_judge.__qualname__ == "judge"  # the keys of functions are their names
 
 
 def test_checkpoints_go_from_the_first_steps_to_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,9 +166,12 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
         > np.mean(results["before"])
         == np.mean(results["rounds"][-1]["control"])
     )
-    assert "| 2 | 10 | 4 | imagined | 60 % |" in (tmp_path / "results.md").read_text()
+    assert "| 2 | 10 | 4 | 0 % | imagined | 60 % |" in (tmp_path / "results.md").read_text()
     count = len(draws)
     assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
+    other = imagined(5, pace=0.5)  # a model of other weights imagines anew
+    made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1")
+    assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(other._imagination.draws) == 2
 
 
 def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:

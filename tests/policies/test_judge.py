@@ -1,3 +1,5 @@
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -9,7 +11,7 @@ from rsjax.errors import UserError
 from rsjax.policies import judging
 from rsjax.policies.env import WorldModelEnv
 from rsjax.policies.judge import Footage, Network, TrainedJudge, load_judge, spoilt, train_judge
-from rsjax.policies.judge_validation import scores, table, validate
+from rsjax.policies.judge_validation import markdown, scores, summary, table, validate
 from rsjax.policies.other_judges import HumanJudge, LanguageJudge, answer_label, write_blinded
 from rsjax.policies.verdicts import HISTORY, LABELS, SUCCESS, last_frames
 from tests.pipeline import toy
@@ -39,12 +41,21 @@ def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: Traine
     assert np.sum(result["confusion"]) == 2 * 20 * 5
     assert all(result[f"{label}_found"][0] > 0.6 for label in LABELS), result
     assert table({"clips": 20, "raw": result}).row_count == 3
+    facts = summary({"clips": 20, "raw": result})
+    assert facts is not None and facts["raw"]["confusion"] == result["confusion"] and "bins" not in facts["raw"]
+    cells = [" / ".join(map(str, row)) for row in result["confusion"]]
+    assert f"| raw | {' | '.join(cells)} | {100 * result['right'][0]:.1f} % |" in markdown(facts)[-1]
 
 
 def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudge, tmp_path: Path) -> None:
     judge.save(tmp_path / "judge")
     frames = footage(2, 3).rgb
     np.testing.assert_array_equal(load_judge(tmp_path / "judge")(frames), judge(frames))
+    assert load_judge(tmp_path / "judge").key == judge.key != replace(judge, temperature=3.0).key
+    report = tmp_path / "judge" / "validation.json"
+    for name, known in ((judge.key, True), ("another", False)):
+        report.write_text(json.dumps({"judge": name}))
+        assert (load_judge(tmp_path / "judge").validation is not None) == known
     np.testing.assert_allclose(judge(frames).sum(-1), 1, rtol=1e-5)
     np.testing.assert_array_equal(judge(frames), judge(frames[:, -HISTORY:]))
     with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
@@ -103,7 +114,7 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
         "generated": toy.TEST * 5,
     }
     loaded = judging.saved_judge(run)
-    assert (run / "judge" / "validation.json").exists()
+    assert loaded.validation == json.loads((run / "judge" / "validation.json").read_text()) and loaded.validation
     assert judging.judge_of(run, "run").temperature == loaded.temperature  # type: ignore[union-attr]
     assert judging.judge_of(tmp_path, "run") is None
 

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.policies import planning
 from rsjax.policies.energies import Seen, imagined, judged, pixel_distance, token_distance
 from rsjax.policies.planner import Planner, PlannerConfig, search
-from rsjax.policies.planning import PlanSettings, compare, table
+from rsjax.policies.planning import PlanSettings, compare, folder, table
 from rsjax.policies.verdicts import HISTORY
 from tests.models.toy_family import ToyConfig
 from tests.pipeline import toy
@@ -136,10 +137,21 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
     assert result["ways"]["cem"]["seconds_per_decision"] > 0
     assert result["ways"]["cem"]["episodes"] == 3 and result["ways"]["random"]["success_high"] > 0.3
     assert table(result).row_count == 4
-    saved = (tmp_path / "plan" / "result.json").read_text()
+    place = folder(tmp_path, result["key"])
+    saved = (place / "result.json").read_text()
+    assert "| cem | 100% |" in (place / "results.md").read_text()
+    assert {path.name for path in place.glob("*.mp4")} == {f"{way}-{n:02d}.mp4" for way in ways for n in range(3)}
+    one = replace(settings, methods=(), episodes=1)
+    for number in range(2):  # another policy has another folder
+        policy: Any = SimpleNamespace(action_dim=28, model=SimpleNamespace(image_size=64), key=str(number))
+        policy.actor = lambda seed: lambda frames: np.ones((1, 28), np.float32)
+        other = compare(model, tmp_path, one, {"policy a/b": policy})
+        assert other["ways"]["policy a/b"]["success"] == 1
+        assert (folder(tmp_path, other["key"]) / "policy a-b-00.mp4").exists()
+        assert len(list((tmp_path / "plan").iterdir())) == 2 + number
     monkeypatch.setattr(planning, "LiftEnv", lambda *_: FakeLift(None, 0))  # it would fail
     assert compare(model, tmp_path, settings) == result
-    assert (tmp_path / "plan" / "result.json").read_text() == saved
+    assert (place / "result.json").read_text() == saved
     with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
         compare(model, tmp_path, replace(settings, energy="judge"))
     with pytest.raises(ConfigError, match="needs lpips_weights"):

@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,10 @@ def test_actions_out_of_range_are_clipped_and_counted(kind: str) -> None:
 def test_the_worlds_begin_with_the_same_frames(tmp_path: Path) -> None:
     world, model = simulated(2), imagined(2)
     found = first_frames(world, STARTS, tmp_path / "starts.npz")
-    again = first_frames(None, STARTS, tmp_path / "starts.npz")  # type: ignore[arg-type]
+    kept: Any = SimpleNamespace(key=world.key)  # nothing is rendered again
+    again = first_frames(kept, STARTS, tmp_path / "starts.npz")
+    with pytest.raises(AttributeError, match="count"):  # another simulator would render
+        first_frames(SimpleNamespace(key="another"), STARTS, tmp_path / "starts.npz")  # type: ignore[arg-type]
     for one, other, place in zip(found, again, STARTS, strict=True):
         np.testing.assert_array_equal(one.rgb, picture(place))
         np.testing.assert_array_equal(one.rgb, other.rgb)

@@ -23,7 +23,7 @@ from tests.policies.worlds import judge
 LIMITS = (np.full(CONTROLS * WIDTH, -1.0), np.full(CONTROLS * WIDTH, 1.0))
 
 
-def trained(store: Any, fails_at: int = -1) -> Any:
+def trained(store: Any, fails_at: int = -1, weight: float = 1.0) -> Any:
     """A world model in which the dot moves as the actions say; it fails at a call."""
     calls: list[list[int]] = []
 
@@ -37,10 +37,10 @@ def trained(store: Any, fails_at: int = -1) -> Any:
         rgb = np.stack([[picture(place) for place in row] for row in np.rint(places)])
         return Video(rgb, np.full(rgb.shape[:-1], 0.5, np.float32))
 
-    config = SimpleNamespace(prompt_frames=1, model=SimpleNamespace(family="toy"))
-    assets = SimpleNamespace(normalization=Normalization.create(store))
+    config = SimpleNamespace(prompt_frames=1, clips=None, tokenizer=None, model=SimpleNamespace(family="toy"))
+    assets = SimpleNamespace(normalization=Normalization.create(store), tokenizer=None)
     return SimpleNamespace(
-        config=config, model=SimpleNamespace(generate=generate), params=None, assets=assets, calls=calls
+        config=config, model=SimpleNamespace(generate=generate), params={"w": weight}, assets=assets, calls=calls
     )
 
 
@@ -94,6 +94,9 @@ def test_an_interrupted_synthesis_resumes(tmp_path: Path, store: Any, monkeypatc
     assert synthesize(rest, store, tmp_path / "cut", options, LIMITS) == mark and len(rest.calls) == 1
     with pytest.raises(UserError, match="holds demonstrations of other settings"):
         synthesize(rest, store, tmp_path / "cut", replace(options, noise=0.1), LIMITS)
+    for other, arbiter in ((trained(store), judge), (trained(store, weight=2.0), None)):
+        with pytest.raises(UserError, match="another model or judge"):
+            synthesize(other, store, tmp_path / "cut", options, LIMITS, judge=arbiter)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 3))
@@ -117,6 +120,6 @@ def test_what_cannot_be_made_is_named(tmp_path: Path, store: Any) -> None:
     with pytest.raises(UserError, match="--demos 0"):
         Synthesis(demos=0)
     other = trained(store)
-    other.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None))
+    other.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None), tokenizer=None)
     with pytest.raises(UserError, match="actions of 6 numbers, the model takes 7"):
         synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)

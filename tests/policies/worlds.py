@@ -62,6 +62,10 @@ class ToyPolicy:
         row[:, 0] = self.speed
         return lambda frames: np.repeat(row.reshape(1, -1), len(frames), 0)
 
+    @property
+    def key(self) -> str:
+        return f"speed {self.speed}"
+
     def save(self, directory: Path) -> None:
         write_json(directory / "policy.json", {"speed": self.speed})
 
@@ -90,11 +94,13 @@ def judge(frames: np.ndarray) -> np.ndarray:
     return np.stack([done, ~done, np.zeros_like(done)], -1).astype(float)
 
 
-def imagined(count: int, pace: float = 1.0) -> Imagined:
+def imagined(count: int, pace: float = 1.0, judge: Any = judge) -> Imagined:
     """A world of ``count`` imagined episodes."""
     imagination = ToyImagination(pace, count)
     model = SimpleNamespace(imagine=lambda params, assets, count: imagination)
-    trained = SimpleNamespace(model=model, params=None, assets=None)
+    config = SimpleNamespace(prompt_frames=1, clips=None, tokenizer=None, model=None)
+    assets = SimpleNamespace(normalization=None, tokenizer=None)
+    trained = SimpleNamespace(config=config, model=model, params={"pace": pace}, assets=assets)
     low = np.full(CONTROLS * WIDTH, -RANGE, np.float32)
     return Imagined(trained, count, judge, low, -low)
 
