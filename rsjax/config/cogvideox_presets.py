@@ -25,7 +25,7 @@ def _cogvideox(name: str, model: CogVideoXConfig) -> Config:
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
-        tokenizer_train=TokenizerTrainConfig(steps=0, start_from="cogvideox"),
+        tokenizer_train=TokenizerTrainConfig(steps=0, start_from="cogvideox", frames_per_clip=16),
         model=replace(
             model,
             autoencoder=CausalVAEConfig(),

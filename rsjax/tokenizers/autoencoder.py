@@ -84,5 +84,9 @@ class Autoencoder(Trainable[B], Protocol[B]):
         return saved
 
     def flops(self) -> dict[str, int]:
-        """Returns floating-point operations per frame, "encoder" and "decoder"; empty if there are no counts."""
+        """Returns floating-point operations of one pass, "encoder" and "decoder"; empty if there are no counts.
+
+        They are those of a frame; where frames are encoded together, of a training clip divided by its
+        ``tokenizer_train.frames_per_clip``.
+        """
         return {}

@@ -1,16 +1,21 @@
-"""Floating-point operations of the tokenizer, counted from its kernels: 2 per weight and output position.
+"""Floating-point operations of autoencoders: of the tokenizer by formula, of the others in the traced program.
 
-Norms, activations and the quantiser are left out. Convolutions count padding like pixels, as libraries do.
+The formula counts 2 per weight of a kernel and output position. Norms, activations and the quantiser are left out.
+Convolutions count padding like pixels, as libraries do.
 """
 
 import math
 import re
+from collections.abc import Callable
+from typing import Any
 
 import jax
 from flax.traverse_util import flatten_dict
+from jax.extend.core import jaxprs_in_params
 
 from rsjax.config import TokenizerConfig
 from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
 
 
 def tokenizer_flops(config: TokenizerConfig, image_size: int) -> dict[str, int]:
@@ -32,3 +37,34 @@ def _positions(config: TokenizerConfig, image_size: int, half: str, module: str)
         return (size // 2 ** (int(level[2]) + module.endswith("downsample"))) ** 2
     at_full_size = {"encoder": "conv_in", "decoder": "conv_out"}[half]
     return size**2 if module == at_full_size else config.grid(image_size) ** 2
+
+
+def traced_flops(
+    params: Params, frames: tuple[int, ...], encode: Callable[..., Any], decode: Callable[..., Any]
+) -> dict[str, int]:
+    """Returns the operations of both halves of any autoencoder, the "encoder" and the "decoder".
+
+    Args:
+        params: their shapes.
+        frames: the shape of what is encoded, float32.
+        encode: from parameters and frames to latents or tokens.
+        decode: from parameters and what ``encode`` returns to frames.
+    """
+    pixels = jax.ShapeDtypeStruct(frames, "float32")
+    halves = {"encoder": (encode, pixels), "decoder": (decode, jax.eval_shape(encode, params, pixels))}
+    return {name: products(jax.make_jaxpr(run)(params, x).jaxpr) for name, (run, x) in halves.items()}
+
+
+def products(jaxpr: Any) -> int:
+    """Returns the operations of the products and convolutions in a program, those of a scan as often as it turns."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "dot_general":
+            (contracted, _), _ = eqn.params["dimension_numbers"]
+            total += 2 * eqn.outvars[0].aval.size * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+        elif eqn.primitive.name == "conv_general_dilated":
+            kernel, spec = eqn.invars[1].aval, eqn.params["dimension_numbers"].rhs_spec
+            total += 2 * eqn.outvars[0].aval.size * kernel.size // kernel.shape[spec[0]]
+        turns = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
+        total += turns * sum(products(inner) for inner in jaxprs_in_params(eqn.params))
+    return total

@@ -29,6 +29,7 @@ from rsjax.models.saved import check_alike, read_model
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
 from rsjax.tokenizers.training import lpips_weights
@@ -109,6 +110,16 @@ class CausalVAETraining(Autoencoder[Batch]):
 
     def codec(self, params: Params, normalization: Normalization) -> "CausalCodec":
         return CausalCodec(self.config, params)
+
+    def flops(self) -> dict[str, int]:
+        count = self.train.frames_per_clip
+        frames = (1, padded_frames(count), self.image_size, self.image_size, 3)
+
+        def encode(params: Params, frames: Any) -> Array:
+            return distributions.posterior(vae.encode(self.config, params, frames))[0]
+
+        whole = traced_flops(self.shapes(), frames, encode, partial(vae.decode, self.config))
+        return {half: number // count for half, number in whole.items()}
 
     def pretrained_shapes(self, directory: Path) -> Params:
         """Returns the shapes of saved weights.

@@ -28,6 +28,7 @@ from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
 from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights
@@ -119,6 +120,14 @@ class KLTraining(Autoencoder[Batch]):
 
     def codec(self, params: Params, normalization: Normalization) -> "KLCodec":
         return KLCodec(self.config, params)
+
+    def flops(self) -> dict[str, int]:
+        def encode(params: Params, images: Images) -> Latents:
+            return posterior(self.config, params, images)[0]
+
+        return traced_flops(
+            self.shapes(), (1, self.image_size, self.image_size, 3), encode, partial(decode, self.config)
+        )
 
     def pretrained_shapes(self, directory: Path) -> Params:
         saved = pretrained.check_autoencoder(directory, self.config)

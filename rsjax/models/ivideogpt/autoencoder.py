@@ -26,6 +26,7 @@ from rsjax.errors import UserError
 from rsjax.models.ivideogpt.networks import ConditionalVQ, Reconstruction
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.training import lpips_weights
 from rsjax.trainable import Extra, Params, StepContext, Term
@@ -102,6 +103,18 @@ class ConditionalVQTraining(Autoencoder[Batch]):
 
     def codec(self, params: Params, normalization: Normalization) -> "ConditionalCodec":
         return ConditionalCodec(self.config, params)
+
+    def flops(self) -> dict[str, int]:
+        count, network = self.train.frames_per_clip, ConditionalVQ(self.config)
+
+        def encode(params: Params, frames: Any) -> Any:
+            return network.apply({"params": params}, frames, method="encode")
+
+        def decode(params: Params, tokens: Any) -> Any:
+            return network.apply({"params": params}, *tokens, method="decode")
+
+        whole = traced_flops(self.shapes(), (1, count, self.image_size, self.image_size, 3), encode, decode)
+        return {half: number // count for half, number in whole.items()}
 
     def pretrained_shapes(self, directory: Path) -> Params:
         """Returns the shapes of saved weights, of as many context frames as this network's or of more.

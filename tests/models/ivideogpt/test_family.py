@@ -15,9 +15,9 @@ from rsjax.errors import UserError
 from rsjax.models.ivideogpt.autoencoder import ConditionalVQTraining
 from rsjax.models.ivideogpt.llama import LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
+from rsjax.tokenizers.flops import products
 from tests.models import families
 from tests.models.ivideogpt.toy import random_params
-from tests.tracing import products
 
 
 @pytest.fixture(scope="module")

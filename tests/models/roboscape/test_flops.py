@@ -10,7 +10,7 @@ import pytest
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.transformer import Transformer
-from tests.tracing import products
+from rsjax.tokenizers.flops import products
 
 DUAL = Architecture(frames=5, grid=3, code_bits=8, action_inputs=3, width=32, blocks=3, heads=2)
 

@@ -14,9 +14,9 @@ from rsjax.models import Genie, RoboScape, create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tokenizers.flops import products
 from rsjax.trainable import Params, StepContext
 from tests.models.roboscape.toy import BATCH, RGB, apply, apply_plain, random_inputs, random_params
-from tests.tracing import products
 
 MLP = replace(RGB, action_encoder="mlp")
 ENCODER = {"action_encoder_fc1", "action_encoder_fc2"}
