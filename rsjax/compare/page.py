@@ -3,10 +3,11 @@
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
@@ -16,6 +17,7 @@ from rsjax.errors import UserError
 from rsjax.evaluation.frame_curves import Curves
 from rsjax.evaluation.registry import Footnotes, Metric
 from rsjax.evaluation.results import read_frames
+from rsjax.evaluation.shown import extremes
 from rsjax.files import write_file
 from rsjax.progress import note
 from rsjax.report.curves import Chart, charts_svg
@@ -23,7 +25,6 @@ from rsjax.report.figures import ClipFigure, filmstrip
 from rsjax.report.page import template_environment
 from rsjax.report.video import webp_uri
 
-STRIPS = 3  # clips of either end, worst and best
 LABEL = 18  # letters in a line of a film strip's labels
 COLORS = ("#3b7dd8", "#d9480f", "#3f9a63", "#8f5bd1", "#b8860b", "#c2417c", "#1b8a9c", "#6b7280")
 
@@ -55,6 +56,7 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
         .get_template("compare.html.j2")
         .render(
             title=comparison.title,
+            reference=comparison.reference.name,
             origin=comparison.protocol.get("origin", ""),
             header=header(comparison),
             published=len(comparison.papers),
@@ -72,40 +74,60 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
 
 
 def strips(comparison: Comparison) -> list[ComparedClip]:
-    """Returns the worst and the best clips by the reference's PSNR, of those whose frames were kept; worst first."""
+    """Returns the clips of :func:`_chosen` with the frames of the first run of each group."""
     try:
         kept = [read_frames(group.folders[0]) for group in comparison.groups]
     except UserError as error:
         note(f"no film strips: {error}")
         return []
-    score = np.mean([each.per_clip["psnr"] for each in comparison.reference.group.results], axis=0)
-    rows, first = kept[0]["rows"], comparison.groups[0].results[0]
-    order = np.argsort(score[rows], kind="stable")
-    count = min(STRIPS, len(order) // 2)
-    chosen = [(f"worst {i + 1}", place) for i, place in enumerate(order[:count])]
-    chosen += [(f"best {count - i}", place) for i, place in enumerate(order[len(order) - count :])]
-    prompt = comparison.protocol["prompt_frames"]
-    out = []
-    for rank, place in chosen:
-        truth, number = kept[0]["truth"][place], first.clips[rows[place]]["number"]
-        others = [
-            (_label(g.name), frames["prediction"][place]) for g, frames in zip(comparison.groups, kept, strict=True)
-        ]
+    clips, prompt, out = comparison.groups[0].results[0].clips, comparison.protocol["prompt_frames"], []
+    for row, why in _chosen(comparison, reduce(np.intersect1d, [frames["rows"] for frames in kept])).items():
+        here = [_of_clip(frames, row) for frames in kept]
+        truth = here[0]["truth"]
+        others = [(_label(g.name), frames["prediction"]) for g, frames in zip(comparison.groups, here, strict=True)]
         others.append(("first frame\nrepeated", np.repeat(truth[prompt - 1 : prompt], len(truth), axis=0)))
-        others += _reconstructions(comparison, kept, place)
-        title = f"clip {number}, {rank} of {len(rows)} by {comparison.reference.name}: {score[rows[place]]:.2f} dB"
+        others += _reconstructions(comparison, here)
+        title = f"clip {clips[row]['number']}, {why}"
         out.append(ComparedClip(title, truth, None, prompt_frames=prompt, others=tuple(others)))
     return out
 
 
-def _reconstructions(
-    comparison: Comparison, kept: Sequence[dict[str, np.ndarray]], place: int
-) -> list[tuple[str, np.ndarray]]:
+def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, str]:
+    """Returns the clips to show by row, and why: those that move most and least, then the worst and the best.
+
+    The first frame repeated has the lowest PSNR where most moves. All clips are ranked by it, as every result keeps
+    both ends; the worst and the best by the reference's own PSNR are of the kept clips alone.
+
+    Args:
+        rows: of the clips whose frames every group has.
+    """
+    results, name = comparison.reference.group.results, comparison.reference.name
+    own = np.mean([each.per_clip["psnr"] for each in results], axis=0)
+    still, every = np.array(results[0].per_clip["psnr_repeat_first"]), np.arange(len(own))
+    pool = every if np.isin(np.concatenate(extremes(still)), rows).all() else rows  # older results lack the ends
+    chosen: dict[int, str] = {}
+    for scores, among, ends, of in (
+        (still, pool, ("moves most", "moves least"), "first frame repeated"),
+        (own, rows, ("worst", "best"), name),
+    ):
+        clips = f"{'all' if len(among) == len(every) else 'the'} {len(among)}{'' if among is every else ' kept'} clips"
+        for end, places in zip(ends, extremes(scores[among]), strict=True):
+            for rank, row in enumerate(among[places].tolist(), 1):
+                chosen.setdefault(row, f"{end} ({rank} of {clips}; {of}: {scores[row]:.2f} dB)")
+    return chosen
+
+
+def _of_clip(frames: dict[str, np.ndarray], row: int) -> dict[str, np.ndarray]:
+    place = int(np.flatnonzero(frames["rows"] == row)[0])
+    return {name: videos[place] for name, videos in frames.items()}
+
+
+def _reconstructions(comparison: Comparison, kept: Sequence[dict[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
     """Returns the reconstruction by each tokenizer that differs from those before it."""
     found: list[tuple[str, np.ndarray]] = []
     for group, frames in zip(comparison.groups, kept, strict=True):
         if "reconstruction" in frames:
-            video = frames["reconstruction"][place]
+            video = frames["reconstruction"]
             if not any(np.array_equal(video, other) for _, other in found):
                 found.append((_label(f"tokenizer, {group.name}"), video))
     return found if len(found) != 1 else [("tokenizer's\nreconstruction", found[0][1])]

@@ -23,17 +23,17 @@ from rsjax.evaluation.frame_curves import Curves, frame_curves
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced
 from rsjax.evaluation.metrics import delta_psnr, fvd
 from rsjax.evaluation.protocols import Protocol, check, of_run
-from rsjax.evaluation.registry import Scene
+from rsjax.evaluation.registry import PerClip, Scene
 from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
 from rsjax.evaluation.scoring import Scored, mean_curves, mean_scores, sample_scores, score_all, summarised, with_best
-from rsjax.evaluation.shown import shown_arrays
+from rsjax.evaluation.shown import extremes, shown_arrays
 from rsjax.files import write_atomically
 from rsjax.models.base import Assets
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
-KEPT_CLIPS = 24  # whose frames are kept for comparisons, spread evenly over the scored ones
+KEPT_CLIPS = 24  # whose frames are kept for comparisons, spread evenly over the scored ones; beside :func:`extremes`
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def evaluate(
         mean_curves([curves for _, curves in repetitions]),
         [summarised(each, interval=False) for each, _ in repetitions],
         held_out.ids(),
-        _kept(first),
+        _kept(first, scored.per_clip()["psnr_repeat_first"]),
     )
 
 
@@ -222,9 +222,14 @@ def _draws(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dic
     }
 
 
-def _kept(scenes: dict[str, Scene]) -> dict[str, np.ndarray]:
+def _kept(scenes: dict[str, Scene], still: PerClip) -> dict[str, np.ndarray]:
+    """Returns frames of the same clips for all models: some spread evenly, and those that move most and least.
+
+    Args:
+        still: PSNR of the first frame repeated, which no model decides.
+    """
     truth = scenes[""].truth.rgb
-    rows = np.array(spread(truth, KEPT_CLIPS))
+    rows = np.union1d(spread(truth, KEPT_CLIPS), np.concatenate(extremes(still)))
     arrays = {"rows": rows, "truth": truth[rows], "prediction": scenes[""].prediction.rgb[rows]}
     if "_tokenizer" in scenes:
         arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]

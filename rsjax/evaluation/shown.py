@@ -1,4 +1,4 @@
-"""The clips in the report: typical ones and the worst ones, and their arrays."""
+"""The clips in the report, typical ones and the worst ones, with their arrays; clips of both ends for comparisons."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from rsjax.data.clips import Clips
 from rsjax.evaluation.registry import PerClip, Scene
+
+EXTREMES = 3  # clips of either end that comparisons show
 
 
 def choose_clips(
@@ -31,6 +33,18 @@ def choose_clips(
     rows, ranks = np.empty(count, int), np.zeros(count, int)
     rows[::2], rows[1::2], ranks[1::2] = typical, worst, np.arange(1, len(worst) + 1)
     return rows, ranks
+
+
+def extremes(
+    scores: Float[np.ndarray, " B"], count: int = EXTREMES
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Returns the clips with the lowest scores, lowest first, and those with the highest, highest first.
+
+    Args:
+        count: of each; fewer where they would overlap.
+    """
+    order, count = np.argsort(scores, kind="stable"), min(count, len(scores) // 2)
+    return order[:count], order[::-1][:count]
 
 
 def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count: int) -> dict[str, np.ndarray]:

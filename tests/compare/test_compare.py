@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rsjax.compare.groups import parse_group, read_groups
-from rsjax.compare.page import strips, write_page
+from rsjax.compare.page import ComparedClip, strips, write_page
 from rsjax.compare.published import published_name
 from rsjax.compare.table import as_csv, as_json, as_markdown, compare
 from rsjax.config import ConfigError
@@ -121,21 +121,42 @@ def test_files_have_published_numbers_apart_and_reasons(make: Make, tmp_path: Pa
     assert json.loads(json.dumps(as_json(found)))["groups"]["theirs"][0]["model"]["trained_on"] == "less"
     write_page(tmp_path / "page.html", found, "the command")
     page = (tmp_path / "page.html").read_text()
-    assert page.count("data:image/webp") == len(strips(found)) == 6
+    assert page.count("data:image/webp") == len(strips(found)) >= 6
     assert "published" in page
     assert 'class="met">better' in page
 
 
-def test_strips_show_the_same_clips_from_the_worst_to_the_best(make: Make) -> None:
-    found = compare(read_groups([make("a", toy.result(0.0)), make("b", toy.result(1.0))], None))
-    psnr = np.array(found.groups[0].results[0].per_clip["psnr"])[toy.ROWS]
-    order = np.argsort(psnr)
-    for clip, place in zip(strips(found), order, strict=True):
-        assert clip.title.startswith(f"clip {2 * toy.ROWS[place]}, ")
+def row_of(clip: ComparedClip) -> int:
+    return int(re.findall(r"\d+", clip.title)[0]) // 2
+
+
+def test_strips_show_the_ends_of_all_clips_and_of_the_kept_ones(make: Make) -> None:
+    plain = toy.result(0.0)
+    result = replace(plain, per_clip=plain.per_clip | {"psnr": (10.0 + 7 * np.arange(toy.CLIPS) % 40).tolist()})
+    found = compare(read_groups([make("a", result), make("b", toy.result(1.0))], None))
+    psnr, still = (np.array(result.per_clip[name]) for name in ("psnr", "psnr_repeat_first"))
+    most, least = np.argsort(still)[:3], np.argsort(-still)[:3]
+    kept = toy.ROWS[np.argsort(psnr[toy.ROWS])]
+    shown = {row_of(clip): clip for clip in strips(found)}
+    assert list(shown) == list(dict.fromkeys([*most, *least, *kept[:3], *kept[:-4:-1]]))
+    assert f"moves most (1 of all 40 clips; first frame repeated: {still[most[0]]:.2f} dB" in shown[most[0]].title
+    assert (kept[0], kept[-1]) == (0, 28), "neither moves most or least"
+    for row in kept[[0, -1]]:
+        assert f" of the {len(toy.ROWS)} kept clips; a: {psnr[row]:.2f} dB" in shown[row].title
+    for row, clip in shown.items():
+        place = np.flatnonzero(row == toy.ROWS)[0]
         labels, rows = zip(*clip.rows(), strict=True)
         assert labels == ("truth", "a", "b", "first frame\nrepeated", "tokenizer's\nreconstruction")
         np.testing.assert_array_equal(rows[1], 255 - toy.TRUTH[place])
         np.testing.assert_array_equal(rows[3][-1], toy.TRUTH[place, 0])
+
+
+def test_strips_of_results_that_lack_an_end_are_of_the_clips_that_all_have(make: Make, tmp_path: Path) -> None:
+    group = make("a", toy.result(0.0))
+    toy.run(tmp_path / "b", toy.result(1.0), keep=toy.SPREAD)
+    shown = strips(compare(read_groups([group, f"b={tmp_path / 'b'}"], None)))
+    assert {row_of(clip) for clip in shown} == set(toy.ROWS[toy.SPREAD].tolist())
+    assert f"moves most (1 of the {len(toy.SPREAD)} kept clips; " in shown[0].title
 
 
 def test_metrics_are_chosen_by_pattern(make: Make) -> None:

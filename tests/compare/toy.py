@@ -11,8 +11,10 @@ from rsjax.evaluation.results import Result, write_result
 CLIPS, FRAMES, SIZE = 40, 4, 16
 rng = np.random.default_rng(0)
 DIFFICULTY = rng.normal(0, 3, CLIPS)  # of each clip, for every model
-TRUTH = rng.integers(0, 256, (6, FRAMES, SIZE, SIZE, 3), np.uint8)
-ROWS = np.arange(0, CLIPS, 7)
+ENDS = np.argsort(DIFFICULTY)[[0, 1, 2, -3, -2, -1]]  # the clips in which most and least moves
+ROWS = np.union1d(np.arange(0, CLIPS, 7), ENDS)
+SPREAD = np.flatnonzero(np.isin(ROWS, np.setdiff1d(np.arange(0, CLIPS, 7), ENDS)))  # places of the rows between them
+TRUTH = rng.integers(0, 256, (len(ROWS), FRAMES, SIZE, SIZE, 3), np.uint8)
 
 
 def result(gain: float, seed: int = 0, noise: float = 0.5, **changes: Any) -> Result:
@@ -46,8 +48,9 @@ def result(gain: float, seed: int = 0, noise: float = 0.5, **changes: Any) -> Re
     return Result(**fields | changes)
 
 
-def run(folder: Path, made: Result) -> Path:
-    """A run directory with a result."""
-    frames = {"rows": ROWS, "truth": TRUTH, "prediction": 255 - TRUTH, "reconstruction": TRUTH // 2}
+def run(folder: Path, made: Result, keep: np.ndarray | slice = slice(None)) -> Path:
+    """A run directory with a result, and the frames of all ``ROWS``, or of some places of them."""
+    every = {"rows": ROWS, "truth": TRUTH, "prediction": 255 - TRUTH, "reconstruction": TRUTH // 2}
+    frames = {name: values[keep] for name, values in every.items()}
     write_result(folder / "evaluations" / made.label, made, frames)
     return folder

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.evaluation.shown import choose_clips
+from rsjax.evaluation.shown import choose_clips, extremes
 
 PSNR = np.array([20.0, 14.0, 23.0, 21.0, 30.0, 16.0, 20.5, 22.0])  # median 20.75
 SUCCESS = np.array([False, True, True, False, True, False, False, True])
@@ -24,6 +24,12 @@ def test_of_an_odd_number_one_more_is_typical(count: int, typical: list[int]) ->
     rows, ranks = choose_clips(PSNR, SUCCESS, count)
     assert len(rows) == len(ranks) == count
     assert rows[ranks == 0].tolist() == typical
+
+
+def test_the_ends_by_hand() -> None:
+    lowest, highest = extremes(PSNR, 2)
+    assert (lowest.tolist(), highest.tolist()) == ([1, 5], [4, 2])
+    assert [rows.tolist() for rows in extremes(PSNR[:3], 2)] == [[1], [2]], "no clip at both ends"
 
 
 def test_without_failures_the_nearest_are_typical() -> None:
