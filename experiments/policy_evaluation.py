@@ -33,6 +33,10 @@ class Options(Trials):
     """Its size: public, tiny or toy."""
     steps: int = 0
     """Its training steps; 0: those of its size."""
+    blind: Path | None = None
+    """Instead: write the rollouts that --out has to this new folder, for people to judge, and labels.csv to fill in."""
+    judge_with: str = ""
+    """Instead: judge those rollouts again, with human:LABELS.csv of --blind or a language model, vlm:DIRECTORY."""
     out: Path | None = None
     """Directory of policies and results; default RUN/policy_evaluation of the first run."""
 
@@ -47,12 +51,20 @@ def main() -> None:
     from rsjax.policies.comparison import checkpoints, compare
     from rsjax.policies.judging import FOLDER
     from rsjax.policies.policy import common_size, load_policy
+    from rsjax.policies.rejudging import blind, named_judge, rejudge
     from rsjax.policies.run_data import RunData, named, sized_policy
     from rsjax.policies.trials import lift_simulators
 
     runs = {name: RunData(run, options.data_dir) for name, run in named(options.runs).items()}
     first, trials = next(iter(runs.values())), part(options, Trials)
     out, judge = options.out or first.run / "policy_evaluation", options.judge or first.run / FOLDER
+    if options.blind:
+        print(blind(out, options.blind))
+        return
+    if options.judge_with:
+        place = rejudge(out, *named_judge(options.judge_with))
+        print((place / "results.md").read_text(), place, sep="\n")
+        return
     for run in runs.values():  # before hours of training
         run.check_world(first)
     first.judge(judge)

@@ -48,7 +48,7 @@ def compare(
         policies: by name.
         simulator: the true one.
         models: makes the world of each run, by the run's name.
-        out: for ``results.json`` (null: not defined, as a correlation without variation), ``results.md``,
+        out: for all rollouts, ``results.json`` (null: not defined, as a correlation without variation), ``results.md``,
             ``scatter.png`` and videos (left: simulator, right: world model).
 
     Returns:
@@ -66,8 +66,8 @@ def compare(
             folder = out / run / name
             imagined[name] = _tried(policy, world, frames, trials, folder, f"{name} in {run}")
             _videos(out, run, name, trials)
-        rows.append(_row(run, true, imagined) | {"judge": summary(world.validation)})
-        _write(out, rows, trials)
+        rows.append(compared(run, true, imagined) | {"judge": summary(world.validation)})
+        write_results(out, rows, trials)
     return {"trials": asdict(trials), "runs": rows}
 
 
@@ -80,8 +80,7 @@ def _tried(
     name: str,
 ) -> Result:
     def see(number: int, episode: Episode) -> None:
-        if number < trials.videos:
-            save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
+        save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)  # each, for other judges (rejudging.py)
 
     return try_policy(policy, world, starts, trials, folder, name, see)
 
@@ -95,7 +94,8 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
             write_mp4(out / "videos" / f"{run}-{name}-{number:02d}.mp4", side_by_side(sides), FPS, 4)
 
 
-def _row(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result]) -> dict[str, Any]:
+def compared(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result]) -> dict[str, Any]:
+    """Returns what ``results.json`` says of a run: success in both worlds by policy, and how well they agree."""
     x, y = (np.array([np.mean(results[name].success) for name in true]) for results in (true, imagined))
     policies: dict[str, dict[str, Any]] = {
         name: {
@@ -118,7 +118,8 @@ def _defined(numbers: dict[str, Any]) -> dict[str, Any]:
     return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in parts.items()}
 
 
-def _write(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
+def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
+    """Writes ``results.json``, ``results.md`` and ``scatter.png`` of the runs that are done."""
     write_json(out / "results.json", {"trials": asdict(trials), "runs": list(rows)})
     write_file(out / "results.md", table(rows).encode())
     points = {row["run"]: _shares(row) for row in rows}
