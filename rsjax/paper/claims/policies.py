@@ -1,5 +1,6 @@
 """What the world model is for: learning from its videos, judging policies in it, improving them, and planning."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -93,10 +94,11 @@ def judged(run: Run) -> Scores:
         policies = comparison.checkpoints(size.policy, demos.first(min(size.demos, len(demos))), place / "judged")
         models = {run.directory.name: partial(data.world, size.trials.together)}
         (row,) = comparison.compare(policies, simulator, models, size.trials, place / "in-models")["runs"]
+    pearson = row["pearson"]["value"]
     same = [np.equal(each["simulator"], each["world_model"]) for each in row["policies"].values()]
     return {
         "same_outcome": np.concatenate(same).astype(float).tolist(),
-        "pearson": [row["pearson"]["value"]],
+        "pearson": [math.nan if pearson is None else pearson],  # None: success does not vary
         "strong": [STRONG],
     }
 
