@@ -15,7 +15,15 @@ from rsjax.config import CogVideoXConfig
 from rsjax.convert import cogvideox
 from rsjax.convert.commands import REPLACES, check_file
 from rsjax.convert.directory import Part, save_part, saved_part
-from rsjax.convert.files import SAFE, ConvertError, Tensors, published_settings, read_tensors, write_safetensors
+from rsjax.convert.files import (
+    SAFE,
+    ConvertError,
+    TensorFile,
+    left_aside,
+    published_settings,
+    read_tensors,
+    write_safetensors,
+)
 from rsjax.convert.table import to_tensors
 from rsjax.data.store import open_store
 from rsjax.errors import first_line
@@ -44,7 +52,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     """
     if source.is_dir():
         return [_export(source, out, part)]
-    tensors, names = _read(source)
+    tensors, _, names, others = _read(source)
     settings, vae = published_settings(source, *cogvideox.CLASSES.values()), cogvideox.is_autoencoder(source, tensors)
     part, other = PARTS if vae else PARTS[::-1]
     if settings.get("_class_name", cogvideox.CLASSES[part]) != cogvideox.CLASSES[part]:
@@ -54,7 +62,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     if vae:
         network, params = cogvideox.autoencoder_from_public(source, tensors, settings, names)
         model = replace(before or CogVideoXConfig(), autoencoder=network)
-        lines = [f"{out}: an autoencoder of {len(tensors)} tensors, none left aside, {network}"]
+        lines = [f"{out}: an autoencoder of {len(tensors)} tensors, {network}", *left_aside(others)]
         if "scaling_factor" not in settings:
             lines.append(f"no {cogvideox.CONFIG} with scaling_factor beside {source.name}: 5B-I2V's 0.7 is taken")
     else:
@@ -62,7 +70,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
         network = model.autoencoder
         model = replace(model, autoencoder=before.autoencoder if before else network)
         lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {model}"]
-        lines += [f"left aside: {aside} tensor of fixed positions, which the network computes"] * aside
+        lines += left_aside({"fixed positions, which the network computes": aside}, others)
     if before and before.autoencoder.latent_channels != network.latent_channels:
         there, here = before.autoencoder.latent_channels, network.latent_channels
         raise ConvertError(f"{out}: holds a part with {there} latent channels, this one has {here}; choose another OUT")
@@ -70,17 +78,15 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     return lines
 
 
-def _read(source: Path) -> tuple[Tensors, dict[str, str]]:
-    """Returns the tensors of a file, or of all files of a network of which it is one."""
-    match = _SHARD.fullmatch(source.name)
-    numbers = range(1, int(match[3]) + 1) if match else ()
-    paths = [source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}") for i in numbers] if match else [source]
-    tensors: Tensors = {}
-    names: dict[str, str] = {}
-    for file in map(read_tensors, paths):
-        tensors |= file.tensors
-        names |= file.names
-    return tensors, names
+def _read(source: Path) -> TensorFile:
+    """Returns the content of a file, or of all files of a network of which it is one."""
+    if not (match := _SHARD.fullmatch(source.name)):
+        return read_tensors(source)
+    numbers = range(1, int(match[3]) + 1)
+    files = [read_tensors(source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}")) for i in numbers]
+    tensors = {name: x for file in files for name, x in file.tensors.items()}
+    names = {name: known for file in files for name, known in file.names.items()}
+    return TensorFile(tensors, {}, names, {})
 
 
 def _export(source: Path, out: Path, part: Part | None) -> str:

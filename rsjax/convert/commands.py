@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rsjax.config import ConfigError, TokenizerConfig, from_dict, to_dict
 from rsjax.convert import directory, genie, lpips, tokenizer
-from rsjax.convert.files import SAFE, ConvertError, Tensors, read_tensors, write_safetensors
+from rsjax.convert.files import SAFE, ConvertError, Tensors, left_aside, read_tensors, write_safetensors
 from rsjax.convert.table import to_tensors
 from rsjax.files import parse_json, read_json, write_json
 
@@ -25,13 +25,12 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
         tensors = to_tensors(params, tokenizer.table(config))
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]
-    tensors, metadata, names = read_tensors(source)
+    tensors, metadata, names, others = read_tensors(source)
     own = _exported_config(source, metadata)
-    config, params, ignored = tokenizer.from_public(source, tensors, weights, own, names)
+    config, params, aside = tokenizer.from_public(source, tensors, weights, own, names)
     replaces = REPLACES * directory.save(out, config, params)
-    used = len(tensors) - ignored.total()
-    lines = [f"ignored: {count} tensors of {group}" for group, count in sorted(ignored.items())]
-    return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *lines]
+    used = len(tensors) - aside.total()
+    return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *left_aside(aside, others)]
 
 
 def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
@@ -52,11 +51,11 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
         write_json(beside, settings)
         text = f"under their public names; settings in {genie.CONFIG}{replaces}"
         return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]
-    tensors, _, names = read_tensors(source)
+    tensors, _, names, others = read_tensors(source)
     settings = genie.read_settings(source)
     config, params = genie.from_public(source, tensors, settings, heads, names)
     replaces = REPLACES * directory.save(out, config, params)
-    lines = [f"{out}: a world model of {len(tensors)} tensors, {config}{replaces}"]
+    lines = [f"{out}: a world model of {len(tensors)} tensors, {config}{replaces}", *left_aside(others)]
     if settings.get("use_mup") is None:
         lines.append(f"no use_mup in a {genie.CONFIG} beside {source.name}: converted as a model without muP")
     return lines
@@ -71,15 +70,18 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
     replaces = check_file(out)
     merged: Tensors = {}
     names: dict[str, str] = {}
+    aside = 0
     for source in sources:
-        tensors, _, own = read_tensors(source)
+        tensors, _, own, others = read_tensors(source)
         if twice := merged.keys() & tensors.keys():
             raise ConvertError(f"{source}: {own[min(twice)]} is also in an earlier file; pass each part once")
         merged |= tensors
         names |= own
+        aside += sum(others.values())
     net, weights = lpips.from_public(", ".join(map(str, sources)), merged, names)
     write_safetensors(out, weights, {"net": net})
-    return [f"{out}: LPIPS with {net}, {len(weights)} tensors; {len(merged) - len(weights)} ignored{replaces}"]
+    lines = left_aside({"other layers or networks": aside + len(merged) - len(weights)})
+    return [f"{out}: LPIPS with {net}, {len(weights)} tensors{replaces}", *lines]
 
 
 def check_file(out: Path) -> str:

@@ -7,7 +7,7 @@ from typing import Literal
 from rsjax.config import ConfigError, from_dict, to_dict
 from rsjax.convert import directory, irasim, kl_autoencoder
 from rsjax.convert.commands import REPLACES, check_file
-from rsjax.convert.files import HOLDERS, ConvertError, published_settings, read_tensors, write_safetensors
+from rsjax.convert.files import HOLDERS, ConvertError, left_aside, published_settings, read_tensors, write_safetensors
 from rsjax.files import parse_json, read_json, write_json
 from rsjax.models.irasim.dit import Architecture
 
@@ -29,13 +29,13 @@ def convert_irasim(source: Path, out: Path, weights: Literal["ema", "raw"], head
         tensors = irasim.to_public(config, params)
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]
-    tensors, metadata, names = read_tensors(source, ("ema", *HOLDERS) if weights == "ema" else HOLDERS)
+    tensors, metadata, names, others = read_tensors(source, ("ema", *HOLDERS) if weights == "ema" else HOLDERS)
     own = _exported(source, metadata)
     config, params, aside = irasim.from_public(source, tensors, own, heads, names)
     replaces = REPLACES * directory.save(out, config, params)
     return [
         f"{out}: an IRASim of {len(tensors) - aside} tensors, {config}{replaces}",
-        f"left aside: {aside} tensors of fixed positions, which the network computes",
+        *left_aside({"fixed positions, which the network computes": aside}, others),
     ]
 
 
@@ -55,11 +55,11 @@ def convert_sdxl(source: Path, out: Path) -> list[str]:
         write_json(beside, settings)
         text = f"under their public names; settings in {kl_autoencoder.CONFIG}{replaces}"
         return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]
-    tensors, _, names = read_tensors(source)
+    tensors, _, names, others = read_tensors(source)
     settings = published_settings(source, kl_autoencoder.CLASS)
     config, params = kl_autoencoder.from_public(source, tensors, settings, names)
     replaces = REPLACES * directory.save(out, config, params)
-    lines = [f"{out}: an autoencoder of {len(tensors)} tensors, none left aside, {config}{replaces}"]
+    lines = [f"{out}: an autoencoder of {len(tensors)} tensors, {config}{replaces}", *left_aside(others)]
     if "scaling_factor" not in settings:
         known = kl_autoencoder.SDXL_FACTOR
         lines.append(f"no scaling_factor in a {kl_autoencoder.CONFIG} beside {source.name}: SDXL's {known} is taken")

@@ -2,7 +2,7 @@
 
 import importlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,11 +46,13 @@ class TensorFile(NamedTuple):
         tensors: by name, without what DistributedDataParallel (``module.``) and torch.compile (``_orig_mod.``) add.
         metadata: of a safetensors file; empty for PyTorch's.
         names: each tensor's name in the file, by the name in ``tensors``.
+        others: how many more tensors the file has, by the keys under which they lie; empty for a safetensors file.
     """
 
     tensors: Tensors
     metadata: dict[str, str]
     names: dict[str, str]
+    others: dict[str, int]
 
 
 def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
@@ -69,10 +71,12 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         raise ConvertError(f"{path}: {what if path.exists() else 'no such file'}")
     if instead := placeholder(path):
         raise ConvertError(f"{path}: {instead}")
+    metadata: dict[str, str] = {}
+    others: dict[str, int] = {}
     if path.suffix == SAFE:
         read, metadata = _read_safetensors(path)
     elif path.suffix in PICKLED:
-        read, metadata = _read_torch(path, holders), {}
+        read, others = _read_torch(path, holders)
     else:
         raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
     names: dict[str, str] = {}
@@ -81,7 +85,14 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         if own in names:
             raise ConvertError(f"{path}: {own} occurs twice, as {names[own]} and as {name}; keep one of them")
         names[own] = name
-    return TensorFile({own: read[name] for own, name in names.items()}, metadata, names)
+    return TensorFile({own: read[name] for own, name in names.items()}, metadata, names, others)
+
+
+def left_aside(*groups: Mapping[str, int]) -> list[str]:
+    """Returns a line for each group of a file's tensors that are not converted, or one that says there are none."""
+    counts = [(name, n) for group in groups for name, n in sorted(group.items()) if n]
+    lines = [f"left aside: {n} tensor{'s' * (n > 1)} of {name}" for name, n in counts]
+    return lines or ["left aside: no tensors"]
 
 
 def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
@@ -113,7 +124,7 @@ class _Placeholder:
     def __setstate__(self, state: object) -> None: ...
 
 
-def _read_torch(path: Path, holders: Sequence[str]) -> Tensors:
+def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, int]]:
     try:
         torch: Any = importlib.import_module("torch")
     except ImportError:
@@ -130,7 +141,12 @@ def _read_torch(path: Path, holders: Sequence[str]) -> Tensors:
     tensors = _tensors(state, torch)
     if not tensors:
         raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(holders)}")
-    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}
+    others = {}
+    for key, value in content.items():
+        read = len(tensors) if value is state else state is content and key in tensors
+        if more := _count(value, torch) - read:
+            others[f"the file's key {key}"] = more
+    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}, others
 
 
 def _unpickled(path: Path, torch: Any) -> Any:
@@ -151,6 +167,12 @@ def _tensors(state: Any, torch: Any) -> dict[str, Any]:
     """Returns the tensors of a state dict; the rest, such as counters, is left out."""
     items = state.items() if isinstance(state, dict) else ()
     return {name: x for name, x in items if isinstance(name, str) and isinstance(x, torch.Tensor)}
+
+
+def _count(value: Any, torch: Any) -> int:
+    """Returns the number of tensors in nested dicts and sequences."""
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    return sum(_count(x, torch) for x in inner) + isinstance(value, torch.Tensor)
 
 
 def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ import jax
 from rsjax.config import ConditionalVQConfig, ConfigError, IVideoGPTConfig, from_dict, to_dict
 from rsjax.convert.commands import REPLACES, check_file
 from rsjax.convert.directory import Part, save_part, saved_part
-from rsjax.convert.files import ConvertError, Tensors, read_tensors, write_safetensors
+from rsjax.convert.files import ConvertError, Tensors, left_aside, read_tensors, write_safetensors
 from rsjax.convert.table import (
     SAME_NAMES,
     Entry,
@@ -139,7 +139,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     """
     if source.is_dir():
         return [_export(source, out, part)]
-    tensors, metadata, names = read_tensors(source)
+    tensors, metadata, names, others = read_tensors(source)
     own = _exported(source, metadata)
     if "dynamics_quantize.embedding.weight" in tensors:
         given = None if own is None else (own[0].autoencoder, own[1].image_size)
@@ -149,7 +149,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
         _check_codes(out, before and before[0], model)
         inputs = Inputs(size, before[1].action_dim if before else 0)
         replaces = save_part(out, "tokenizer", model, inputs, params)
-        return [f"{out}: a tokenizer of {len(tensors)} tensors, {vq}{REPLACES * replaces}"]
+        return [f"{out}: a tokenizer of {len(tensors)} tensors, {vq}{REPLACES * replaces}", *left_aside(others)]
     aside = Counter(ASIDE.search(name)[0] for name in tensors if ASIDE.search(name))  # type: ignore[index]
     used = {name: x for name, x in tensors.items() if not ASIDE.search(name)}
     model, actions = (own[0], own[1].action_dim) if own else infer_llama(source, used, heads, names)
@@ -161,7 +161,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     _check_codes(out, before and before[0], model)
     inputs = Inputs(before[1].image_size if before else own[1].image_size if own else 0, actions)
     replaces = save_part(out, "world_model", whole, inputs, params)
-    lines = [f"left aside: {count} tensors of {group}" for group, count in sorted(aside.items())]
+    lines = left_aside(aside, others)
     return [f"{out}: a transformer of {len(used)} tensors, {model}{REPLACES * replaces}", *lines]
 
 

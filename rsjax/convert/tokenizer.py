@@ -131,7 +131,7 @@ def from_public(
         names: of the tensors in the file, for errors, where they differ.
 
     Returns:
-        The configuration, the parameters, and how many tensors were ignored, by the first words of their names.
+        The configuration, the parameters, and how many tensors were left aside, by the first words of their names.
 
     Raises:
         ConvertError: tensors are missing, unexpected, of another shape or no finite floats, or not a tokenizer's.
@@ -140,12 +140,12 @@ def from_public(
     entries = table(config)
     keys = {public_name(entry.key, weights): entry.key for entry in entries}
     kept: Tensors = {}
-    ignored: Counter[str] = Counter()
+    aside: Counter[str] = Counter()
     for name, x in tensors.items():
         if name not in keys and name.startswith(IGNORED[weights]):
-            ignored[".".join(name.split(".")[: 2 if name.startswith("loss.") else 1])] += 1
+            aside[".".join(name.split(".")[: 2 if name.startswith("loss.") else 1])] += 1
         else:
             kept[keys.get(name, name)] = x
     shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
     public = {own: names.get(key, key) for key, own in keys.items()}
-    return config, to_params(source, kept, entries, shapes, dict(names) | public), ignored
+    return config, to_params(source, kept, entries, shapes, dict(names) | public), aside

@@ -79,13 +79,17 @@ def test_an_exported_tokenizer_carries_its_configuration(tmp_path: Path) -> None
     assert load_tokenizer(tmp_path / "again")[0] == other
 
 
-def test_the_command_prints_its_output_and_what_it_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_its_output_and_what_it_left_aside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rest = {"loss.discriminator.main.0.bias": np.zeros(64, np.float32)}
     write_safetensors(tmp_path / "in.safetensors", TOKENIZER | rest, {})
     convert("tokenizer", tmp_path / "in.safetensors", tmp_path / "own")
     made, aside = capsys.readouterr().out.splitlines()
     assert f"{len(TOKENIZER)} raw tensors" in made
-    assert aside == "ignored: 1 tensors of loss.discriminator"
+    assert aside == "left aside: 1 tensor of loss.discriminator"
+    convert("genie", _written(tmp_path / "genie.safetensors", GENIE), tmp_path / "own", "--heads", 2)
+    assert capsys.readouterr().out.splitlines()[1] == "left aside: no tensors"
 
 
 @pytest.mark.parametrize(

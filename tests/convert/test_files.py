@@ -30,7 +30,8 @@ def test_reading_inverts_writing(tmp_path: Path) -> None:
     tensors: Tensors = {"a.weight": whole.transpose(2, 0, 1), "b": whole[:, 1:3, ::2], "n": np.array(7, np.int64)}
     tensors["c"] = rng.normal(size=6).astype(ml_dtypes.bfloat16)
     write_safetensors(path, tensors, {"net": "x"})
-    read, metadata, _ = read_tensors(path)
+    read, metadata, _, others = read_tensors(path)
+    assert not others
     assert metadata == {"net": "x"}
     assert read.keys() == tensors.keys()
     for name in tensors:
@@ -76,15 +77,20 @@ def test_what_training_scripts_save_beside_tensors_is_left_out(tmp_path: Path, z
         "hyper_parameters": {"out": Path("runs/a"), "args": Namespace(lr=1e-4, path=PurePath("x"))},
         "best": np.float64(0.25),
         "numbers": [np.int64(3), np.bool_(True), np.random.get_state()],
+        "optimizer": {"state": {0: {"moment": torch.zeros(2), "step": 4}}, "groups": [(torch.ones(1), 1e-4)]},
+        "other": {"a": torch.arange(2.0)},
     }
     state = {"module._orig_mod.a": torch.arange(2.0), "block._orig_mod.b": torch.tensor(3.0), "epoch": 3}
     for holder in ("state_dict", "model_state_dict", "model"):
         path = tmp_path / "x.ckpt"
-        torch.save({holder: state | {"count": np.int64(1)}} | beside, path, _use_new_zipfile_serialization=zipped)
+        inner = {"count": np.int64(1), "nested": {"c": torch.zeros(1)}}
+        torch.save({holder: state | inner} | beside, path, _use_new_zipfile_serialization=zipped)
         read = read_tensors(path)
         assert read.names == {"a": "module._orig_mod.a", "block.b": "block._orig_mod.b"}
         np.testing.assert_array_equal(read.tensors["a"], [0.0, 1.0])
         assert read.tensors["block.b"] == 3
+        counts = {"optimizer": 2, "other": 1, holder: 1}
+        assert read.others == {f"the file's key {key}": number for key, number in counts.items()}
 
 
 def test_a_name_that_is_left_twice_is_refused(tmp_path: Path) -> None:
@@ -162,8 +168,8 @@ def test_pytorchs_tensors_are_read_bare_or_as_a_state_dict(tmp_path: Path) -> No
     }
     for name, content in (("bare.pt", state), ("whole.ckpt", {"state_dict": state, "epoch": 3})):
         torch.save(content, tmp_path / name)
-        read, metadata, _ = read_tensors(tmp_path / name)
-        assert metadata == {}
+        read, metadata, _, others = read_tensors(tmp_path / name)
+        assert metadata == others == {}
         np.testing.assert_array_equal(read["a.weight"], np.arange(6.0, dtype=np.float32).reshape(2, 3).T)
         np.testing.assert_array_equal(read["p"], [0.0, 1.0])
         np.testing.assert_array_equal(read["half"], np.array([0.1, 3.0], ml_dtypes.bfloat16).astype(np.float32))

@@ -52,7 +52,7 @@ def test_irasim_comes_back_to_the_bit(weights: Path, capsys: pytest.CaptureFixtu
 
 def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.CaptureFixture[str]) -> None:
     convert("sdxl", vae, vae.parent / "own")
-    assert "none left aside" in capsys.readouterr().out
+    assert "left aside: no tensors" in capsys.readouterr().out
     config, params = load_kl_autoencoder(vae.parent / "own")
     assert config == SMALL
     np.testing.assert_allclose(np.exp(-params["latents"]["log_deviation"]), 0.2, rtol=1e-5)
@@ -99,12 +99,16 @@ def test_a_trained_autoencoder_has_no_public_form(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("options", "scale"), [((), 1.0), (("--weights", "raw"), 2.0)])
 def test_training_checkpoints_are_read_without_running_them(
-    options: tuple[str, ...], scale: float, tmp_path: Path
+    options: tuple[str, ...], scale: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torch = pytest.importorskip("torch")
     ema = {name: torch.from_numpy(x) for name, x in public.random_weights(NET).items()}
     raw = {f"module.{name}": 2 * x for name, x in ema.items()}
-    torch.save({"model": raw, "ema": ema, "opt": {"state": {}}, "args": None}, tmp_path / "0300000.pt")
+    moments = {number: {"exp_avg": x} for number, x in enumerate(ema.values())}
+    torch.save({"model": raw, "ema": ema, "opt": {"state": moments}, "args": None}, tmp_path / "0300000.pt")
     convert("irasim", tmp_path / "0300000.pt", tmp_path / "own", "--heads", NET.heads, *options)
+    said = capsys.readouterr().out
+    for key in ("model" if scale == 1 else "ema", "opt"):
+        assert f"left aside: {len(ema)} tensors of the file's key {key}\n" in said
     kernel = load_irasim(tmp_path / "own")[1]["final"]["kernel"]
     np.testing.assert_allclose(kernel, scale * public.random_weights(NET)["final_layer.linear.weight"].T)

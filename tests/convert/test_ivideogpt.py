@@ -52,7 +52,7 @@ def test_one_directory_holds_both_parts_and_exports_each_to_the_bit(
     said = capsys.readouterr().out
     assert f"a tokenizer of {len(TOKENIZER)} tensors" in said
     assert f"a transformer of {len(TRANSFORMER)} tensors" in said
-    assert "left aside: 1 tensors of reward_linear" in said
+    assert "left aside: 1 tensor of reward_linear" in said and "left aside: no tensors" in said
     settings = json.loads((tmp_path / "own" / "config.json").read_text())
     assert settings["inputs"] == {"image_size": 16, "action_dim": 3}
     for part, tensors in (("tokenizer", TOKENIZER), ("world_model", TRANSFORMER)):
