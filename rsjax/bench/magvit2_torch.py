@@ -5,6 +5,7 @@ It needs torch, an optional dependency, so import this module only where it is u
 Axes: N images, C channels, h×w cells.
 """
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -126,6 +127,8 @@ def to_channels(x: Tensor, p: int) -> Tensor:
 
 
 def to_pixels(x: Tensor, p: int) -> Tensor:
-    """Inverts :func:`to_channels`."""
+    """Inverts :func:`to_channels`, and keeps the memory format."""
     n, c, h, w = x.shape
-    return x.reshape(n, p, p, c // p**2, h, w).permute(0, 3, 4, 1, 5, 2).reshape(n, c // p**2, h * p, w * p)
+    out = x.reshape(n, p, p, c // p**2, h, w).permute(0, 3, 4, 1, 5, 2).reshape(n, c // p**2, h * p, w * p)
+    last = x.is_contiguous(memory_format=torch.channels_last)
+    return out.contiguous(memory_format=torch.channels_last) if last else out

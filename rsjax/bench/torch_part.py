@@ -14,6 +14,7 @@ from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 
 ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # options that the plain Genie lacks
+COMPILER = "inductor"  # backend of torch.compile
 
 
 def check_genie(config: Config) -> None:
@@ -85,9 +86,10 @@ def check_plain(model: Architecture) -> None:
 
 
 def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
-    """Measures the model in eager PyTorch, float32 and bf16 autocast, like the public code of its family.
+    """Measures the model in PyTorch, float32 and bf16 autocast, like the public code of its family.
 
-    That is training step, sampling and the autoencoder; of RoboScape the RGB branch. It uses the GPU if jax and PyTorch
+    That is training step, sampling and the autoencoder; of RoboScape the RGB branch. All are eager; the training step
+    is compiled besides. It uses the GPU if jax and PyTorch
     both do, otherwise the CPU (``torch_device``).
 
     Args:
@@ -110,4 +112,4 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     torch.manual_seed(0)
     work = import_module(baseline.module).create(config, batch, horizon, device)
     numbers = {"torch": torch.__version__, "torch_device": device, "torch_threads": torch.get_num_threads()}
-    return numbers | measure(work, config.train.optimizer, device, timed)
+    return numbers | measure(work, config.train.optimizer, device, timed, COMPILER)

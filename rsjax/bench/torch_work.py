@@ -3,14 +3,19 @@
 It needs torch, an optional dependency, so import this module only where it is used.
 """
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from rsjax.config import OptimizerConfig
+from rsjax.errors import first_line
+
+FORMATS = {4: torch.channels_last, 5: torch.channels_last_3d}  # by the kernels' number of axes
 
 
 @dataclass(frozen=True)
@@ -36,43 +41,88 @@ class TorchWork:
 
 
 def measure(
-    work: TorchWork, optimizer: OptimizerConfig, device: str, timed: Callable[[Callable[[], Any]], float]
+    work: TorchWork,
+    optimizer: OptimizerConfig,
+    device: str,
+    timed: Callable[[Callable[[], Any]], float],
+    compiler: str = "inductor",
 ) -> dict[str, Any]:
     """Measures training step, sampling, encoding and decoding, in float32 and under bf16 autocast.
 
+    Under bf16 autocast also the training step by ``torch.compile``, and the autoencoder with its kernels in
+    channels-last format; both change the networks, so they come last.
+
     Args:
         timed: takes a call and returns its median seconds.
+        compiler: backend of ``torch.compile``.
+
+    Returns:
+        Numbers by name; ``torch_compile`` says why if the step cannot be compiled here.
     """
     networks = (*work.trained, *work.frozen)
-    numbers: dict[str, Any] = {"torch_parameters": sum(p.numel() for net in networks for p in net.parameters())}
+    numbers: dict[str, Any] = {"torch_parameters": sum(x.numel() for x in parameters(networks))}
     for dtype in ("float32", "bfloat16"):
-
-        def cast() -> Any:
-            return torch.autocast(device, dtype=torch.bfloat16, enabled=dtype == "bfloat16")  # noqa: B023
-
-        def seconds(call: Callable[[], Any]) -> float:
-            def without_gradients() -> None:
-                with torch.no_grad(), cast():
-                    call()
-
-            return timed(without_gradients)
-
-        def loss() -> Tensor:
-            with cast():
-                return work.loss()
-
-        for network in networks:
-            network.train()
-        adamw = make_adamw(parameters(work.trained), optimizer)
-        numbers[f"torch_train_step_s_{dtype}"] = timed(
-            lambda: train_step(loss, work.trained, adamw, optimizer.grad_clip)  # noqa: B023
-        )
+        cast = partial(torch.autocast, device, dtype=torch.bfloat16, enabled=dtype == "bfloat16")
+        numbers[f"torch_train_step_s_{dtype}"] = timed(training(work, work.loss, optimizer, cast))
         for network in networks:
             network.eval()
+        seconds = partial(_seconds, cast, timed)
         numbers[f"torch_sample_s_per_frame_{dtype}"] = seconds(work.sample) / work.sampled
-        numbers[f"torch_tokenizer_encode_frames_per_s_{dtype}"] = work.frames / seconds(work.encode)
-        numbers[f"torch_tokenizer_decode_frames_per_s_{dtype}"] = work.frames / seconds(work.decode)
-    return numbers
+        numbers |= _codec_rates(work, seconds, dtype)
+    to_channels_last(work.frozen)
+    numbers |= _codec_rates(work, seconds, "bfloat16_channels_last")
+
+    def compiled() -> Callable[[], Any]:
+        return training(work, torch.compile(work.loss, backend=compiler), optimizer, cast)
+
+    return numbers | _compiled(compiled, timed)
+
+
+def to_channels_last(networks: Iterable[nn.Module]) -> None:
+    """Stores convolutions' kernels with the channels last, in which PyTorch then computes them."""
+    for x in parameters(networks):
+        if x.dim() in FORMATS:
+            x.data = x.data.contiguous(memory_format=FORMATS[x.dim()])
+
+
+def training(work: TorchWork, loss: Callable[[], Tensor], optimizer: OptimizerConfig, cast: Any) -> Callable[[], Any]:
+    """Returns a training step with a fresh AdamW; ``cast`` makes the context of its forward pass."""
+    for network in (*work.trained, *work.frozen):
+        network.train()
+    adamw = make_adamw(parameters(work.trained), optimizer)
+
+    def forward() -> Tensor:
+        with cast():
+            return loss()
+
+    return lambda: train_step(forward, work.trained, adamw, optimizer.grad_clip)
+
+
+def _seconds(cast: Any, timed: Callable[[Callable[[], Any]], float], call: Callable[[], Any]) -> float:
+    def without_gradients() -> None:
+        with torch.no_grad(), cast():
+            call()
+
+    return timed(without_gradients)
+
+
+def _codec_rates(work: TorchWork, seconds: Callable[[Callable[[], Any]], float], name: str) -> dict[str, float]:
+    return {
+        f"torch_tokenizer_encode_frames_per_s_{name}": work.frames / seconds(work.encode),
+        f"torch_tokenizer_decode_frames_per_s_{name}": work.frames / seconds(work.decode),
+    }
+
+
+def _compiled(make: Callable[[], Callable[[], Any]], timed: Callable[[Callable[[], Any]], float]) -> dict[str, Any]:
+    """Measures a step that ``make`` makes: the first time, which compiles it, and the later ones."""
+    began = time.perf_counter()
+    try:
+        step = make()
+        step()
+    except Exception as error:  # no C++ compiler, or a network that PyTorch cannot trace
+        return {"torch_compile": f"unavailable: {first_line(error)}"}
+    seconds = time.perf_counter() - began
+    return {"torch_compile_s": seconds, "torch_train_step_s_bfloat16_compiled": timed(step)}
 
 
 def parameters(networks: Iterable[nn.Module]) -> list[nn.Parameter]:

@@ -84,6 +84,7 @@ def test_logits_are_those_of_the_rgb_branch(action_inputs: int) -> None:
 @pytest.mark.parametrize("changes", [{"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
 def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
     from rsjax.bench.magvit2_torch import Decoder, Encoder
+    from rsjax.bench.torch_work import to_channels_last
 
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6, **changes
@@ -102,6 +103,12 @@ def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
     codes = latents.sign().permute(0, 2, 3, 1).numpy()
     decoded: Any = magvit2.Decoder(config).apply({"params": drawn["decoder"]}, codes)
     np.testing.assert_allclose(decoded, made, atol=2e-5)
+    to_channels_last([encoder, decoder])
+    with torch.no_grad():
+        assert torch.allclose(encoder(torch.tensor(images).permute(0, 3, 1, 2)), latents, atol=2e-5)
+        again = decoder(latents.sign())
+    assert again.is_contiguous(memory_format=torch.channels_last)
+    np.testing.assert_allclose(again.permute(0, 2, 3, 1), made, atol=2e-5)
 
 
 @pytest.mark.parametrize("bf16", [False, True])

@@ -228,9 +228,32 @@ def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         bench(toy(), torch=True)
 
 
-@pytest.mark.parametrize("horizon", [3, 48])
-def test_torch_is_timed_in_both_types_on_jaxs_device(horizon: int) -> None:
+def test_torchs_faster_variant_is_compared_and_named() -> None:
+    plain = {"torch_device": "cpu", "platform": "cpu", "train_step_s": 2.0, "torch_train_step_s_bfloat16": 6.0}
+    rate = "tokenizer_encode_frames_per_s"
+    plain |= {rate: 2.0, f"torch_{rate}_bfloat16": 4.0}
+    slower = plain | {"torch_train_step_s_bfloat16_compiled": 8.0, f"torch_{rate}_bfloat16_channels_last": 1.0}
+    faster = plain | {"torch_train_step_s_bfloat16_compiled": 5.0, f"torch_{rate}_bfloat16_channels_last": 8.0}
+    assert ratios(slower, False) == {
+        "train_speedup_over_torch_bfloat16": 3.0,
+        "train_fastest_torch_bfloat16": "eager",
+        "tokenizer_encode_speedup_over_torch_bfloat16": 0.5,
+        "tokenizer_encode_fastest_torch_bfloat16": "eager",
+    }
+    assert ratios(faster, False) == {
+        "train_speedup_over_torch_bfloat16": 2.5,
+        "train_fastest_torch_bfloat16": "compiled",
+        "tokenizer_encode_speedup_over_torch_bfloat16": 0.25,
+        "tokenizer_encode_fastest_torch_bfloat16": "channels_last",
+    }
+
+
+@pytest.mark.parametrize(("horizon", "compiler"), [(3, "eager"), (48, "none")])
+def test_torch_is_timed_in_both_types_on_jaxs_device(
+    horizon: int, compiler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("torch")
+    monkeypatch.setattr("rsjax.bench.torch_part.COMPILER", compiler)
     measured = bench(toy(), only=[], horizons=(horizon,), budget=0.0, torch=True)
     assert (measured["torch_device"] == "cpu") == (measured["platform"] == "cpu")
     assert all(
@@ -238,3 +261,11 @@ def test_torch_is_timed_in_both_types_on_jaxs_device(horizon: int) -> None:
         for name in ("train_step_s", "sample_s_per_frame")
         for dtype in ("float32", "bfloat16")
     )
+    assert all(
+        measured[f"torch_tokenizer_{way}_frames_per_s_bfloat16_channels_last"] > 0 for way in ("encode", "decode")
+    )
+    if compiler == "eager":
+        assert measured["torch_train_step_s_bfloat16_compiled"] > 0 and measured["torch_compile_s"] > 0
+    else:
+        assert measured["torch_compile"].startswith("unavailable: ")
+        assert "torch_train_step_s_bfloat16_compiled" not in measured
