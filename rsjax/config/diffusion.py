@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import added, require, require_range
+from rsjax.config.fields import added, fitting_sizes, require, require_range
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,10 @@ def check_grid(clips: ClipShape, downsampling: int, patch_size: int) -> int:
         ConfigError: they do not divide the clips' images.
     """
     token = downsampling * patch_size
-    below = clips.image_size // token * token
-    fitting = f"{below} or {below + token}" if below else f"{token}"
     require(
         clips.image_size % token == 0,
         f"images have {clips.image_size} pixels a side, which the {token} pixels of a token (the autoencoder's "
         f"{downsampling} × model.patch_size {patch_size}) do not divide; take clips of "
-        f"{fitting} pixels, or change model.patch_size",
+        f"{fitting_sizes(clips.image_size, token)} pixels, or change model.patch_size",
     )
     return token

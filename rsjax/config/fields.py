@@ -64,6 +64,16 @@ def require_range(config: Any, section: str, low: float, high: float, *names: st
         require(low <= value <= high, f"{section}.{name} is {value}; it must be {wanted}")
 
 
+def fitting_sizes(size: int, unit: int, least: int = 1, most: int | None = None) -> str:
+    """Returns the multiples of ``unit`` next to ``size``, such as "240 or 256", for errors.
+
+    Args:
+        least, most: units that there may be.
+    """
+    near = {max(least, n if most is None else min(n, most)) for n in (size // unit, size // unit + 1)}
+    return " or ".join(str(unit * n) for n in sorted(near))
+
+
 def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
     """Checks that every number of a dataclass is finite and every seed one of 32 bits, also in nested dataclasses.
 

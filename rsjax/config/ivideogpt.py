@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import require, require_range, runtime, sampling
+from rsjax.config.fields import fitting_sizes, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 
@@ -48,11 +48,12 @@ class ConditionalVQConfig:
         Raises:
             ConfigError: the image does not divide into cells, or its cells not into the tokens of a later frame.
         """
-        pixels = self.downsampling * self.future_patch
+        pixels, most = self.downsampling * self.future_patch, self.attention_size // self.future_patch
         require(
             image_size % pixels == 0,
             f"images have {image_size} pixels a side, which {pixels} does not divide (model.autoencoder.patch_size × "
-            f"2^(levels - 1) × future_patch); change widths, patch_size or future_patch, or the clips' image size",
+            f"2^(levels - 1) × future_patch); take clips of {fitting_sizes(image_size, pixels, most=most)} pixels, or "
+            f"change widths, patch_size or future_patch",
         )
         grid = image_size // self.downsampling
         require(

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import require, require_range
+from rsjax.config.fields import fitting_sizes, require, require_range
 from rsjax.config.train import LoopConfig
 
 
@@ -62,8 +62,9 @@ class TokenizerConfig:
         require(
             image_size % self.downsampling == 0,
             f"images have {image_size} pixels a side, which the downsampling {self.downsampling} of the tokenizer "
-            f"(patch_size × 2^(levels - 1)) does not divide; change tokenizer.patch_size or "
-            f"tokenizer.channel_multipliers, or the clips' image size",
+            f"(patch_size × 2^(levels - 1)) does not divide; take clips of "
+            f"{fitting_sizes(image_size, self.downsampling, least=1 + self.adaptive_norm)} pixels, or change "
+            f"tokenizer.patch_size or tokenizer.channel_multipliers",
         )
         grid = image_size // self.downsampling
         require(

@@ -131,6 +131,8 @@ def train_tokenizer(run: Run, resume: bool) -> None:
     check_stages(run.config.train, run.open_clips())
     setup, model = tokenizer_setup(run), create_autoencoder(run.config)
     note_curriculum(setup.loader)
+    for line in model.notes() if is_lead() else ():
+        note(line)
     state = fit(
         model,
         setup.loop,

@@ -83,6 +83,10 @@ class Autoencoder(Trainable[B], Protocol[B]):
         """Returns the parameters that training begins with: the saved ones, completed by fresh ones."""
         return saved
 
+    def notes(self) -> list[str]:
+        """Returns what a user should know before training, a line each."""
+        return []
+
     def flops(self) -> dict[str, int]:
         """Returns floating-point operations of one pass, "encoder" and "decoder"; empty if there are no counts.
 

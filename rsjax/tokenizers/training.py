@@ -176,6 +176,14 @@ class TokenizerTraining(Autoencoder[Images]):
         return fresh | {"generator": saved} if "generator" in fresh else saved
 
 
+def require_no_adversarial(train: TokenizerTrainConfig, network: str) -> None:
+    """Raises :class:`rsjax.config.ConfigError` if a family's autoencoder is to have a discriminator."""
+    require(
+        not train.adversarial_weight,
+        f"tokenizer_train.adversarial_weight is above 0, but {network} has no discriminator here; set it to 0",
+    )
+
+
 def lpips_weights(train: TokenizerTrainConfig, image_size: int) -> dict[str, Any]:
     """Returns the weights of the LPIPS term.
 

@@ -130,8 +130,16 @@ def test_frozen_weights_need_a_path() -> None:
 @pytest.mark.parametrize(
     ("config", "size", "line"),
     [
-        (presets.get("genie_35m_actions"), 250, r"250 pixels a side, which the downsampling 16 of the tokenizer"),
-        (presets.get("ivideogpt_64"), 72, r"72 pixels a side, which 16 does not divide .*; change widths"),
+        (
+            presets.get("genie_35m_actions"),
+            250,
+            r"downsampling 16 of the tokenizer .* clips of 240 or 256 pixels",
+        ),
+        (
+            presets.get("ivideogpt_64"),
+            72,
+            r"72 pixels a side, which 16 does not divide .*; take clips of 64 pixels,",
+        ),
         (presets.get("irasim_xl"), 250, r"250 pixels .* 16 pixels of a token .* take clips of 240 or 256 pixels"),
         (presets.get("irasim_tiny"), 60, r"60 pixels .* 8 pixels of a token .* take clips of 56 or 64 pixels"),
     ],

@@ -14,7 +14,7 @@ import pytest
 import rsjax
 from rsjax.ablation.grid import expand, parse_axes
 from rsjax.bench import inputs
-from rsjax.config import Config, LoopConfig, presets
+from rsjax.config import Config, ConfigError, LoopConfig, presets
 from rsjax.config.leaves import with_values
 from rsjax.describe import describe
 from rsjax.errors import UserError
@@ -47,6 +47,7 @@ TRAINED: tuple[Literal["tokenizer", "world_model"], ...] = ("tokenizer", "world_
 
 
 every_family = pytest.mark.parametrize("family", families.FAMILIES)
+own_autoencoder = pytest.mark.parametrize("family", ["ivideogpt", "irasim", "cogvideox"])
 
 
 @pytest.fixture(scope="module", params=["ivideogpt", "irasim", "cogvideox"])
@@ -162,7 +163,7 @@ def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
         assert np.isfinite(combine(whole, model.loss_weights)[0])
 
 
-@pytest.mark.parametrize("family", ["ivideogpt", "irasim", "cogvideox"])
+@own_autoencoder
 def test_rows_of_an_autoencoders_batch_keep_their_place_over_all_hosts(family: str) -> None:
     """Otherwise the clips of two hosts would share their noise and dropout."""
     autoencoder = create_autoencoder(families.FAMILIES[family]())
@@ -175,6 +176,13 @@ def test_rows_of_an_autoencoders_batch_keep_their_place_over_all_hosts(family: s
     for host, batch in enumerate(hosts):
         assert batch["index"].dtype == np.int32
         np.testing.assert_array_equal(batch["index"], whole["index"].reshape(4, rows)[host::2].reshape(-1))
+
+
+@own_autoencoder
+def test_an_autoencoder_without_discriminator_takes_no_adversarial_weight(family: str) -> None:
+    config = with_values(families.FAMILIES[family](), {"tokenizer_train.adversarial_weight": 0.1})
+    with pytest.raises(ConfigError, match="adversarial_weight is above 0, but .* has no discriminator here; set it"):
+        create_autoencoder(config)
 
 
 @every_family

@@ -63,6 +63,9 @@ class Mean(Autoencoder):
     def codec(self, params, normalization):
         return Codec(params["gain"])
 
+    def notes(self):
+        return ["it learns one number"]
+
 
 @pytest.fixture
 def config(tmp_path: Path) -> Iterator[Config]:
@@ -125,7 +128,9 @@ def config(tmp_path: Path) -> Iterator[Config]:
 SIZE = toy.config().clips.image_size
 
 
-def test_both_stages_train_and_the_model_reads_what_the_autoencoder_made(config: Config, tmp_path: Path) -> None:
+def test_both_stages_train_and_the_model_reads_what_the_autoencoder_made(
+    config: Config, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = Run(config, tmp_path / "run", tmp_path)
     assert run.stages[:4] == ("collect", "tokenizer", "tokens", "world_model")
     run.prepare(overwrite=False)
@@ -137,6 +142,7 @@ def test_both_stages_train_and_the_model_reads_what_the_autoencoder_made(config:
         with run.stage(stage):
             work()
         assert run.finished(stage)
+    assert capsys.readouterr().out.count("note: it learns one number") == 1
     model = rsjax.load(run.directory)
     assert model.assets.tokenizer is not None and model.assets.tokenizer["gain"] > 0.5, "it has learned"
     prepared = run.open_prepared()

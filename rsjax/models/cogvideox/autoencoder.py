@@ -32,7 +32,7 @@ from rsjax.tokenizers.codec import CHUNK, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
-from rsjax.tokenizers.training import lpips_weights
+from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's noise
@@ -60,11 +60,7 @@ class CausalVAETraining(Autoencoder[Batch]):
     image_size: int
 
     def __post_init__(self) -> None:
-        require(
-            not self.train.adversarial_weight,
-            "tokenizer_train.adversarial_weight is above 0, but CogVideoX's autoencoder has no discriminator here; "
-            "set it to 0",
-        )
+        require_no_adversarial(self.train, "CogVideoX's autoencoder")
         require(
             self.train.steps > 0 or bool(self.train.start_from),
             "tokenizer_train.steps is 0, so the autoencoder stays as it is saved, but tokenizer_train.start_from is "
@@ -111,6 +107,9 @@ class CausalVAETraining(Autoencoder[Batch]):
     def codec(self, params: Params, normalization: Normalization) -> "CausalCodec":
         return CausalCodec(self.config, params)
 
+    def notes(self) -> list[str]:
+        return notes_on_filling("windows", self.train.frames_per_clip) if self.train.steps else []
+
     def flops(self) -> dict[str, int]:
         count = self.train.frames_per_clip
         frames = (1, padded_frames(count), self.image_size, self.image_size, 3)
@@ -130,6 +129,12 @@ class CausalVAETraining(Autoencoder[Batch]):
         saved = read_model(directory, CogVideoXConfig, "tokenizer").autoencoder
         check_alike(directory, saved, self.config, FREE, "model.autoencoder")
         return jax.eval_shape(partial(init, saved), jax.random.key(0))
+
+
+def notes_on_filling(what: str, frames: int) -> list[str]:
+    """Returns a line that says how many frames are encoded, unless they are those given."""
+    whole = padded_frames(frames)
+    return [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"] * (whole != frames)
 
 
 def filled(frames: np.ndarray, axis: int) -> np.ndarray:

@@ -16,14 +16,13 @@ from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
 from rsjax.config import ClipShape, CogVideoXConfig, Config, TextConfig
-from rsjax.config.cogvideox import padded_frames
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.cogvideox import pretrained
-from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining
+from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining, notes_on_filling
 from rsjax.models.cogvideox.rollout import rollout
 from rsjax.models.cogvideox.text import check_tasks, empty_texts, texts_of
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, forward_flops
@@ -97,9 +96,9 @@ class CogVideoX(WorldModel[Batch]):
         Raises:
             UserError: a task of the clips has no text.
         """
-        codec, frames = self._codec(assets), self.clips.frames
-        if padded_frames(frames) != frames:
-            note(f"clips of {frames} frames are encoded as {padded_frames(frames)}, 8k + 1, by repeating the last")
+        codec = self._codec(assets)
+        for line in notes_on_filling("clips", self.clips.frames):
+            note(line)
 
         def encode(clip: Record) -> Record:
             rng = np.random.default_rng(zlib.crc32(clip["rgb"][0].tobytes()))

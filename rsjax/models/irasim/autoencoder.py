@@ -31,7 +31,7 @@ from rsjax.tokenizers.codec import CHUNK, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
-from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights
+from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Images = Float[Array, "B H W 3"]
@@ -78,6 +78,9 @@ class KLTraining(Autoencoder[Batch]):
     config: KLConfig
     train: TokenizerTrainConfig
     image_size: int
+
+    def __post_init__(self) -> None:
+        require_no_adversarial(self.train, "IRASim's autoencoder")
 
     @classmethod
     def create(cls, config: Config) -> "KLTraining":

@@ -28,7 +28,7 @@ from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
-from rsjax.tokenizers.training import lpips_weights
+from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's dropout
@@ -50,10 +50,7 @@ class ConditionalVQTraining(Autoencoder[Batch]):
             f"tokenizer_train.frames_per_clip is {self.train.frames_per_clip}; the tokenizer learns from "
             f"model.autoencoder.context_frames {self.config.context_frames} and at least one later frame",
         )
-        require(
-            not self.train.adversarial_weight,
-            "tokenizer_train.adversarial_weight is above 0, but iVideoGPT's tokenizer has no discriminator here; set 0",
-        )
+        require_no_adversarial(self.train, "iVideoGPT's tokenizer")
 
     @classmethod
     def create(cls, config: Config) -> "ConditionalVQTraining":

@@ -14,6 +14,7 @@ from rsjax.bench import inputs
 from rsjax.clip import Video
 from rsjax.config import CogVideoXConfig, ConfigError, NoiseConfig, TextConfig, presets, to_dict
 from rsjax.config.cogvideox import latent_frames, padded_frames
+from rsjax.config.leaves import with_values
 from rsjax.data.normalization import Normalization
 from rsjax.describe import describe
 from rsjax.errors import UserError
@@ -61,6 +62,8 @@ def test_actions_change_nothing_and_the_padding_is_said(tmp_path: Path, capsys: 
     assets = Assets(Normalization.create(clips), weights)
     MODEL.prepare(clips, assets, tmp_path / "latents", 0.0)
     assert "clips of 6 frames are encoded as 9, 8k + 1, by repeating the last" in capsys.readouterr().out
+    assert create_autoencoder(CONFIG).notes() == ["windows of 6 frames are encoded as 9, 8k + 1, by repeating the last"]
+    assert create_autoencoder(with_values(CONFIG, {"tokenizer_train.frames_per_clip": 9})).notes() == []
     prompt = Video(clip["rgb"][None, :1], tasks=np.array(["drift"]))
     one, other = (MODEL.generate(params, assets, prompt, clip["actions"][None] + more).rgb for more in (0, 1))
     assert one.shape == clip["rgb"][None].shape

@@ -50,11 +50,9 @@ def test_a_model_that_does_not_fit_the_clips_is_refused(config: Config, values: 
         with_values(config, values)
 
 
-def test_a_tokenizer_without_later_frames_or_with_a_discriminator_is_refused(config: Config) -> None:
+def test_a_tokenizer_without_later_frames_is_refused(config: Config) -> None:
     with pytest.raises(ConfigError, match="frames_per_clip is 1; the tokenizer learns from .*context_frames 1 and"):
         ConditionalVQTraining.create(with_values(config, {"tokenizer_train.frames_per_clip": 1}))
-    with pytest.raises(ConfigError, match="adversarial_weight is above 0"):
-        ConditionalVQTraining.create(with_values(config, {"tokenizer_train.adversarial_weight": 0.1}))
 
 
 def test_training_starts_from_more_context_or_without_actions(config: Config, tmp_path: Path) -> None:

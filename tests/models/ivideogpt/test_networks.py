@@ -94,8 +94,10 @@ def test_impossible_settings_are_refused(changes: dict[str, Any], line: str) -> 
 
 
 def test_images_that_do_not_divide_into_tokens_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"60 pixels a side, which 8 does not divide .*future_patch"):
-        VQ.grid(60)
+    with pytest.raises(
+        ConfigError, match=r"20 pixels .* 8 does not divide .*future_patch.*; take clips of 16 or 24 pixels"
+    ):
+        VQ.grid(20)
     with pytest.raises(ConfigError, match="attention_size is 16; it must be at least the grid of 32 cells"):
         VQ.grid(64)
 
