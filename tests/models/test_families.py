@@ -16,7 +16,7 @@ from rsjax.ablation.grid import expand, parse_axes
 from rsjax.bench import inputs
 from rsjax.config import Config, ConfigError, LoopConfig, presets
 from rsjax.config.leaves import with_values
-from rsjax.describe import describe
+from rsjax.describe import count, describe
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.pipeline import stages
@@ -161,6 +161,17 @@ def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
         for name, (value, weight) in whole.items():
             np.testing.assert_allclose(summed[name], (value, weight), rtol=2e-4, atol=1e-5, err_msg=name)
         assert np.isfinite(combine(whole, model.loss_weights)[0])
+
+
+@own_autoencoder
+def test_the_counts_of_the_small_presets_in_the_docs_are_theirs(family: str) -> None:
+    config = presets.get(f"{family}_tiny")
+    text = (Path(rsjax.__file__).parents[1] / "docs" / "baselines.md").read_text()
+    (row,) = (line for line in text.splitlines() if line.startswith(f"| `{family}_tiny` |"))
+    model = jax.eval_shape(create_model(config).init, jax.random.key(0))
+    autoencoder = {name: x for name, x in create_autoencoder(config).shapes().items() if name != "latents"}
+    for shapes in (model, autoencoder):
+        assert f" {count(shapes):,}" in row
 
 
 @own_autoencoder
