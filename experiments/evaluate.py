@@ -43,6 +43,8 @@ class Options:
     """The new path of the run's store of ingested clips, if it was moved."""
     overwrite: bool = False
     """Evaluate again what is up to date."""
+    second_takes: bool = False
+    """Simulate the scored clips once more with slightly jittered actions, for physics_iq_score."""
     prompt_frames: int | None = None
     """Recorded frames that generation starts from. This and the following options change the protocol."""
     horizon: int | None = None
@@ -90,7 +92,7 @@ def main() -> None:
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
     settings = {name: value for name, value in vars(options.eval).items() if value is not None}
-    where = (options.data, options.split, options.store, options.overwrite)
+    where = (options.data, options.split, options.store, options.overwrite, options.second_takes)
     request = Request(options.protocol, changes, settings, *where)
     for run in options.runs:
         for folder in evaluate_run(run, options.data_dir, request):

@@ -18,7 +18,7 @@ ALIKE = {
     "settings": None,
     "data": ("key", "split", "frames", "image_size", "fps"),
 }
-MAYBE_UNKNOWN = ("fps", "physics_iq_threshold")  # None where nothing says it, as in older results: fits any value
+MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rsjax.clip import Video
 from rsjax.config import EvalConfig
 from rsjax.config.data import ClipShape
 from rsjax.data.clips import Clips, readable, spread
@@ -85,6 +86,7 @@ class HeldOut:
         protocol: with its horizon and resolution as numbers.
         records: of the scored clips, whole.
         clips: the same, cut to the protocol's frames.
+        second_takes: the same scenes recorded once more, cut likewise; None without.
     """
 
     store: Store
@@ -92,6 +94,7 @@ class HeldOut:
     protocol: Protocol
     records: Sequence[Record]
     clips: Clips
+    second_takes: Video | None = None
 
     @classmethod
     def read(cls, store: Store, split: str, protocol: Protocol, shape: ClipShape) -> "HeldOut":
@@ -162,11 +165,11 @@ def evaluate(
     trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
     takes_actions = trained.config.model.takes_actions
     locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
-    taught = teacher_forced(trained, protocol, clips)
+    taught, takes = teacher_forced(trained, protocol, clips), held_out.second_takes
     repetitions: list[tuple[Scored, Curves]] = []
     first: dict[str, Scene] = {}
     for run in range(protocol.repetitions):
-        scenes = make_scenes(trained, protocol, clips, generation.videos(run), estimator, locate, taught)
+        scenes = make_scenes(trained, protocol, clips, generation.videos(run), estimator, locate, taught, takes)
         scored = with_best(score_all(scenes, protocol, takes_actions), scenes[""], generation.samples(run), protocol)
         repetitions.append((scored, frame_curves(scenes)))
         first = first or scenes

@@ -33,12 +33,14 @@ def make_scenes(
     estimator: DepthEstimator | None,
     locate: Locate | None,
     taught: TeacherForced | None = None,
+    second_takes: Video | None = None,
 ) -> dict[str, Scene]:
     """Returns the prediction's scene as "", and those of both baselines by their suffix of names.
 
     Args:
         videos: by kind, one for each draw of actions; the first under the clips' own actions is the prediction.
         taught: how well the model predicts tokens from true frames.
+        second_takes: the clips' scenes recorded once more.
     """
     reconstruction = trained.model.reconstruct(trained.assets, clips.video)
     shown = {"": videos[OWN][0], "_repeat_first": _repeat_first(clips.metric_video, protocol.prompt_frames)}
@@ -59,6 +61,7 @@ def make_scenes(
             estimated.get(suffix),
             locate(shown[suffix], not suffix) if locate else None,
             None if suffix else taught,
+            scaled(second_takes, protocol.resolution) if second_takes is not None else None,
             settings=trained.config.eval,
             truth_cache=truth_cache,
         )

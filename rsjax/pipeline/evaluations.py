@@ -8,14 +8,18 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 import rsjax
+from rsjax.clip import Video
 from rsjax.config import Config, EvalConfig, SimConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
+from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError, open_store
+from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
@@ -29,6 +33,7 @@ from rsjax.pipeline.run import RECIPE, Run
 from rsjax.pipeline.trained import load, load_config
 from rsjax.pipeline.videos import resampled
 from rsjax.progress import Progress, note
+from rsjax.sim import second_takes
 from rsjax.sim.collect import Report, collect, collection_key
 from rsjax.sim.unseen import collect_unseen
 from rsjax.training.distributed import barrier, is_lead, on_lead
@@ -37,6 +42,7 @@ FOLDER = "evaluations"
 NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "loss_clips", "batch_size", "report_clips")
 LONGER_SEED = 1_000_000  # added to a run's seed, for longer episodes that are none of its own
 LONGER_TRAIN = 2  # episodes of their train split, which nothing uses
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,7 @@ class Request:
         splits: of that store; empty: the protocol's.
         store: the new path of the run's store of ingested clips, if it was moved.
         overwrite: evaluate again what is up to date.
+        second_takes: simulate the scored clips once more, for Physics-IQ's score.
     """
 
     protocol: str
@@ -60,6 +67,7 @@ class Request:
     splits: tuple[str, ...] = ()
     store: Path | None = None
     overwrite: bool = False
+    second_takes: bool = False
 
 
 def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
@@ -72,7 +80,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         The folder of each result.
 
     Raises:
-        UserError: the run, its data, a split or a file of weights is missing; the clips do not fit the protocol.
+        UserError: the run, its data, a split or a file of weights is missing; the clips do not fit the protocol, or
+            cannot be simulated once more.
     """
     config = load_config(directory)
     config = relocated(config, request.store) if request.store else config
@@ -88,6 +97,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
         name = ",".join([*parts, *([f"data={held_out.manifest.get('key')}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
+        if request.second_takes:
+            name, chosen = f"{name},second-takes", _with_second_takes(chosen, config.sim.workers)
         folder = directory / FOLDER / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
@@ -148,7 +159,7 @@ def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut)
     return {
         "protocol": held_out.protocol.described(),
         "sampling": _sample_settings(config),
-        "settings": _settings(config.eval),
+        "settings": _settings(config.eval) | _take_settings(held_out),
         "data": data | {"split": held_out.split, "frames": frames, "image_size": size, "fps": rate},
         "model": {
             "run": str(run.directory),
@@ -170,7 +181,8 @@ def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
         (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, held_out.store)
     ]
     protocol = json.dumps([held_out.protocol.described(), _sample_settings(trained.config), data, held_out.split])
-    return content_key(RECIPE, "evaluation", protocol, _weights(trained), trained.config.eval)
+    takes = [] if held_out.second_takes is None else [json.dumps([second_takes.RECIPE, second_takes.JITTER])]
+    return content_key(RECIPE, "evaluation", protocol, _weights(trained), trained.config.eval, *takes)
 
 
 def _weights(trained: TrainedModel) -> str:
@@ -194,6 +206,10 @@ def _settings(settings: EvalConfig) -> dict[str, Any]:
     files = {name: Path(value) for name, value in values.items() if name.endswith("_weights") and value}
     hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
     return values | hashes | {"physics_iq_threshold": THRESHOLD}
+
+
+def _take_settings(held_out: HeldOut) -> dict[str, Any]:
+    return {} if held_out.second_takes is None else {"second_take_jitter": second_takes.JITTER}
 
 
 def _sample_settings(config: Config) -> dict[str, Any]:
@@ -247,8 +263,21 @@ def _held_out(run: Run, store: Store, protocol: Protocol) -> Store:
     return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
 
 
-def _simulated(what: str, make: Callable[[Report], Store]) -> Store:
-    """Returns a store that the lead process makes, unless it exists, and the others then find."""
+def _with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
+    """Returns the clips with second takes of all of them, which are simulated if need be."""
+    protocol, clips = held_out.protocol, held_out.clips
+    if protocol.reference != "recorded":
+        raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
+
+    def make(report: Report) -> list[Record]:
+        return second_takes.collect_second_takes(held_out.store, held_out.split, clips.index.tolist(), workers, report)
+
+    takes = _simulated(f"second takes of {len(clips.rgb)} clips", make)
+    return replace(held_out, second_takes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
+
+
+def _simulated(what: str, make: Callable[[Report], T]) -> T:
+    """Returns clips that the lead process makes, unless they exist, and the others then find."""
     with Progress(f"simulating {what}", 0, "episodes") as progress:
 
         def report(done: int, total: int) -> None:

@@ -45,6 +45,19 @@ class Simulator(Protocol):
     def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # of the main object and the gripper, in this order
 
 
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Recorded actions to repeat in place of an expert's.
+
+    Attributes:
+        actions: of a clip, of which frame 0's lead to no frame.
+        jitter: standard deviation of the noise on each number; the sum is cut to [-1, 1].
+    """
+
+    actions: Float[np.ndarray, "T A"]
+    jitter: float
+
+
 @dataclass(frozen=True)
 class EpisodePlan:
     """What one episode is.
@@ -54,12 +67,14 @@ class EpisodePlan:
         episode: its number; with the seed it decides everything but ``change``.
         task: of Meta-World; empty in Lift.
         change: what looks otherwise than in training.
+        replay: actions that take the place of the expert's.
     """
 
     name: str
     episode: int
     task: str = ""
     change: Change | None = None
+    replay: Replay | None = None
 
 
 class Simulators:
@@ -105,6 +120,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     looks = draw_variation(plan.change, np.random.default_rng([config.seed, episode, 2])) if plan.change else SEEN
     sim.reset(int(rng.integers(2**32)), looks)
     act, manner = _expert(sim, rng)
+    if plan.replay:
+        act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))
     views, shots, success, places = [], [], [], []
     actions = np.zeros((config.frames, config.control_steps, CONTROLS[config.env]), np.float32)
     for frame in range(config.frames):
@@ -126,6 +143,8 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     }
     if plan.task:
         provenance["difficulty"] = "simple" if plan.task in SIMPLE else "difficult"
+    if plan.replay:
+        provenance["replay"] = {"jitter": plan.replay.jitter}
     if plan.change:
         provenance["unseen"] = {"what": plan.change} | to_dict(looks)
     return Clip(
@@ -166,6 +185,13 @@ def _expert(sim: Any, rng: np.random.Generator) -> tuple[Callable[[Any], Float[n
         return metaworld.Expert(sim.policy, manner, rng).act, manner
     lifts = lift_expert.draw_manner(rng)
     return lift_expert.Expert(lifts, rng).act, lifts
+
+
+def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callable[[Any], Float[np.ndarray, " C"]]:
+    """Returns a policy that repeats recorded actions with jitter, whatever it observes."""
+    recorded = replay.actions[1:].reshape(-1, controls)
+    steps = iter(np.clip(recorded + replay.jitter * rng.standard_normal(recorded.shape), -1, 1))
+    return lambda state: next(steps)
 
 
 def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]]], width: float) -> dict[str, Any]:

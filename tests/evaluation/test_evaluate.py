@@ -176,9 +176,18 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
         return generate(self, batch)
 
     monkeypatch.setattr(Generation, "_generate", counted)
-    again = evaluate(trained, clips, folder=tmp_path)
+    monkeypatch.setattr(evaluation, "KEPT_CLIPS", 2)
+    # A second take that is the first one sets the limits 1, 1, 1 and 0.
+    again = evaluate(trained, clips, held_out=replace(held_out, second_takes=held_out.clips.video), folder=tmp_path)
     assert [batch.name for batch in made] == [files[4].name]
-    assert (again.metrics, again.per_clip) == (result.metrics, result.per_clip)
+    score, own = "physics_iq_score", again.metrics
+    assert ({k: v for k, v in own.items() if score not in k}, again.per_clip) == (result.metrics, result.per_clip)
+    ious = [own[f"physics_iq_{kind}_all_frames"] for kind in ("spatial", "spatiotemporal", "weighted")]
+    expected = np.clip(100 * (np.mean(ious) - own["physics_iq_mse_all_frames"]), 0, 100)
+    assert own[score] == pytest.approx(expected, abs=0.02)
+    assert own.keys() >= {f"{score}_repeat_first", f"{score}_tokenizer"}
+    ends = np.argsort(result.per_clip["psnr_repeat_first"])[[0, 1, -2, -1]]
+    assert again.kept["rows"].tolist() == sorted({0, toy.TEST - 1, *ends.tolist()})
     assert [clip["number"] for clip in again.clips] == list(range(toy.TEST))
     assert len({clip["sha256"] for clip in again.clips}) == toy.TEST
 

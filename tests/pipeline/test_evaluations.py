@@ -23,6 +23,7 @@ from rsjax.pipeline.evaluations import Request, evaluate_own, evaluate_run, long
 from rsjax.pipeline.own_data import on_store
 from rsjax.pipeline.run import Run
 from rsjax.runtime import HUGE_PAGES
+from rsjax.sim import second_takes
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.training.checkpoint import save_weights
 from tests.pipeline import toy
@@ -135,6 +136,33 @@ def test_the_evaluation_stage_writes_such_a_file_too(run: Run) -> None:
     assert own.per_clip == found.per_clip
     assert own.protocol["action_draws"] == run.config.eval.action_draws
     assert own.data["frames"] == FRAMES
+
+
+def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="clips: these clips were not simulated, so there is no second take of them"):
+        list(evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, second_takes=True)))
+    takes: list[np.ndarray] = []
+    whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
+    monkeypatch.setattr(
+        second_takes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers]
+    )
+
+    def evaluate(*inputs: Any, held_out: HeldOut, **more: Any) -> Evaluation:
+        assert held_out.second_takes is not None
+        takes.append(held_out.second_takes.rgb)
+        return scored(*inputs, held_out=held_out, **more)
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    (with_takes,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, second_takes=True))
+    np.testing.assert_array_equal(takes[0][:, -1, 0, 0, 0], range(toy.TEST))
+    assert takes[0].shape[:2] == (toy.TEST, FRAMES), "cut to the protocol's frames"
+    assert with_takes.name == f"{folder.name},second-takes"
+    results = read_result(folder), read_result(with_takes)
+    assert [each.settings.get("second_take_jitter") for each in results] == [None, second_takes.JITTER]
+    assert results[0].key != results[1].key
+    reconstructed = Request("1xgpt", {"prompt_frames": 2, "horizon": 2}, second_takes=True)
+    with pytest.raises(UserError, match="protocol 1xgpt compares with reconstructions, of which there is no second"):
+        list(evaluate_run(run.directory, run.data_directory, reconstructed))
 
 
 def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
