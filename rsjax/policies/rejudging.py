@@ -16,7 +16,7 @@ from rsjax.errors import UserError
 from rsjax.files import read_json, write_json
 from rsjax.policies.comparison import compared, write_results
 from rsjax.policies.judge_validation import scores, summary
-from rsjax.policies.other_judges import HumanJudge, LanguageJudge, video_name, write_blinded
+from rsjax.policies.other_judges import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
 from rsjax.policies.trials import Result, Trials
 from rsjax.policies.verdicts import FAIL, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.progress import Progress
@@ -31,8 +31,8 @@ def blind(out: Path, folder: Path) -> Path:
     Raises:
         UserError: ``out`` has no finished comparison, or the folder has a sheet already.
     """
-    if folder.exists():
-        raise UserError(f"{folder}: exists; its labels would be lost, so name a new folder")
+    if (folder / SHEET).exists():
+        raise UserError(f"{folder / SHEET}: exists; its labels would be lost, so name a new folder")
     worlds = _rollouts(out, _results(out)).values()
     return write_blinded([video for policies in worlds for videos in policies.values() for video in videos], folder)
 
