@@ -32,9 +32,9 @@ from rsjax.convert.table import (
 from rsjax.convert.vae_names import vae_table
 from rsjax.files import parse_json
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
-from rsjax.models.ivideogpt.networks import ConditionalVQ
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import Inputs, read_model, saved_inputs
+from rsjax.tokenizers.conditional_vq import ConditionalVQ
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights
 

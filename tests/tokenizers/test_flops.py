@@ -12,7 +12,7 @@ import pytest
 
 from rsjax.config import Config, KLConfig, TokenizerConfig
 from rsjax.models.base import create_autoencoder
-from rsjax.models.ivideogpt.networks import Codebook, CrossAttention
+from rsjax.tokenizers.conditional_vq import Codebook, CrossAttention
 from rsjax.tokenizers.flops import products, tokenizer_flops
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.vae_blocks import SelfAttention

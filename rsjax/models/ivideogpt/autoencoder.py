@@ -23,9 +23,9 @@ from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.errors import UserError
-from rsjax.models.ivideogpt.networks import ConditionalVQ, Reconstruction
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.conditional_vq import ConditionalVQ, Reconstruction
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.training import lpips_weights, require_no_adversarial

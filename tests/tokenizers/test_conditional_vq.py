@@ -14,7 +14,7 @@ from rsjax.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, toke
 from rsjax.convert.table import public_shapes, to_tensors
 from rsjax.describe import count
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
-from rsjax.models.ivideogpt.networks import Codebook, ConditionalVQ
+from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
 from tests.models.ivideogpt.toy import SIZE, VQ, frames, vq_params
 
 LARGE = ConditionalVQConfig(context_frames=2, widths=(128, 256, 256, 512, 768), attention_size=32)
