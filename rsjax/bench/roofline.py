@@ -1,4 +1,6 @@
-"""The roofline of a training step: the time of each kind of operation beside the least that this machine allows.
+"""Rooflines: the time of each kind of operation beside the least that this machine allows.
+
+They cover a training step, the tokenizer's products for one image, and a pass of cached sampling.
 
 The least time is that of its matrix products at the measured ceiling, or of its reads and writes at the measured
 bandwidth, whichever is longer: every operand is read once and every result written once, in float32 (Williams et al.
@@ -8,22 +10,31 @@ them across these borders, or operands that fit the processor's caches, go below
 Axes: R rows (clips · frames · cells), C width.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax.extend.core import jaxprs_in_params
 
+from rsjax.bench import inputs
 from rsjax.bench.timing import median_seconds
-from rsjax.config import Config
+from rsjax.config import Config, TokenizerConfig
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import Dense, attend, attend_cells, layer_norm
+from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.gelu import gelu
+from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.transformer import Cache
+from rsjax.models.roboscape.window import cache_slots
+from rsjax.tokenizers.flops import products as count_products
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.trainable import Params
 from rsjax.training.state import make_optimizer
 
 STREAM = 2**24  # numbers in each of the arrays by which the bandwidth is measured: 64 MiB, more than a cache holds
@@ -52,28 +63,38 @@ class Operation:
 
 
 def roofline(config: Config, batch: int, ceiling: float, budget: float) -> dict[str, Any]:
-    """Measures each kind of operation of a training step alone, forward and gradient.
+    """Measures each kind of operation alone: of a training step, forward and gradient, and of the tokenizer.
 
     Args:
         ceiling: operations a second of matrix products.
         budget: seconds per quantity.
 
     Returns:
-        For each operation seconds in a whole step, the least seconds, and the share of the second in the first; the
-        sums; and the bandwidth. Empty for a family other than RoboScape and Genie.
+        For each operation seconds in a whole step, or for one image; the least seconds; and the share of the second in
+        the first; the sums; the same of one pass of cached sampling; and the bandwidth. Empty for a family other than
+        RoboScape and Genie.
     """
     model = create_model(config)
     if not isinstance(model, RoboScape):
         return {}
     speed = bandwidth(budget)
-    numbers: dict[str, Any] = {"roofline_bandwidth_bytes_per_s": speed}
-    rows = {each.name: _measure(each, ceiling, speed, budget) for each in operations(model.architecture, config, batch)}
-    rows["optimizer"] = _optimizer(config, model, speed, budget)
-    for name, (seconds, least) in rows.items():
-        numbers |= {f"roofline_{name}_s": seconds, f"roofline_{name}_least_s": least}
-        numbers[f"roofline_{name}_share"] = least / seconds
-    total, least = (sum(row[place] for row in rows.values()) for place in (0, 1))
-    return numbers | {"roofline_sum_s": total, "roofline_sum_least_s": least, "roofline_sum_share": least / total}
+    measure = partial(_measure, ceiling=ceiling, speed=speed, budget=budget)
+    step = {each.name: measure(each) for each in operations(model.architecture, config, batch)}
+    step["optimizer"] = _optimizer(config, model, speed, budget)
+    numbers: dict[str, Any] = {"roofline_bandwidth_bytes_per_s": speed} | _rows("roofline", step)
+    for half, products in tokenizer_operations(config.tokenizer, config.clips.image_size).items():
+        numbers |= _rows(f"roofline_{half}", {each.name: measure(each, gradient=False) for each in products})
+    return numbers | _row("roofline_cached_pass", *_cached_pass(model, batch, ceiling, speed, budget))
+
+
+def _row(name: str, seconds: float, least: float) -> dict[str, float]:
+    return {f"{name}_s": seconds, f"{name}_least_s": least, f"{name}_share": least / seconds}
+
+
+def _rows(prefix: str, rows: dict[str, tuple[float, float]]) -> dict[str, float]:
+    """Returns the numbers of several operations, seconds and least seconds of each, and of their sum."""
+    rows = rows | {"sum": (sum(row[0] for row in rows.values()), sum(row[1] for row in rows.values()))}
+    return {key: x for name, row in rows.items() for key, x in _row(f"{prefix}_{name}", *row).items()}
 
 
 def bandwidth(budget: float) -> float:
@@ -119,6 +140,73 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
     )
 
 
+def tokenizer_operations(config: TokenizerConfig, image_size: int) -> dict[str, tuple[Operation, ...]]:
+    """Returns the distinct convolutions and linear layers that "encode" and "decode" one image."""
+    network, side = Tokenizer(config), config.grid(image_size)
+    params = jax.eval_shape(network.init_params, jax.random.key(0))
+    images = jax.ShapeDtypeStruct((1, image_size, image_size, 3), "float32")
+    tokens = jax.ShapeDtypeStruct((1, side, side), "int32")
+
+    def of(method: str, x: Any) -> tuple[Operation, ...]:
+        found: dict[str, list[Operation]] = {}
+        for each in _traced(jax.make_jaxpr(partial(network.apply, method=method))({"params": params}, x).jaxpr):
+            found.setdefault(each.name, []).append(each)
+        return tuple(replace(each[0], times=len(each)) for each in found.values())
+
+    return {"encode": of("encode", images), "decode": of("decode", tokens)}
+
+
+def _traced(jaxpr: Any) -> Iterator[Operation]:
+    """Yields a program's products, named after kernel, stride, channels and side of the result."""
+    for eqn in jaxpr.eqns:
+        for inner in jaxprs_in_params(eqn.params):
+            yield from _traced(inner)
+        if eqn.primitive.name not in ("conv_general_dilated", "dot_general"):
+            continue
+        shapes, out = tuple(x.aval.shape for x in eqn.invars), eqn.outvars[0].aval.shape
+        name = f"linear_{shapes[1][0]}_to_{out[-1]}"
+        if eqn.primitive.name == "conv_general_dilated":
+            rows, columns, inputs, outputs = shapes[1]
+            stride = eqn.params["window_strides"][0]
+            name = f"{rows}x{columns}{f'_stride_{stride}' * (stride > 1)}_{inputs}_to_{outputs}_at_{out[1]}"
+        run = partial(eqn.primitive.bind, **eqn.params)
+        yield Operation(name, 1, run, shapes, count_products(jax.make_jaxpr(run)(*map(jnp.zeros, shapes)).jaxpr))
+
+
+def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
+    """Returns a pass over the last frame of a full window, from parameters and the cache of the frames before."""
+    arch, sample = model.architecture, model.config.sample
+    tokens, actions = inputs.prompt(arch, batch, 1), inputs.actions(arch, batch, 1)
+    hidden = jnp.ones((batch, 1, arch.grid**2), bool)
+
+    def run(params: Params, cache: Cache) -> Any:
+        start = jnp.asarray(arch.frames - 1)
+        return apply_guided(arch, sample, params, tokens, hidden, actions, start, cache, previous=tokens)[0]
+
+    return run
+
+
+def full_cache(model: RoboScape, batch: int) -> Cache:
+    """Returns a cache of a full window."""
+    return guided_cache(model.architecture, model.config.sample, batch, cache_slots(model.architecture, 1))
+
+
+def pass_flops(arch: Architecture, cache: Cache) -> int:
+    """Returns the operations of a pass over one frame that reads the cache and itself."""
+    _, clips, _, _, slots, _ = cache["rgb"].k.shape
+    return clips * forward_flops(arch, slots + 1) // (slots + 1)
+
+
+def _cached_pass(model: RoboScape, batch: int, ceiling: float, speed: float, budget: float) -> tuple[float, float]:
+    """Returns seconds and least seconds of a pass, which reads parameters and cache once."""
+    params = jax.jit(model.init)(jax.random.key(0))
+    cache = full_cache(model, batch)
+    run = jax.jit(cached_pass(model, batch))
+    seconds = median_seconds(lambda: run(params, cache), budget)
+    read = sum(x.nbytes for x in jax.tree.leaves((params, cache)))
+    return seconds, max(pass_flops(model.architecture, cache) / ceiling, read / speed)
+
+
 def _causal(frames: int, q: Any, k: Any, v: Any) -> Any:
     return attend(q, k, v, jnp.tril(jnp.ones((frames, frames), bool)))
 
@@ -127,8 +215,10 @@ def _cross_entropy(logits: Any) -> Any:
     return optax.softmax_cross_entropy_with_integer_labels(logits, jnp.zeros(logits.shape[:-1], jnp.int32))
 
 
-def _measure(operation: Operation, ceiling: float, speed: float, budget: float) -> tuple[float, float]:
-    """Returns seconds and least seconds of an operation in a whole step."""
+def _measure(
+    operation: Operation, ceiling: float, speed: float, budget: float, gradient: bool = True
+) -> tuple[float, float]:
+    """Returns seconds and least seconds of an operation in all its places, with its gradient or without."""
     keys = jax.random.split(jax.random.key(0), len(operation.shapes))
     operands = [jax.random.normal(key, shape) for key, shape in zip(keys, operation.shapes, strict=True)]
 
@@ -138,12 +228,15 @@ def _measure(operation: Operation, ceiling: float, speed: float, budget: float) 
         return out, pull(cotangent)
 
     out = jax.eval_shape(operation.run, *operands)
+    forward = jax.jit(operation.run)
     cotangent = jnp.ones(out.shape, out.dtype)
-    seconds = median_seconds(lambda: both(cotangent, *operands), budget)
+    run = partial(both, cotangent, *operands) if gradient else partial(forward, *operands)
+    seconds = median_seconds(run, budget)
     read = sum(x.size for x in operands)
     # Forward: operands and result. Gradient: operands, the result's gradient, and the operands' gradients.
-    moved = FLOAT * (read + out.size + (0 if operation.passes_on else 2 * read + out.size))
-    return operation.times * seconds, operation.times * max(3 * operation.flops / ceiling, moved / speed)
+    moved = FLOAT * (read + out.size + (gradient and not operation.passes_on) * (2 * read + out.size))
+    products = (3 if gradient else 1) * operation.flops
+    return operation.times * seconds, operation.times * max(products / ceiling, moved / speed)
 
 
 def _optimizer(config: Config, model: RoboScape, speed: float, budget: float) -> tuple[float, float]:

@@ -1,14 +1,19 @@
 """The roofline's operations are those of the model."""
 
 from dataclasses import replace
+from typing import Any
 
+import jax
 import pytest
 
-from rsjax.bench.roofline import operations, roofline
+from rsjax.bench.roofline import cached_pass, full_cache, operations, pass_flops, roofline, tokenizer_operations
 from rsjax.bench.run import bench
-from rsjax.config import ConfigError, presets
+from rsjax.config import ConfigError, TokenizerConfig, presets
+from rsjax.config.leaves import with_values
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.model import RoboScape
+from rsjax.tokenizers.flops import products, tokenizer_flops
 from tests.models.toy_family import ToyConfig
 
 
@@ -18,6 +23,25 @@ def test_their_products_are_all_that_the_model_counts(name: str) -> None:
     arch = replace(create_model(config).architecture, action_inputs=0)  # type: ignore[attr-defined]
     counted = sum(each.times * each.flops for each in operations(arch, config, 3))
     assert counted == 3 * forward_flops(arch, config.clips.frames)
+
+
+@pytest.mark.parametrize("changes", [{}, {"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
+def test_the_tokenizers_products_are_all_that_it_counts(changes: dict[str, Any]) -> None:
+    config = TokenizerConfig(
+        channels=8, channel_multipliers=(1, 1, 2), res_blocks=2, norm_groups=4, code_bits=6, **changes
+    )
+    halves, counted = tokenizer_operations(config, 64), tokenizer_flops(config, 64)
+    for half, name in (("encode", "encoder"), ("decode", "decoder")):
+        assert sum(each.times * each.flops for each in halves[half]) == counted[name]
+
+
+@pytest.mark.parametrize("changes", [{}, {"use_depth": False, "positions": "rotary"}])
+def test_a_cached_passs_products_are_all_that_the_model_counts(changes: dict[str, Any]) -> None:
+    config = with_values(presets.debug(), {f"model.{name}": value for name, value in changes.items()})
+    model = create_model(config)
+    assert isinstance(model, RoboScape)
+    params, cache = jax.eval_shape(model.init, jax.random.key(0)), full_cache(model, 3)
+    assert products(jax.make_jaxpr(cached_pass(model, 3))(params, cache).jaxpr) == pass_flops(model.architecture, cache)
 
 
 def test_other_families_and_a_missing_ceiling() -> None:
