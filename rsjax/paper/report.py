@@ -138,7 +138,7 @@ def _arm(arm: Trained, outcome: Outcome, columns: Sequence[Metric]) -> dict[str,
     published = outcome.claim.arm(arm.name).published
     config = arm.cells[0].config if arm.cells else None
     seconds = [sum(_trained(result).values()) for result in arm.finished]
-    flops = sum(budget.training_cost(config, "flops")) if config else None
+    flops = sum(budget.training_cost(config, "flops")) if config and arm.finished else None
     return {
         "name": arm.name,
         "absent": arm.absent,
