@@ -62,7 +62,9 @@ def measure(run: Run, name: str) -> None:
     result: dict[str, Any] = {}
     try:
         scores = _MEASUREMENTS[name][0](run)
-        result["scores"] = {key: [x if math.isfinite(x) else None for x in values] for key, values in scores.items()}
+        result["scores"] = {
+            key: [float(x) if math.isfinite(x) else None for x in values] for key, values in scores.items()
+        }
     except Exception as error:
         line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         note(f"{name} failed: {line}")

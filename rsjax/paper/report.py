@@ -246,11 +246,8 @@ def _missing(result: Result) -> str:
 def _figure(outcome: Outcome) -> bytes | None:
     """Draws the arms' scores with every seed; None before any arm has one."""
     names = {column.name for column in _columns(outcome)}
-    rows = [
-        Row({"": arm.name}, arm.finished, {name: value for name, value in arm.spreads.items() if name in names})
-        for arm in outcome.arms
-        if arm.spreads
-    ]
+    shown = [(arm, {name: value for name, value in arm.spreads.items() if name in names}) for arm in outcome.arms]
+    rows = [Row({"": arm.name}, arm.finished, spreads) for arm, spreads in shown if spreads]
     return draw(rows, f"{outcome.claim.place}: {outcome.claim.title}") if rows else None
 
 

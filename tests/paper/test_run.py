@@ -178,6 +178,7 @@ def test_policies_that_never_succeed_are_not_as_good_as_one_another(
     (found,) = claim["comparisons"]
     assert found["verdict"] == verdict and found["values"]["low"] < 0 < found["values"]["high"]
     assert claim["header"] == [], "the arms' own evaluations have no such score"
+    assert not (tmp_path / "out" / "figures" / "toy.png").exists()
 
 
 def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Path, longer: list[str]) -> None:

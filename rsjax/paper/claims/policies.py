@@ -27,7 +27,8 @@ from rsjax.policies.trials import Trials, lift_simulators
 from rsjax.progress import Progress
 
 STRONG = 0.9  # correlation with success in the simulator that is asked for
-POLICY_STEP, JUDGE_STEP, EPISODE, DECISION = 0.3, 0.13, 0.8, 1.0  # seconds on 2 cores
+# Seconds on 2 cores; a decision is one of 96 sequences.
+POLICY_STEP, JUDGE_STEP, EPISODE, DECISION = 0.31, 0.12, 1.7, 6.5
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,6 @@ def judged(run: Run) -> Scores:
     """Rolls eight stages of a policy's training out in the simulator and in the run's world model."""
     size = Size.of(run.config)
     data, place = _judged(run, size), _place(run, size)
-    place.parent.mkdir(parents=True, exist_ok=True)
     with making(place, wait=True), lift_simulators(data.simulator, size.trials) as simulator:
         demos = data.demos()
         policies = comparison.checkpoints(size.policy, demos.first(min(size.demos, len(demos))), place / "judged")
