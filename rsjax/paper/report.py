@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -252,20 +253,26 @@ def _figure(outcome: Outcome) -> bytes | None:
 
 
 def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Draws the clip that is in the middle by the first arm's PSNR, as the first seed of every arm predicts it.
+    """Draws a clip as the first seed of every arm predicts it: of those that all arms kept, the first arm's middle one.
 
-    None with fewer than two arms, or where their frames were not kept.
+    None with fewer than two arms, or where no frames of the same clip were kept.
     """
     arms = [(arm.name, arm.finished[0]) for arm in outcome.arms if arm.finished]
     try:
         kept = [(name, read_frames(result.run.output("evaluation"))) for name, result in arms]
     except UserError:
         return None
-    if len(kept) < 2 or len({frames["truth"].tobytes() for _, frames in kept}) > 1:
+    if len(kept) < 2:
         return None
-    truth, prompt = kept[0][1]["truth"], arms[0][1].run.config.prompt_frames
-    error = np.square(kept[0][1]["prediction"].astype(float) - truth).mean((1, 2, 3, 4))
+    rows = reduce(np.intersect1d, [frames["rows"] for _, frames in kept])
+    places = [np.searchsorted(frames["rows"], rows) for _, frames in kept]
+    truths = [frames["truth"][place] for (_, frames), place in zip(kept, places, strict=True)]
+    if not len(rows) or any(not np.array_equal(truths[0], truth) for truth in truths):
+        return None
+    predictions = [frames["prediction"][place] for (_, frames), place in zip(kept, places, strict=True)]
+    error = np.square(predictions[0].astype(float) - truths[0]).mean((1, 2, 3, 4))
     middle = int(np.argsort(error)[len(error) // 2])
-    others = tuple((name, frames["prediction"][middle]) for name, frames in kept)
+    others = tuple((name, frames[middle]) for (name, _), frames in zip(kept, predictions, strict=True))
     title = f"the clip in the middle by {arms[0][0]}'s PSNR, first seed of each"
-    return filmstrip(ComparedClip(title, truth[middle], None, prompt_frames=prompt, others=others))
+    prompt = arms[0][1].run.config.prompt_frames
+    return filmstrip(ComparedClip(title, truths[0][middle], None, prompt_frames=prompt, others=others))
