@@ -29,12 +29,14 @@ def test_a_frame_attends_to_itself_alone() -> None:
     np.testing.assert_array_equal(together[1:], alone)
 
 
-@pytest.mark.parametrize("frames_at_once", [1, 2])  # all of them in turn; two, and one is left over
-def test_taking_few_frames_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch, frames_at_once: int) -> None:
+@pytest.mark.parametrize("unrolled", [1, 2])  # frame by frame; two at a time, and one is left over
+def test_how_far_the_loop_is_unrolled_changes_nothing(monkeypatch: pytest.MonkeyPatch, unrolled: int) -> None:
     q, k, v, cotangent = (jax.random.normal(key, (3, 6, 2, 4)) for key in jax.random.split(jax.random.key(2), 4))
-    together = jax.vjp(attend_in_frames, q, k, v)[1](cotangent)
-    monkeypatch.setattr(frame_attention, "SCORES_AT_ONCE", frames_at_once * 2 * 6 * 6)
-    for x, y in zip(jax.vjp(attend_in_frames, q, k, v)[1](cotangent), together, strict=True):
+    out, pull = jax.vjp(attend_in_frames, q, k, v)
+    gradients = pull(cotangent)
+    monkeypatch.setattr(frame_attention, "UNROLLED", unrolled)
+    other, pull = jax.vjp(attend_in_frames, q, k, v)
+    for x, y in zip((other, *pull(cotangent)), (out, *gradients), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-6)
 
 
