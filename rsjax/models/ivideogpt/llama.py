@@ -10,11 +10,11 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import ClipShape, IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.models.roboscape.attention import Dense, KeyValues, attend_parts, put_frames, rotate
+from rsjax.models.roboscape.attention import Dense, KeyValues, attend_cells, attend_parts, put_frames, rotate
 from rsjax.trainable import Params
 
 NORMAL = nn.initializers.normal(0.02)
@@ -67,18 +67,20 @@ class Block(nn.Module):
             for name in "qkv"
         )
         q, k = (rotate(y[:, :, None], positions)[:, :, 0] for y in (q, k))
-        q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))  # B h L e
-        new = KeyValues(k, v)
-        causal = positions[:, None] >= positions[None, :]
-        if cache is None:
-            out = _attend(q, new, causal, None if keys is None else folded(keys, jnp.full(len(keys), number)), cfg)
-        else:
+        new = None
+        if cache is not None:
+            q, k, v = (y.swapaxes(1, 2) for y in (q, k, v))  # B h L e
+            new = KeyValues(k, v)
             earlier = jnp.broadcast_to(jnp.arange(cache.k.shape[-2]) < first, (x.shape[1], cache.k.shape[-2]))
-            out = attend_parts(q, [(cache, earlier), (new, causal)])
-        x = x + dense(cfg.width, name="o_proj")(out.swapaxes(1, 2).reshape(x.shape))
+            out = attend_parts(q, [(cache, earlier), (new, jnp.tri(x.shape[1], dtype=bool))]).swapaxes(1, 2)
+        elif keys is not None:
+            out = _attend_some(q, k, v, folded(keys, jnp.full(len(keys), number)), cfg)
+        else:
+            out = attend_cells(q, k, v, cfg.compute_dtype == "bfloat16", causal=True)
+        x = x + dense(cfg.width, name="o_proj")(out.reshape(x.shape))
         h = norm(name="post_attention_layernorm")(x)
         gated = nn.silu(dense(cfg.mlp_width, name="gate_proj")(h)) * dense(cfg.mlp_width, name="up_proj")(h)
-        return x + dense(cfg.width, name="down_proj")(gated), None if cache is None else new
+        return x + dense(cfg.width, name="down_proj")(gated), new
 
 
 def folded(keys: Key[Array, " B"], numbers: Int[Array, " B"]) -> Key[Array, " B"]:
@@ -86,22 +88,21 @@ def folded(keys: Key[Array, " B"], numbers: Int[Array, " B"]) -> Key[Array, " B"
     return jax.vmap(jax.random.fold_in)(keys, numbers)
 
 
-def _attend(
-    q: Float[Array, "B h L e"],
-    kv: KeyValues,
-    causal: Bool[Array, "L L"],
-    keys: Key[Array, " B"] | None,
+def _attend_some(
+    q: Float[Array, "B L h e"],
+    k: Float[Array, "B L h e"],
+    v: Float[Array, "B L h e"],
+    keys: Key[Array, " B"],
     config: IVideoGPTConfig,
-) -> Float[Array, "B h L e"]:
-    """Returns softmax(q·kᵀ/√e)·v in the past; on an accelerator with bf16 operands if linear layers have them."""
-    bf16 = config.compute_dtype == "bfloat16" and jax.default_backend() != "cpu"
-    q, k, v = (x.astype(jnp.bfloat16 if bf16 else x.dtype) for x in (q, kv.k, kv.v))
-    scores = jnp.einsum("bhqe,bhke->bhqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
-    weights = jax.nn.softmax(jnp.where(causal, scores, jnp.finfo(jnp.float32).min), axis=-1)
-    if keys is not None:
-        keep = jax.vmap(lambda key: jax.random.bernoulli(key, 1 - config.dropout, weights.shape[1:]))(keys)
-        weights = jnp.where(keep, weights / (1 - config.dropout), 0.0)
-    return jnp.einsum("bhqk,bhke->bhqe", weights.astype(v.dtype), v, preferred_element_type=jnp.float32)
+) -> Float[Array, "B L h e"]:
+    """Returns softmax(q·kᵀ/√e)·v in the past with dropout of the weights; products as in :func:`attend_cells`."""
+    if config.compute_dtype == "bfloat16" and jax.default_backend() != "cpu":
+        q, k, v = (x.astype(jnp.bfloat16) for x in (q, k, v))
+    scores = jnp.einsum("bqhe,bkhe->bhqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
+    weights = jax.nn.softmax(jnp.where(jnp.tri(q.shape[1], dtype=bool), scores, jnp.finfo(jnp.float32).min), axis=-1)
+    keep = jax.vmap(lambda key: jax.random.bernoulli(key, 1 - config.dropout, weights.shape[1:]))(keys)
+    weights = jnp.where(keep, weights / (1 - config.dropout), 0.0)
+    return jnp.einsum("bhqk,bkhe->bqhe", weights.astype(v.dtype), v, preferred_element_type=jnp.float32)
 
 
 class LLaMA(nn.Module):

@@ -91,16 +91,26 @@ def attend_parts(
 
 
 def attend_cells(
-    q: Float[Array, "B T S h e"], k: Float[Array, "B T S h e"], v: Float[Array, "B T S h e"], bf16: bool
-) -> Float[Array, "B T S h e"]:
-    """Returns :func:`attend` within each frame, by the fastest implementation on this platform."""
-    frames = [x.reshape(-1, *x.shape[2:]) for x in (q, k, v)]
+    q: Float[Array, "*N S h e"],
+    k: Float[Array, "*N S h e"],
+    v: Float[Array, "*N S h e"],
+    bf16: bool,
+    causal: bool = False,
+) -> Float[Array, "*N S h e"]:
+    """Returns :func:`attend` within each frame, or each sequence, by the fastest implementation on this platform.
+
+    Args:
+        bf16: whether products may round their operands to bf16.
+        causal: whether a query sees its own key and those before it alone.
+    """
+    frames = [x.reshape(-1, *x.shape[-3:]) for x in (q, k, v)]
     if bf16 and jax.default_backend() != "cpu":
-        out = jax.nn.dot_product_attention(*(x.astype(jnp.bfloat16) for x in frames)).astype(q.dtype)
+        halves = (x.astype(jnp.bfloat16) for x in frames)
+        out = jax.nn.dot_product_attention(*halves, is_causal=causal).astype(q.dtype)
     elif bf16 and q.shape[-3] >= LARGE_FRAME:
-        out = attend_in_frames(*frames)
+        out = attend_in_frames(frames[0], frames[1], frames[2], causal)
     else:
-        out = attend(frames[0], frames[1], frames[2], None)
+        out = attend(frames[0], frames[1], frames[2], jnp.tri(q.shape[-3], dtype=bool) if causal else None)
     return out.reshape(q.shape)
 
 

@@ -1,4 +1,4 @@
-"""Attention among the cells of a frame with bf16 products and a hand-written gradient, fast on CPUs.
+"""Attention within frames, or within other sequences, with bf16 products and a hand-written gradient, fast on CPUs.
 
 A frame's scores are the largest arrays of a training step. They are not kept: the gradient recomputes them from
 queries, keys and each row's log-sum. Both passes treat frames one by one, so that a frame's scores stay in the
@@ -6,10 +6,11 @@ processor's cache, and unroll the loop over them, so that XLA runs several frame
 contracts the last axis of its first operand, the only form for which XLA's CPU backend has fast bf16 kernels. So the
 gradients of keys and values transpose their small operands in memory, never the scores.
 
-Axes: N frames, S cells (q of the queries, k of the keys), h heads, e head width.
+Axes: N frames (or sequences), S cells (q of the queries, k of the keys), h heads, e head width.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,25 +22,30 @@ from rsjax.models.roboscape.matmul import transposed_in_memory
 UNROLLED = 16  # frames whose code is written out; compiling takes as long as there are
 
 
-@jax.custom_vjp
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
 def attend_in_frames(
-    q: Float[Array, "N S h e"], k: Float[Array, "N S h e"], v: Float[Array, "N S h e"]
+    q: Float[Array, "N S h e"], k: Float[Array, "N S h e"], v: Float[Array, "N S h e"], causal: bool = False
 ) -> Float[Array, "N S h e"]:
-    """Returns softmax(q·kᵀ/√e)·v: operands rounded to bf16, accumulation and softmax float32; float32 in and out."""
-    return _forward(q, k, v)[0]
+    """Returns softmax(q·kᵀ/√e)·v: operands rounded to bf16, accumulation and softmax float32; float32 in and out.
+
+    Args:
+        causal: whether a query sees its own key and those before it alone.
+    """
+    return _forward(q, k, v, causal)[0]
 
 
-def _forward(q: Array, k: Array, v: Array) -> tuple[Array, tuple[Array, ...]]:
+def _forward(q: Array, k: Array, v: Array, causal: bool) -> tuple[Array, tuple[Array, ...]]:
     q, k, v = (_head_major(x).astype(jnp.bfloat16) for x in (q * q.shape[-1] ** -0.5, k, v))
-    out, log_total = _each_frame(_frame, q, k, v)
+    out, log_total = _each_frame(partial(_frame, causal), q, k, v)
     return _head_major(out), (q, k, v, out, log_total)
 
 
-def _backward(saved: tuple[Array, ...], cotangent: Array) -> tuple[Array, Array, Array]:
+def _backward(causal: bool, saved: tuple[Array, ...], cotangent: Array) -> tuple[Array, Array, Array]:
     q, k, v, out, log_total = saved
     g = _head_major(cotangent)
     along = jnp.sum(g * out, axis=-1, keepdims=True)  # Σ_k p·dp of each row
-    dq, dk_t, dv_t = _each_frame(_frame_gradient, q, k, v, g.astype(jnp.bfloat16), along, log_total)
+    gradient = partial(_frame_gradient, causal)
+    dq, dk_t, dv_t = _each_frame(gradient, q, k, v, g.astype(jnp.bfloat16), along, log_total)
     return (
         _head_major(dq) * q.shape[-1] ** -0.5,  # the saved queries hold this factor already
         dk_t.transpose(0, 3, 1, 2),
@@ -51,27 +57,32 @@ def _each_frame(run: Callable[..., Any], *operands: Array) -> Any:
     return jax.lax.scan(lambda _, frame: (None, run(*frame)), None, operands, unroll=UNROLLED)[1]
 
 
-def _frame(q: Array, k: Array, v: Array) -> tuple[Array, Array]:
+def _frame(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
     """Returns one frame's output (h, S, e), and the log-sum of each row of its scores (h, S, 1)."""
-    scores = _product("hqe,hke->hqk", q, k)
+    scores = _scores(q, k, causal)
     top = jnp.max(scores, axis=-1, keepdims=True)
-    weights = jnp.exp(scores - top)
-    total = jnp.sum(weights, axis=-1, keepdims=True)
-    return _product("hqk,hke->hqe", weights.astype(jnp.bfloat16), v) / total, top + jnp.log(total)
+    weights = jnp.exp(scores - top).astype(jnp.bfloat16)
+    total = jnp.sum(weights, axis=-1, keepdims=True, dtype=jnp.float32)
+    return _product("hqk,hke->hqe", weights, v) / total, top + jnp.log(total)
 
 
 def _frame_gradient(
-    q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
+    causal: bool, q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
     """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
-    weights = jnp.exp(_product("hqe,hke->hqk", q, k) - log_total)
+    weights = jnp.exp(_scores(q, k, causal) - log_total).astype(jnp.bfloat16)
     of_weights = _product("hqe,hke->hqk", g, v)
     of_scores = (weights * (of_weights - along)).astype(jnp.bfloat16)
     return (
         _product("hqk,hke->hqe", of_scores, k),
         _product("heq,hqk->hek", transposed_in_memory(q), of_scores),
-        _product("heq,hqk->hek", transposed_in_memory(g), weights.astype(jnp.bfloat16)),
+        _product("heq,hqk->hek", transposed_in_memory(g), weights),
     )
+
+
+def _scores(q: Array, k: Array, causal: bool) -> Array:
+    scores = _product("hqe,hke->hqk", q, k)
+    return jnp.where(jnp.tri(len(q[0]), dtype=bool), scores, -jnp.inf) if causal else scores
 
 
 def _head_major(x: Array) -> Array:

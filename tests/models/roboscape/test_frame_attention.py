@@ -12,11 +12,13 @@ from rsjax.models.roboscape.frame_attention import attend_in_frames
 from rsjax.models.roboscape.transformer import Transformer
 
 
-def test_output_and_gradients_are_plain_attention_s_to_bf16_rounding() -> None:
+@pytest.mark.parametrize("causal", [False, True])
+def test_output_and_gradients_are_plain_attention_s_to_bf16_rounding(causal: bool) -> None:
     keys = jax.random.split(jax.random.key(0), 4)
     q, k, v, cotangent = (jax.random.normal(key, (3, 10, 2, 8)) for key in keys)  # N S h e
-    found, pull = jax.vjp(jax.jit(attend_in_frames), q, k, v)
-    plain, pull_plain = jax.vjp(lambda q, k, v: attend(q, k, v, None), q, k, v)
+    found, pull = jax.vjp(jax.jit(lambda *x: attend_in_frames(*x, causal)), q, k, v)
+    mask = jnp.tri(10, dtype=bool) if causal else None
+    plain, pull_plain = jax.vjp(lambda q, k, v: attend(q, k, v, mask), q, k, v)
     for x, y in zip((found, *pull(cotangent)), (plain, *pull_plain(cotangent)), strict=True):
         assert x.dtype == jnp.float32 and x.shape == y.shape
         np.testing.assert_allclose(x, y, atol=0.02 * float(jnp.max(jnp.abs(y))))
