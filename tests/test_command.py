@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rsjax.command import UNREAD
 from rsjax.runtime import ANSWERS, INTERRUPTED, TERMINATED
 
 ROOT = Path(__file__).parents[1]
@@ -127,3 +128,15 @@ def test_a_program_that_imports_commands_keeps_its_handlers() -> None:
     program = "import signal, experiments.train, rsjax.convert; print(signal.getsignal(signal.SIGINT).__name__)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "default_int_handler\n"
+
+
+def test_output_that_nobody_reads_any_more_ends_a_command_without_a_word() -> None:
+    lines = "for i in range(10**5): print(i)"
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, lines], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout and process.stderr
+        assert process.stdout.readline() == "0\n"
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == UNREAD
