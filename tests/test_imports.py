@@ -21,6 +21,7 @@ ORDER = [
     "sim",
     "ingest",
     "trainable",
+    "matmul",
     "tokenizers",
     "models",
     "training",

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import fitting_sizes, require, require_range
+from rsjax.config.fields import added, fitting_sizes, require, require_range
 from rsjax.config.train import LoopConfig
 
 
@@ -28,6 +28,9 @@ class TokenizerConfig:
     vocabularies: int = 2  # n: the vocabulary of 2^D is factorised into n of 2^(D/n)
     # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
     depth_scale: Literal["linear", "inverse"] = "inverse"
+
+    # bfloat16: operands of convolutions, added up in float32. The public code computes in float32.
+    compute_dtype: Literal["float32", "bfloat16"] = added("float32")
 
     def __post_init__(self) -> None:
         sizes = ("patch_size", "channels", "res_blocks", "norm_groups", "code_bits", "vocabularies")

@@ -6,7 +6,7 @@ downsampling pads symmetrically, and there is no attention. Submodules are named
 Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from jaxtyping import Array, Float, Int
 
 from rsjax.config import TokenizerConfig
 from rsjax.tokenizers import lfq
+from rsjax.tokenizers.convolution import conv
+
+Dtype = Literal["float32", "bfloat16"]
 
 
 def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:
@@ -30,9 +33,9 @@ def depth_to_space(x: Float[Array, "B h w C2"], factor: int) -> Float[Array, "B 
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height * factor, width * factor, c // factor**2)
 
 
-def _conv3(features: int, name: str, bias: bool = False, stride: int = 1) -> nn.Conv:
+def _conv3(features: int, name: str, dtype: Dtype, bias: bool = False, stride: int = 1) -> nn.Conv:
     # Symmetric padding even with stride 2, where 'SAME' would pad one side only.
-    return nn.Conv(features, (3, 3), (stride, stride), padding=((1, 1), (1, 1)), use_bias=bias, name=name)
+    return conv(features, 3, dtype, name, stride, padding=((1, 1), (1, 1)), use_bias=bias)
 
 
 class ResBlock(nn.Module):
@@ -43,6 +46,7 @@ class ResBlock(nn.Module):
 
     features: int
     groups: int
+    dtype: Dtype
     local: bool = False
 
     @nn.compact
@@ -50,14 +54,14 @@ class ResBlock(nn.Module):
         h = x
         for i in (1, 2):
             h = nn.swish(_norm(self.groups, f"norm{i}", local=self.local)(h))
-            h = _inner_conv(self.features, f"conv{i}", self.local)(h)
+            h = _inner_conv(self.features, f"conv{i}", self.dtype, self.local)(h)
         if x.shape[-1] != self.features:
-            x = nn.Conv(self.features, (1, 1), use_bias=False, name="nin_shortcut")(x)
+            x = conv(self.features, 1, self.dtype, "nin_shortcut", use_bias=False)(x)
         return x + h
 
 
-def _inner_conv(features: int, name: str, local: bool) -> nn.Conv:
-    return nn.Conv(features, (1, 1), use_bias=False, name=name) if local else _conv3(features, name)
+def _inner_conv(features: int, name: str, dtype: Dtype, local: bool) -> nn.Conv:
+    return conv(features, 1, dtype, name, use_bias=False) if local else _conv3(features, name, dtype)
 
 
 def _norm(groups: int, name: str, affine: bool = True, local: bool = False) -> nn.GroupNorm:
@@ -96,22 +100,24 @@ class Encoder(nn.Module):
     def __call__(self, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w D"]:
         cfg = self.config
         x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
-        local = cfg.local_codes
-        x = _inner_conv(cfg.channels, "conv_in", local)(x)
+        local, dtype = cfg.local_codes, cfg.compute_dtype
+        x = _inner_conv(cfg.channels, "conv_in", dtype, local)(x)
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
             for i in range(cfg.res_blocks):
-                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, local, name=f"down_{level}_block_{i}")(x)
+                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, dtype, local, name=f"down_{level}_block_{i}")(
+                    x
+                )
             if level < levels - 1:
                 name = f"down_{level}_downsample"
                 if local:
-                    x = nn.Conv(x.shape[-1], (2, 2), (2, 2), name=name)(x)
+                    x = conv(x.shape[-1], 2, dtype, name, stride=2)(x)
                 else:
-                    x = _conv3(x.shape[-1], name, bias=True, stride=2)(x)
+                    x = _conv3(x.shape[-1], name, dtype, bias=True, stride=2)(x)
         for i in range(cfg.res_blocks):
-            x = ResBlock(x.shape[-1], cfg.norm_groups, local, name=f"mid_block_{i}")(x)
+            x = ResBlock(x.shape[-1], cfg.norm_groups, dtype, local, name=f"mid_block_{i}")(x)
         x = nn.swish(_norm(cfg.norm_groups, "norm_out", local=local)(x))
-        return nn.Conv(cfg.code_bits, (1, 1), name="conv_out")(x)
+        return conv(cfg.code_bits, 1, dtype, "conv_out")(x)
 
 
 class Decoder(nn.Module):
@@ -121,20 +127,20 @@ class Decoder(nn.Module):
 
     @nn.compact
     def __call__(self, codes: Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
-        cfg = self.config
-        x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", bias=True)(codes)
+        cfg, dtype = self.config, self.config.compute_dtype
+        x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", dtype, bias=True)(codes)
         for i in range(cfg.res_blocks):
-            x = ResBlock(x.shape[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
+            x = ResBlock(x.shape[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
         for level in reversed(range(len(cfg.channel_multipliers))):
             if cfg.adaptive_norm:
                 x = AdaptiveGroupNorm(cfg.norm_groups, name=f"adaptive_{level}")(x, codes)
             for i in range(cfg.res_blocks):
                 features = cfg.channels * cfg.channel_multipliers[level]
-                x = ResBlock(features, cfg.norm_groups, name=f"up_{level}_block_{i}")(x)
+                x = ResBlock(features, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x)
             if level > 0:
-                x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", bias=True)(x), 2)
+                x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", dtype, bias=True)(x), 2)
         x = nn.swish(_norm(cfg.norm_groups, "norm_out")(x))
-        x = _conv3(3 * cfg.patch_size**2, "conv_out", bias=True)(x)
+        x = _conv3(3 * cfg.patch_size**2, "conv_out", dtype, bias=True)(x)
         return depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x
 
 

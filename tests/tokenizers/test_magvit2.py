@@ -119,7 +119,7 @@ def test_depth_to_space_puts_row_then_column_before_channel() -> None:
 @pytest.mark.parametrize("features", [8, 12])
 def test_a_residual_block_is_the_plain_computation(features: int) -> None:
     x = np.random.default_rng(1).normal(size=(2, 4, 4, 8)).astype(np.float32)
-    block = ResBlock(features, 4)
+    block = ResBlock(features, 4, "float32")
     p = random_params(lambda key: block.init(key, x)["params"])
     out = jax.jit(block.apply)({"params": p}, x)
     h = conv3(swish(group_norm(x, 4, p["norm1"]["scale"], p["norm1"]["bias"])), p["conv1"]["kernel"])

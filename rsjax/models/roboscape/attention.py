@@ -14,9 +14,9 @@ from flax import struct
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
+from rsjax.matmul import matmul_bf16
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.frame_attention import attend_in_frames
-from rsjax.models.roboscape.matmul import matmul_bf16
 
 # torch's default for linear layers, U(±1/√fan_in), as in the public code.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")

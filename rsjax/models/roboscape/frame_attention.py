@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.models.roboscape.matmul import transposed_in_memory
+from rsjax.matmul import transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; compiling takes as long as there are
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.models.roboscape.matmul import matmul_bf16
+from rsjax.matmul import matmul_bf16
 
 
 def rounded(x: np.ndarray) -> np.ndarray:

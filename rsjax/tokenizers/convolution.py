@@ -1,0 +1,150 @@
+"""Convolutions with bf16 operands and float32 accumulation, as matrix products on CPUs.
+
+XLA's CPU backend convolves in float32 whatever its operands are, without the bf16 units and, for small images, on one
+core. So each row of a 3×3 kernel becomes one product over the whole image: three neighbouring cells of a row lie side
+by side in memory, and the image's rows are shifted by taking another part of the same array. Large images are cut into
+strips, so that these copies stay in the processor's cache.
+
+Axes: B images, h×w cells, C channels in, D channels out, i×j cells of a kernel, N = B·h·w.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rsjax.matmul import matmul_bf16, transposed_in_memory
+
+LEAST = 64  # channels, in and out, from which the products save more time than their copies of the image cost
+STRIP = 2**20  # numbers of an unfolded strip: 2 MiB
+
+
+def conv(
+    features: int,
+    kernel: int,
+    dtype: Literal["float32", "bfloat16"],
+    name: str | None = None,
+    stride: int = 1,
+    padding: Any = "SAME",
+    use_bias: bool = True,
+) -> nn.Conv:
+    """Returns a convolution with a square kernel and float32 parameters, inputs and outputs.
+
+    Args:
+        dtype: bfloat16: operands are rounded to bf16 where this is faster, and products are added up in float32.
+    """
+    sizes = (kernel, kernel), (stride, stride)
+    convolve = _convolve if dtype == "bfloat16" else None
+    return nn.Conv(features, *sizes, padding=padding, use_bias=use_bias, name=name, conv_general_dilated=convolve)
+
+
+def _convolve(
+    x: Float[Array, "B h w C"],
+    kernel: Float[Array, "i j C D"],
+    strides: Sequence[int],
+    padding: Any,
+    **settings: Any,
+) -> Float[Array, "B h w D"]:
+    """Convolves as ``jax.lax.conv_general_dilated`` does, by the fastest implementation on this platform."""
+    if jax.default_backend() != "cpu":
+        halves = (y.astype(jnp.bfloat16) for y in (x, kernel))
+        return jax.lax.conv_general_dilated(*halves, strides, padding, **settings).astype(jnp.float32)
+    size = kernel.shape[0]
+    keeps_size = set(strides) == {1} and padding in ("SAME", [(size // 2, size // 2)] * 2)
+    if not keeps_size or size % 2 == 0 or min(kernel.shape[2:]) < LEAST:
+        return jax.lax.conv_general_dilated(x, kernel, strides, padding, **settings)
+    if size == 1:
+        return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
+    return conv_bf16(x, kernel)
+
+
+@jax.custom_vjp
+def conv_bf16(x: Float[Array, "B h w C"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
+    """Convolves with an odd kernel and stride 1, with zeros around the image; operands are rounded to bf16."""
+    return _in_strips(lambda total, strip: (total, _products(strip, kernel)), (), len(kernel), x)[1]
+
+
+def _forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return conv_bf16(x, kernel), (x.astype(jnp.bfloat16), kernel)
+
+
+def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, kernel = saved
+    size, _, inputs, outputs = kernel.shape
+    turned = kernel[::-1, ::-1].swapaxes(2, 3)
+
+    def gradients(total: Array, strip: Array, x: Array) -> tuple[Array, Array]:
+        # Shifting the image against the cotangent is shifting the cotangent the other way; of the two, the cotangent
+        # is unfolded anyway. Without the barrier, XLA swaps the operands to a form for which it has no bf16 kernel.
+        across = transposed_in_memory(x.reshape(-1, inputs))  # C N
+        rows = [jax.lax.optimization_barrier(_product(across, row)) for row in _rows(strip, size)]
+        return total + jnp.stack(rows), _products(strip, turned)
+
+    zeros = jnp.zeros((size, inputs, size * outputs))
+    of_kernel, of_x = _in_strips(gradients, zeros, size, cotangent, x)
+    of_kernel = of_kernel.reshape(size, inputs, size, outputs)[::-1, :, ::-1]
+    return of_x, of_kernel.swapaxes(1, 2)
+
+
+def _in_strips(
+    run: Callable[..., tuple[Any, Array]],
+    total: Any,
+    size: int,
+    x: Float[Array, "B h w C"],
+    *beside: Float[Array, "B h w E"],
+) -> tuple[Any, Float[Array, "B h w D"]]:
+    """Runs a function on strips of images that fit the processor's cache, one after another.
+
+    Args:
+        run: from a total, an unfolded strip of ``x``, and the same strips of the other maps to a new total and a strip
+            of the result.
+        total: the first one.
+        size: of the kernel.
+
+    Returns:
+        The last total, and the results put together.
+    """
+    (images, height, width, _), around = x.shape, size // 2
+    numbers = width * size * x.shape[-1]  # of a row
+    rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * numbers <= STRIP))
+    many = max(n for n in range(1, images + 1) if images % n == 0 and (n == 1 or n * height * numbers <= STRIP))
+    padded = jnp.pad(x.astype(jnp.bfloat16), ((0, 0), (around, around), (around, around), (0, 0)))
+
+    def strip(total: Any, place: tuple[Array, Array]) -> tuple[Any, Array]:
+        def cut(y: Array, rows: int) -> Array:
+            return jax.lax.dynamic_slice(y, (*place, 0, 0), (many, rows, *y.shape[2:]))
+
+        return run(total, _unfold(cut(padded, rows + 2 * around), size), *(cut(y, rows) for y in beside))
+
+    first, top = jnp.meshgrid(jnp.arange(0, images, many), jnp.arange(0, height, rows), indexing="ij")
+    total, strips = jax.lax.scan(strip, total, (first.reshape(-1), top.reshape(-1)))
+    return total, strips.reshape(*x.shape[:3], -1)
+
+
+def _unfold(strip: Float[Array, "B h2 w2 C"], size: int) -> Float[Array, "B h2 w jC"]:
+    """Puts the cells of each kernel's row side by side."""
+    width = strip.shape[2] - size + 1
+    return jax.lax.optimization_barrier(jnp.concatenate([strip[:, :, j : j + width] for j in range(size)], axis=-1))
+
+
+def _rows(unfolded: Float[Array, "B h2 w jC"], size: int) -> list[Float[Array, "N jC"]]:
+    """Returns what each row of the kernel sees at every cell."""
+    height = unfolded.shape[1] - size + 1
+    return [unfolded[:, i : i + height].reshape(-1, unfolded.shape[-1]) for i in range(size)]
+
+
+def _products(unfolded: Float[Array, "B h2 w jC"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
+    size, outputs = len(kernel), kernel.shape[-1]
+    kernels = kernel.astype(jnp.bfloat16).reshape(size, -1, outputs)
+    out = sum(_product(row, one) for row, one in zip(_rows(unfolded, size), kernels, strict=True))
+    return jnp.reshape(out, (len(unfolded), -1, unfolded.shape[2], outputs))
+
+
+def _product(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    return jax.lax.dot_general(x, w, (((1,), (0,)), ((), ())), preferred_element_type=jnp.float32)
+
+
+conv_bf16.defvjp(_forward, _backward)
