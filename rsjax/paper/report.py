@@ -259,7 +259,7 @@ def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:
     """
     arms = [(arm.name, arm.finished[0]) for arm in outcome.arms if arm.finished]
     try:
-        kept = [(name, read_frames(result.run.output("evaluation"))) for name, result in arms]
+        kept = [(name, read_frames(result.run.output("evaluation").parent)) for name, result in arms]
     except UserError:
         return None
     if len(kept) < 2:

@@ -268,6 +268,7 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
     kept = {"with": ([0, 2, 5], [40, 0, 20]), "without": ([0, 2, 4, 5], [1, 2, 9, 3])}
 
     def frames(folder: Path) -> dict[str, np.ndarray]:
+        assert folder.name == "evaluation"  # where result.json and the frames are
         rows, shift = kept["without" if "use_keypoints" in str(folder) else "with"]
         truth = np.zeros((len(rows), 4, 8, 8, 3), np.uint8)
         shifted = truth + np.array(shift, np.uint8)[:, None, None, None, None]
