@@ -1,6 +1,7 @@
 """A grid's table as a picture: a panel per metric, a line per combination of values."""
 
 import io
+import textwrap
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -47,7 +48,7 @@ def _panel(axes: Axes, column: Metric, rows: Sequence[Row], top: set[int]) -> No
         seeds = [result.metrics[column.name] for result in row.results if column.name in result.metrics]
         axes.scatter(seeds, [y + 0.25] * len(seeds), s=16, facecolors="none", edgecolors=color, linewidths=0.9)
         axes.errorbar(mean, y, xerr=std, fmt="D", markersize=5, color=color, capsize=3, linewidth=1.4)
-    axes.set_title(column.heading, fontsize=10, loc="left")
+    axes.set_title(textwrap.fill(column.heading, 26), fontsize=10, loc="left")
     axes.grid(axis="x", alpha=0.25)
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.tick_params(axis="x", labelsize=8)

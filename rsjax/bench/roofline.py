@@ -32,6 +32,7 @@ from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import cache_slots
+from rsjax.tokenizers.convolution import convolve
 from rsjax.tokenizers.flops import products as count_products
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -142,25 +143,30 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
 
 def tokenizer_operations(config: TokenizerConfig, image_size: int) -> dict[str, tuple[Operation, ...]]:
     """Returns the distinct convolutions and linear layers that "encode" and "decode" one image."""
-    network, side = Tokenizer(config), config.grid(image_size)
+    network, side = Tokenizer(replace(config, compute_dtype="float32")), config.grid(image_size)
+    bf16 = config.compute_dtype == "bfloat16"
     params = jax.eval_shape(network.init_params, jax.random.key(0))
     images = jax.ShapeDtypeStruct((1, image_size, image_size, 3), "float32")
     tokens = jax.ShapeDtypeStruct((1, side, side), "int32")
 
     def of(method: str, x: Any) -> tuple[Operation, ...]:
         found: dict[str, list[Operation]] = {}
-        for each in _traced(jax.make_jaxpr(partial(network.apply, method=method))({"params": params}, x).jaxpr):
+        for each in _traced(jax.make_jaxpr(partial(network.apply, method=method))({"params": params}, x).jaxpr, bf16):
             found.setdefault(each.name, []).append(each)
         return tuple(replace(each[0], times=len(each)) for each in found.values())
 
     return {"encode": of("encode", images), "decode": of("decode", tokens)}
 
 
-def _traced(jaxpr: Any) -> Iterator[Operation]:
-    """Yields a program's products, named after kernel, stride, channels and side of the result."""
+def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
+    """Yields a float32 program's products, named after kernel, stride, channels and side of the result.
+
+    Args:
+        bf16: whether they run as a tokenizer runs them that computes in bf16.
+    """
     for eqn in jaxpr.eqns:
         for inner in jaxprs_in_params(eqn.params):
-            yield from _traced(inner)
+            yield from _traced(inner, bf16)
         if eqn.primitive.name not in ("conv_general_dilated", "dot_general"):
             continue
         shapes, out = tuple(x.aval.shape for x in eqn.invars), eqn.outvars[0].aval.shape
@@ -169,8 +175,10 @@ def _traced(jaxpr: Any) -> Iterator[Operation]:
             rows, columns, inputs, outputs = shapes[1]
             stride = eqn.params["window_strides"][0]
             name = f"{rows}x{columns}{f'_stride_{stride}' * (stride > 1)}_{inputs}_to_{outputs}_at_{out[1]}"
-        run = partial(eqn.primitive.bind, **eqn.params)
-        yield Operation(name, 1, run, shapes, count_products(jax.make_jaxpr(run)(*map(jnp.zeros, shapes)).jaxpr))
+        run = plain = partial(eqn.primitive.bind, **eqn.params)
+        if bf16 and eqn.primitive.name == "conv_general_dilated":
+            run = partial(convolve, **eqn.params)
+        yield Operation(name, 1, run, shapes, count_products(jax.make_jaxpr(plain)(*map(jnp.zeros, shapes)).jaxpr))
 
 
 def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:

@@ -37,25 +37,26 @@ def conv(
         dtype: bfloat16: operands are rounded to bf16 where this is faster, and products are added up in float32.
     """
     sizes = (kernel, kernel), (stride, stride)
-    convolve = _convolve if dtype == "bfloat16" else None
-    return nn.Conv(features, *sizes, padding=padding, use_bias=use_bias, name=name, conv_general_dilated=convolve)
+    how = convolve if dtype == "bfloat16" else None
+    return nn.Conv(features, *sizes, padding=padding, use_bias=use_bias, name=name, conv_general_dilated=how)
 
 
-def _convolve(
+def convolve(
     x: Float[Array, "B h w C"],
     kernel: Float[Array, "i j C D"],
-    strides: Sequence[int],
+    window_strides: Sequence[int],
     padding: Any,
     **settings: Any,
 ) -> Float[Array, "B h w D"]:
-    """Convolves as ``jax.lax.conv_general_dilated`` does, by the fastest implementation on this platform."""
+    """Convolves as ``jax.lax.conv_general_dilated`` does, with bf16 operands where this is faster on this platform."""
     if jax.default_backend() != "cpu":
-        halves = (y.astype(jnp.bfloat16) for y in (x, kernel))
-        return jax.lax.conv_general_dilated(*halves, strides, padding, **settings).astype(jnp.float32)
+        x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
+        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings).astype(jnp.float32)
     size = kernel.shape[0]
-    keeps_size = set(strides) == {1} and padding in ("SAME", [(size // 2, size // 2)] * 2)
+    around = padding == "SAME" or all(tuple(each) == (size // 2, size // 2) for each in padding)
+    keeps_size = set(window_strides) == {1} and around
     if not keeps_size or size % 2 == 0 or min(kernel.shape[2:]) < LEAST:
-        return jax.lax.conv_general_dilated(x, kernel, strides, padding, **settings)
+        return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings)
     if size == 1:
         return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
     return conv_bf16(x, kernel)

@@ -25,7 +25,10 @@ def test_their_products_are_all_that_the_model_counts(name: str) -> None:
     assert counted == 3 * forward_flops(arch, config.clips.frames)
 
 
-@pytest.mark.parametrize("changes", [{}, {"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}, {"compute_dtype": "bfloat16"}],
+)
 def test_the_tokenizers_products_are_all_that_it_counts(changes: dict[str, Any]) -> None:
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 1, 2), res_blocks=2, norm_groups=4, code_bits=6, **changes
