@@ -74,7 +74,7 @@ class Block(nn.Module):
             earlier = jnp.broadcast_to(jnp.arange(cache.k.shape[-2]) < first, (x.shape[1], cache.k.shape[-2]))
             out = attend_parts(q, [(cache, earlier), (new, jnp.tri(x.shape[1], dtype=bool))]).swapaxes(1, 2)
         elif keys is not None:
-            out = _attend_some(q, k, v, folded(keys, jnp.full(len(keys), number)), cfg)
+            out = _attend_with_dropout(q, k, v, folded(keys, jnp.full(len(keys), number)), cfg)
         else:
             out = attend_cells(q, k, v, cfg.compute_dtype == "bfloat16", causal=True)
         x = x + dense(cfg.width, name="o_proj")(out.reshape(x.shape))
@@ -88,7 +88,7 @@ def folded(keys: Key[Array, " B"], numbers: Int[Array, " B"]) -> Key[Array, " B"
     return jax.vmap(jax.random.fold_in)(keys, numbers)
 
 
-def _attend_some(
+def _attend_with_dropout(
     q: Float[Array, "B L h e"],
     k: Float[Array, "B L h e"],
     v: Float[Array, "B L h e"],

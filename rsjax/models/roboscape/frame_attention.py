@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from rsjax.matmul import transposed_in_memory
 
-UNROLLED = 16  # frames whose code is written out; compiling takes as long as there are
+UNROLLED = 16  # frames whose code is written out; more take longer to compile
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
