@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from rsjax.errors import Preempted, UserError, storage_limit
 from rsjax.runtime import INTERRUPTED, TERMINATED, exit_now, stop_signals
 
-UNREAD = 128 + signal.SIGPIPE  # the status of a command that the signal ends
+UNREAD = 128 + signal.SIGPIPE  # the exit status of a process that SIGPIPE ends
 
 
 def refuse_repeated(argv: Sequence[str], repeatable: Collection[str] = ()) -> None:
@@ -41,9 +41,8 @@ def main_errors() -> Iterator[None]:
     """Turns errors that the user can cure into one line on standard error and an exit status, without a traceback.
 
     Around a command's main function, as a decorator or in a ``with``. Exits with 2 for most :class:`UserError`, a full
-    disk or a missing permission, with 130 for an interrupt, with 75 (to be started again) for SIGTERM, and without a
-    word with 141 where nobody reads its output any more (``| head``). Any other exception is a bug and keeps its
-    traceback.
+    disk or a missing permission, with 130 for an interrupt, with 75 (to be started again) for SIGTERM, and with 141 and
+    no message if nobody reads its output any more (``| head``). Any other exception is a bug and keeps its traceback.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
@@ -51,7 +50,8 @@ def main_errors() -> Iterator[None]:
     with stop_signals() as received:
         try:
             yield
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed by the shell's >&-
+                sys.stdout.flush()
         except (Exception, KeyboardInterrupt) as error:
             if isinstance(error, BrokenPipeError) and _unread():
                 exit_now(UNREAD)
@@ -63,9 +63,13 @@ def main_errors() -> Iterator[None]:
 
 def _unread() -> bool:
     """Says whether standard output is a pipe that was closed at its other end."""
+    try:
+        output = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):  # closed, or not a file
+        return False
     state = select.poll()
-    state.register(sys.stdout.fileno(), 0)
-    return any(event & select.POLLERR for _, event in state.poll(0))
+    state.register(output, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in state.poll(0))
 
 
 def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]:

@@ -1,4 +1,4 @@
-"""The matrix product of linear layers with bf16 operands and float32 accumulation.
+"""The matrix product of linear layers and 1×1 convolutions with bf16 operands and float32 accumulation.
 
 CPUs use their bf16 units only for bf16 × bf16 → float32. The default gradient of such a product does not: its
 cotangents are float32, and its weight gradient contracts the first axes of both operands, for which XLA has no fast

@@ -162,7 +162,7 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
     """Yields a float32 program's products, named after kernel, stride, channels and side of the result.
 
     Args:
-        bf16: whether they run as a tokenizer runs them that computes in bf16.
+        bf16: whether to run convolutions as a tokenizer in bf16 does.
     """
     for eqn in jaxpr.eqns:
         for inner in jaxprs_in_params(eqn.params):

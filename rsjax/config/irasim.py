@@ -26,7 +26,7 @@ class DiTConfig:
     heads: int = 16
     mlp_ratio: int = 4
     patch_size: int = 2  # cells of latents that one token covers, along each side
-    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps the blocks' inputs alone
 
     def __post_init__(self) -> None:

@@ -96,7 +96,7 @@ class IVideoGPTConfig(ModelConfig):
     use_actions: bool = True  # False: the public action-free models
     integrate_actions: bool = False  # also the sum of all actions so far; see TransformerConfig
     dropout: float = 0.1  # of attention weights
-    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     unroll: int = runtime(1)  # blocks per iteration of the scan
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps the blocks' inputs alone
     sample: TopKConfig = sampling(TopKConfig())

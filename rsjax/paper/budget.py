@@ -21,7 +21,8 @@ EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
 TOKENIZER_RATE = 4.1e10  # operations a second of the tokenizer's training, with Muon
-# Seconds of a step of autoencoder and model in each family's small preset, on the same quiet machine.
+# Seconds of a step of autoencoder and model in each family's small preset, on the same quiet machine; 1.02 and 0.74 are
+# 1.33 and 0.87, of slower attention, by the ratios that a busy one gave (docs/performance.md).
 FAMILY_STEPS = {"ivideogpt": (0.88, 1.02), "irasim": (0.13, 0.55), "cogvideox": (0.85, 0.74)}
 START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
 EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds: of each evaluation, a localiser's step, a rollout

@@ -46,16 +46,20 @@ def convolve(
     kernel: Float[Array, "i j C D"],
     window_strides: Sequence[int],
     padding: Any,
-    **settings: Any,
+    **settings: Any,  # axes must be in the order of flax's layers
 ) -> Float[Array, "B h w D"]:
-    """Convolves as ``jax.lax.conv_general_dilated`` does, with bf16 operands where this is faster on this platform."""
+    """Convolves as ``jax.lax.conv_general_dilated`` does, in bf16 where this is faster on this platform.
+
+    On an accelerator the result is rounded to bf16 too, as by the layers of other libraries.
+    """
     if jax.default_backend() != "cpu":
         x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
         return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings).astype(jnp.float32)
-    size = kernel.shape[0]
+    size = len(kernel)
     around = padding == "SAME" or all(tuple(each) == (size // 2, size // 2) for each in padding)
-    keeps_size = set(window_strides) == {1} and around
-    if not keeps_size or size % 2 == 0 or min(kernel.shape[2:]) < LEAST:
+    square = kernel.shape[1] == size and size % 2 == 1
+    plain = {*window_strides, *(settings.get("lhs_dilation") or ()), *(settings.get("rhs_dilation") or ())} == {1}
+    if not (around and square and plain) or min(kernel.shape[2:]) < LEAST or kernel.shape[2] != x.shape[-1]:
         return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings)
     if size == 1:
         return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)
@@ -98,6 +102,9 @@ def _in_strips(
     *beside: Float[Array, "B h w E"],
 ) -> tuple[Any, Float[Array, "B h w D"]]:
     """Runs a function on strips of images that fit the processor's cache, one after another.
+
+    XLA gathers a batch that is sharded over devices in one program (``mesh``) before it is cut; under ``pmap`` each
+    device has its own.
 
     Args:
         run: from a total, an unfolded strip of ``x``, and the same strips of the other maps to a new total and a strip

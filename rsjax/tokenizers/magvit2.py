@@ -105,9 +105,8 @@ class Encoder(nn.Module):
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
             for i in range(cfg.res_blocks):
-                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, dtype, local, name=f"down_{level}_block_{i}")(
-                    x
-                )
+                name = f"down_{level}_block_{i}"
+                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, dtype, local, name=name)(x)
             if level < levels - 1:
                 name = f"down_{level}_downsample"
                 if local:

@@ -34,7 +34,11 @@ from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 Images: TypeAlias = Float[Array, "B H W 3"]
 Latents: TypeAlias = Float[Array, "B h w D"]
 
-FREE = {"vocabularies", "depth_scale"}  # fields that may differ between the saved tokenizer and the one to train
+FREE = {
+    "vocabularies",
+    "depth_scale",
+    "compute_dtype",
+}  # fields that may differ between the saved tokenizer and the one to train
 
 
 @dataclass(frozen=True)

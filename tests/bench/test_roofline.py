@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from rsjax.bench.roofline import cached_pass, full_cache, operations, pass_flops, roofline, tokenizer_operations
@@ -13,6 +14,7 @@ from rsjax.config.leaves import with_values
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.model import RoboScape
+from rsjax.tokenizers import convolution
 from rsjax.tokenizers.flops import products, tokenizer_flops
 from tests.models.toy_family import ToyConfig
 
@@ -29,13 +31,21 @@ def test_their_products_are_all_that_the_model_counts(name: str) -> None:
     "changes",
     [{}, {"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}, {"compute_dtype": "bfloat16"}],
 )
-def test_the_tokenizers_products_are_all_that_it_counts(changes: dict[str, Any]) -> None:
+def test_the_tokenizers_products_are_all_that_it_counts(
+    changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 1, 2), res_blocks=2, norm_groups=4, code_bits=6, **changes
     )
+    monkeypatch.setattr(convolution, "LEAST", 8)
     halves, counted = tokenizer_operations(config, 64), tokenizer_flops(config, 64)
     for half, name in (("encode", "encoder"), ("decode", "decoder")):
         assert sum(each.times * each.flops for each in halves[half]) == counted[name]
+        for each in halves[half]:
+            program = jax.make_jaxpr(each.run)(*map(jnp.zeros, each.shapes))
+            assert products(program.jaxpr) == each.flops
+            wide = each.name.startswith("3x3_") and "stride" not in each.name and min(each.shapes[1][2:]) >= 8
+            assert ("scan" in str(program)) == (wide and config.compute_dtype == "bfloat16")
 
 
 @pytest.mark.parametrize("changes", [{}, {"use_depth": False, "positions": "rotary"}])

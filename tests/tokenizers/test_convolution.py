@@ -3,6 +3,7 @@
 from typing import Any
 from unittest import mock
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.tokenizers import convolution
-from rsjax.tokenizers.convolution import conv, conv_bf16
+from rsjax.tokenizers.convolution import conv, conv_bf16, convolve
 
 
 def rounded(x: Any) -> jax.Array:
@@ -54,8 +55,35 @@ def test_a_layer_of_many_channels_takes_products_and_keeps_its_parameters(
     exact, half = conv(5, kernel, "float32"), conv(5, kernel, "bfloat16")
     variables = exact.init(jax.random.key(1), x)
     jax.tree.map(np.testing.assert_array_equal, variables, half.init(jax.random.key(1), x))
-    difference = jnp.abs(exact.apply(variables, x) - half.apply(variables, x))  # type: ignore[arg-type]
-    assert 0 < float(jnp.max(difference)) < 0.03
+
+    def passes(layer: nn.Conv) -> tuple[Any, Any]:
+        def total(variables: Any, x: Any) -> Any:
+            out: Any = layer.apply(variables, x)
+            return jnp.sin(out).sum()
+
+        return jax.value_and_grad(total, argnums=(0, 1))(variables, x)
+
+    for platform in ("cpu", "gpu"):
+        monkeypatch.setattr(jax, "default_backend", lambda platform=platform: platform)
+        for found, wanted in zip(jax.tree.leaves(passes(half)), jax.tree.leaves(passes(exact)), strict=True):
+            difference = float(jnp.max(jnp.abs(found - wanted)))
+            assert found.dtype == jnp.float32
+            assert 0 < difference < 0.03 * max(1.0, float(jnp.max(jnp.abs(wanted))))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"rhs_dilation": (2, 2)}, {"lhs_dilation": (2, 2)}, {"feature_group_count": 2}, {"window_strides": (2, 2)}, {}],
+)
+def test_whatever_its_settings_it_is_the_convolution_of_jax(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(convolution, "LEAST", 1)
+    x = jax.random.normal(jax.random.key(0), (1, 6, 6, 4))
+    kernel = jax.random.normal(jax.random.key(1), (3, 3, 4 // settings.get("feature_group_count", 1), 4))
+    whole = {"window_strides": (1, 1), "padding": ((1, 1), (1, 1)), "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
+    expected = jax.lax.conv_general_dilated(x, kernel, **(whole | settings))
+    np.testing.assert_allclose(convolve(x, kernel, **(whole | settings)), expected, atol=0.1)
 
 
 @pytest.mark.parametrize("settings", [{"kernel": 3, "stride": 2, "padding": ((1, 1), (1, 1))}, {"kernel": 2}])

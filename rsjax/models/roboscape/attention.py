@@ -22,7 +22,8 @@ from rsjax.models.roboscape.frame_attention import attend_in_frames
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
 FEW = 2  # frames per pass of a rollout
-LARGE_FRAME = 128  # cells per frame from which bf16 products in attention save more than their transposes cost
+# Cells of a frame, or tokens of a sequence, from which bf16 products in attention save more than their transposes cost.
+LARGE_FRAME = 128
 
 
 @struct.dataclass

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from rsjax.matmul import transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
+SCORES = 2**24  # of the frames that run at the same time: 64 MiB
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -54,7 +55,9 @@ def _backward(causal: bool, saved: tuple[Array, ...], cotangent: Array) -> tuple
 
 
 def _each_frame(run: Callable[..., Any], *operands: Array) -> Any:
-    return jax.lax.scan(lambda _, frame: (None, run(*frame)), None, operands, unroll=UNROLLED)[1]
+    _, heads, cells, _ = operands[0].shape
+    unroll = max(1, min(UNROLLED, SCORES // (heads * cells**2)))
+    return jax.lax.scan(lambda _, frame: (None, run(*frame)), None, operands, unroll=unroll)[1]
 
 
 def _frame(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.ivideogpt.rollout import pick, sample
 from rsjax.models.ivideogpt.sequence import Layout
+from rsjax.models.roboscape import attention
 from rsjax.trainable import StepContext
 from tests.models.ivideogpt.toy import ARCH, CLIPS, MODEL, VQ, frames, llama_params, vq_params
 
@@ -65,6 +66,21 @@ def logits(params: Any, tokens: Any = SEQUENCE, actions: Any = ACTIONS) -> Any:
 @partial(jax.jit, static_argnums=0)
 def token_term(model: IVideoGPT, params: Any, batch: Any) -> Any:
     return model.loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))["token"]
+
+
+@pytest.mark.parametrize("remat", ["none", "blocks"])
+def test_fast_attention_and_its_gradient_are_the_plain_ones(
+    monkeypatch: pytest.MonkeyPatch, remat: Literal["none", "blocks"]
+) -> None:
+    arch, params = replace(ARCH, config=replace(MODEL, compute_dtype="bfloat16", remat=remat)), llama_params()
+
+    def loss(params: Any) -> Any:
+        return jnp.mean(jnp.sin(LLaMA(arch).apply({"params": params}, SEQUENCE, ACTIONS)[0]))
+
+    plain = jax.value_and_grad(loss)(params)
+    monkeypatch.setattr(attention, "LARGE_FRAME", 1)
+    for x, y in zip(jax.tree.leaves(jax.value_and_grad(loss)(params)), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(x, y, atol=0.03 * float(jnp.max(jnp.abs(y))) + 1e-6)
 
 
 def test_nothing_depends_on_what_comes_later_and_an_action_acts_from_its_slot_on() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from rsjax.models.roboscape import attention, frame_attention
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.attention import attend
+from rsjax.models.roboscape.attention import attend, attend_cells
 from rsjax.models.roboscape.frame_attention import attend_in_frames
 from rsjax.models.roboscape.transformer import Transformer
 
@@ -22,6 +22,19 @@ def test_output_and_gradients_are_plain_attention_s_to_bf16_rounding(causal: boo
     for x, y in zip((found, *pull(cotangent)), (plain, *pull_plain(cotangent)), strict=True):
         assert x.dtype == jnp.float32 and x.shape == y.shape
         np.testing.assert_allclose(x, y, atol=0.02 * float(jnp.max(jnp.abs(y))))
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_on_an_accelerator_it_is_plain_attention_to_bf16_rounding(
+    monkeypatch: pytest.MonkeyPatch, causal: bool
+) -> None:
+    keys = jax.random.split(jax.random.key(3), 3)
+    q, k, v = (jax.random.normal(key, (1, 2, 6, 2, 8)) for key in keys)  # B T S h e
+    plain = attend_cells(q, k, v, bf16=False, causal=causal)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    found = attend_cells(q, k, v, bf16=True, causal=causal)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, plain, atol=0.02)
 
 
 def test_a_frame_attends_to_itself_alone() -> None:
