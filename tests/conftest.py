@@ -97,9 +97,12 @@ def gl() -> str:
         pytest.skip(str(error))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A headless Chromium, steered by Playwright; skips where either is missing (make extras installs both)."""
+    """A headless Chromium, steered by Playwright; skips where either is missing (make extras installs both).
+
+    Until it is closed, an event loop runs in this thread, and others (Ray's) cannot.
+    """
     api = pytest.importorskip("playwright.sync_api")
     path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
     if not path:
