@@ -124,7 +124,8 @@ class EpisodeRef:
     Attributes:
         id: unique within the source, safe as a file name (see :func:`rsjax.files.safe_id`).
         fingerprint: 16 hex digits of what the episode would be read from.
-        location: what the source's ``read`` needs, or ``error``: why the episode cannot be read.
+        location: what the source's ``read`` needs, or ``error``: why the episode cannot be read; ``split``: the side
+            of a store that it stays on.
     """
 
     id: str

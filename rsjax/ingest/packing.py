@@ -51,8 +51,14 @@ class Contents:
 
 
 def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
-    """Splits into ``train`` and ``test``, in order, by a hash of the ids; each gets one at least of two or more."""
-    test = choose_test([ref.id for ref in refs], test_share)
+    """Splits into ``train`` and ``test``, in order; each gets one at least of two or more.
+
+    Clips of a store stay on the side they were on, since several can show the same recording, and ``test_share`` then
+    counts for nothing. Where the source has one side only, or none, a hash of the ids decides.
+    """
+    test = {ref.id for ref in refs if ref.location.get("split", "train") != "train"}
+    if not 0 < len(test) < len(refs):
+        test = choose_test([ref.id for ref in refs], test_share)
     return {"train": [r for r in refs if r.id not in test], "test": [r for r in refs if r.id in test]}
 
 

@@ -91,6 +91,16 @@ def test_each_episode_is_in_one_split_and_both_have_some(names: set[str], share:
         assert all(splits.values())
 
 
+@settings(max_examples=30)
+@given(st.lists(st.sampled_from(["train", "test", "cameras"]), min_size=2, max_size=9), st.floats(0, 0.99))
+def test_clips_of_a_store_stay_on_their_side(sides: list[str], share: float) -> None:
+    refs = [EpisodeRef(f"{side}-{number}", "", {"split": side}) for number, side in enumerate(sides)]
+    splits = split_episodes(refs, share)
+    if 0 < sides.count("train") < len(sides):
+        assert {ref.id for ref in splits["train"]} == {ref.id for ref in refs if ref.id.startswith("train")}
+    assert sorted(ref.id for part in splits.values() for ref in part) == sorted(ref.id for ref in refs)
+
+
 def test_the_same_again_does_nothing_and_more_episodes_reuse_annotations(tmp_path: Path) -> None:
     methods = Annotators()
     ingested(clip_plan(tmp_path, Source(3), methods))
