@@ -24,6 +24,8 @@ from rsjax.files import disk_guard, making, replace_directory
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
+# Of a constant state; with one number it would come as (B, T) from LeRobot, whose policies want (B, T, D).
+ZEROS = ("zero_0", "zero_1")
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class LeRobotOptions:
     Attributes:
         version: of the format; v3.0 for LeRobot 0.4 and later, v2.1 for earlier ones and openpi.
         split: the clips to export. LeRobot trains on all episodes of a data set, so the default leaves test clips out.
-        state: ``observation.state``, which most policies ask for and clips do not have. zeros: one constant number;
+        state: ``observation.state``, which most policies ask for and clips do not have. zeros: two zeros;
             command: the action that led into the frame; none: no such column.
         codec: of the videos; LeRobot's own default is av1.
         crf: constant rate factor of the codec: lower is larger and sharper (LeRobot: 30).
@@ -119,7 +121,7 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
     if size % 2 or not 0 < fps <= 1000:
         raise UserError(f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0 to 1000 Hz")
     width = clip["actions"].shape[1]
-    states = {"zeros": ["none"], "command": _names(store, width), "none": None}[options.state]
+    states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
     camera = "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
     video = VideoSettings(options.codec, options.crf, fps, size)
     return LAYOUTS[options.version](root, video, describe_features(video, camera, _names(store, width), states))
@@ -137,5 +139,6 @@ def _episode(clip: Record, features: dict[str, Any], state: str) -> Episode:
     actions = clip["actions"]
     columns: dict[str, Float32[np.ndarray, "T D"]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
     if "observation.state" in features:
-        columns["observation.state"] = actions if state == "command" else np.zeros((len(actions), 1), np.float32)
+        zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
+        columns["observation.state"] = actions if state == "command" else zeros
     return Episode(clip["rgb"], columns, str(clip["task"]))

@@ -36,11 +36,14 @@ def describe_features(
 
 
 def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
-    """Returns columns as a table; those of several numbers a row as lists of fixed length, as LeRobot writes them."""
+    """Returns columns as a table; those of several numbers a row as lists of fixed length, as LeRobot writes them.
+
+    A column of one number a row is one of scalars, also if it has two axes: LeRobot reads the shape [1] as that.
+    """
     arrays: dict[str, pa.Array] = {}
     for name, values in columns.items():
-        flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-        arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
+        flat, width = pa.array(np.ascontiguousarray(values).reshape(-1)), values.size // len(values)
+        arrays[name] = pa.FixedSizeListArray.from_arrays(flat, width) if width > 1 else flat
     return pa.table(arrays)
 
 

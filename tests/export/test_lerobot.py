@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
@@ -54,14 +55,15 @@ def assert_near(one: np.ndarray, other: np.ndarray) -> None:
     st.integers(2, 4),
     st.integers(2, 7),
     st.sampled_from([16, 18, 48]),
+    st.sampled_from([1, 3]),
     st.sampled_from([2.0, 5.0, 12.5, 30.0]),
     st.sampled_from(["zeros", "command", "none"]),
 )
 def test_what_is_exported_is_read_back(
-    tmp_path_factory: Any, version: Any, count: int, frames: int, size: int, fps: float, state: Any
+    tmp_path_factory: Any, version: Any, count: int, frames: int, size: int, width: int, fps: float, state: Any
 ) -> None:
     folder = tmp_path_factory.mktemp("lerobot")
-    store = toy_store(folder / "store", count, frames, size, fps=fps)
+    store = toy_store(folder / "store", count, frames, size, width, fps=fps)
     export_lerobot(store, folder / "out", LeRobotOptions(version, state=state, codec="h264", crf=1))
     clips, episodes = records(store), read_all("lerobot", folder / "out")
     assert len(clips) == len(episodes)
@@ -69,7 +71,7 @@ def test_what_is_exported_is_read_back(
         np.testing.assert_array_equal(episode.actions, clip["actions"])
         assert_near(episode.cameras["image"].read(range(frames)), clip["rgb"])
         assert (episode.task, episode.fps) == (clip["task"], fps)
-        states = {"zeros": np.zeros((frames, 1), np.float32), "command": clip["actions"], "none": None}[state]
+        states = {"zeros": np.zeros((frames, 2), np.float32), "command": clip["actions"], "none": None}[state]
         np.testing.assert_array_equal(episode.states, states) if state != "none" else None
         assert (episode.states is None) == (state == "none")
 
@@ -147,12 +149,19 @@ def test_pandas_finds_the_tasks_by_their_text(tmp_path: Path) -> None:
         assert frame.loc[task].task_index == number and task in TASKS
 
 
-def test_lists_have_a_fixed_length(tmp_path: Path) -> None:
-    export_lerobot(toy_store(tmp_path / "store"), tmp_path / "out", LeRobotOptions(codec="h264"))
-    schema = pq.read_schema(tmp_path / "out/data/chunk-000/file-000.parquet")
-    assert (
-        str(schema.field("action").type).startswith("fixed_size_list<") and schema.field("action").type.list_size == 3
-    )
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+@pytest.mark.parametrize("width", [1, 3])
+def test_columns_have_the_types_that_lerobot_casts_to(tmp_path: Path, version: Any, width: int) -> None:
+    """Lists of the feature's length, and scalars where its shape is [1]."""
+    store = toy_store(tmp_path / "store", width=width)
+    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, codec="h264"))
+    schema = pq.read_schema(next((tmp_path / "out").glob("data/*/*.parquet")))
+    for name in schema.names:
+        shape, kind = info["features"][name]["shape"], schema.field(name).type
+        assert pa.types.is_fixed_size_list(kind) == (shape != [1])
+        assert shape == [1] or shape == [kind.list_size]
+    assert info["features"]["action"]["shape"] == [width]
+    assert info["features"]["observation.state"]["shape"] == [2]
     assert {str(schema.field(name).type) for name in ("frame_index", "index", "task_index")} == {"int64"}
 
 
