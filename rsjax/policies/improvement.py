@@ -78,6 +78,7 @@ def improve(
     """
     rows: list[dict[str, Any]] = []
     arms = {"imagined": policy, "control": policy}
+    config = _tuning(policy.model.config, settings)  # once: the policies of each round have it as theirs
     before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before")
     for number in range(1, settings.rounds + 1):
         stage(
@@ -89,7 +90,6 @@ def improve(
         for arm, old in arms.items():
             learns = mixed(demos, made, settings.share, number) if arm == "imagined" and made else demos
             folder = out / f"round-{number}" / arm
-            config = _tuning(old.model.config, settings)
             arms[arm] = train_policy(config, learns, folder, name=f"round {number} {arm}", seed=number, start=old)
             tried = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}")
             row[arm], row["clipped"][arm] = tried.success, tried.clipped
