@@ -62,7 +62,7 @@ class World(Protocol):
         """Begins an episode from each start, at most ``count``."""
         ...
 
-    def step(self, actions: Any, over: Bool[np.ndarray, " B"]) -> Seen:
+    def step(self, actions: Float32[np.ndarray, "B A"], over: Bool[np.ndarray, " B"]) -> Seen:
         """Does a step in every episode; what it gives of those that are over does not matter."""
         ...
 
@@ -91,7 +91,7 @@ class Simulated:
         width = self._envs[0].action_space.shape[0]
         return self._seen(np.zeros((len(starts), width), np.float32))
 
-    def step(self, actions: Any, over: Bool[np.ndarray, " B"]) -> Seen:
+    def step(self, actions: Float32[np.ndarray, "B A"], over: Bool[np.ndarray, " B"]) -> Seen:
         done = np.zeros((len(self._last), self._envs[0].action_space.shape[0]), np.float32)
         for number in np.flatnonzero(~over):
             seen, _, _, _, info = self._envs[number].step(actions[number])
@@ -137,8 +137,8 @@ class Imagined:
         self._alive = len(starts)
         return self._seen(video, np.zeros((self._count, len(self._low)), np.float32), np.zeros(self._count, int))
 
-    def step(self, actions: Any, over: Bool[np.ndarray, " B"]) -> Seen:
-        given = np.concatenate([np.asarray(actions), np.asarray(actions)[-1:].repeat(self._count - len(actions), 0)])
+    def step(self, actions: Float32[np.ndarray, "B A"], over: Bool[np.ndarray, " B"]) -> Seen:
+        given = np.concatenate([actions, actions[-1:].repeat(self._count - len(actions), 0)])
         low, high = (np.broadcast_to(end, given.shape[:1] + end.shape) for end in (self._low, self._high))
         done, _ = checked_actions(given, low, high, "clip", UNIT)
         video = self._imagination.step(done)
@@ -164,7 +164,11 @@ class FirstFrame:
 
 
 def run_together(world: World, act: Acts, starts: Sequence[Any], steps: int) -> list[Episode]:
-    """Runs at most ``world.count`` episodes together, each until it succeeds or has had all its steps."""
+    """Runs at most ``world.count`` episodes together, each until it succeeds or has had all its steps.
+
+    Raises:
+        ActionError: the policy answers with another shape, or a value that is not finite.
+    """
     seen = world.restart(starts)
     over, history, ends = np.zeros(len(starts), bool), [seen], np.full(len(starts), steps)
     over |= seen.success
@@ -172,7 +176,9 @@ def run_together(world: World, act: Acts, starts: Sequence[Any], steps: int) -> 
     for step in range(1, steps + 1):
         if over.all():
             break
-        seen = world.step(act(seen.rgb), over)
+        free = np.full(seen.actions.shape, np.inf, np.float32)
+        actions, _ = checked_actions(act(seen.rgb), -free, free, "clip", UNIT)  # the world clips, and counts
+        seen = world.step(actions, over)
         history.append(seen)
         ends[seen.success & ~over] = step
         over = over | seen.success

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from rsjax.errors import UserError
+from rsjax.policies.actions import ActionError
 from rsjax.policies.rollouts import FirstFrame, run_together
 from rsjax.policies.simulator import Episode
 from rsjax.policies.trials import Trials, first_frames, try_policy
@@ -42,6 +44,17 @@ def test_actions_out_of_range_are_clipped_and_counted(kind: str) -> None:
     episodes = run_together(world, ToyPolicy(3.0).actor(), starts, 9)
     assert [len(one.rgb) - 1 for one in episodes] == [5, 3]
     assert [one.clipped for one in episodes] == [10, 6]  # both controls of each step
+
+
+@pytest.mark.parametrize("kind", ["simulated", "imagined"])
+@pytest.mark.parametrize("shape", [(1, 6), (3, 6), (7, 6), (2, 5), (2, 2, 3)])
+def test_answers_of_another_shape_are_named(kind: str, shape: tuple[int, ...]) -> None:
+    world: Any = simulated(4) if kind == "simulated" else imagined(4)
+    starts: Any = [0, 4] if kind == "simulated" else frames([0, 4])
+    with pytest.raises(
+        ActionError, match=rf"actions have shape {re.escape(str(shape))}; expected \(2, 6\), 6-D change"
+    ):
+        run_together(world, lambda rgb: np.zeros(shape, np.float32), starts, 3)
 
 
 def test_the_worlds_begin_with_the_same_frames(tmp_path: Path) -> None:
