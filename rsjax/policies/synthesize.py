@@ -43,6 +43,7 @@ class Synthesis:
         only: success uses those that end in success, where the data set says which do.
         seed: of the choice of clips, the noise and the model's draws.
         batch: clips that are generated together.
+        fps: frames per second; 0: as the clips say.
     """
 
     demos: int = 200
@@ -51,8 +52,11 @@ class Synthesis:
     only: Only = "success"
     seed: int = 0
     batch: int = 10
+    fps: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.fps <= 1000:
+            raise UserError(f"--fps {self.fps}: frames per second, up to 1000; 0: as the clips say")
         if self.demos < 1 or self.batch < 1 or not 0 <= self.noise < float("inf"):
             raise UserError(f"--demos {self.demos}, --batch {self.batch}, --noise {self.noise}: 1, 1 and 0 at least")
 
@@ -85,7 +89,8 @@ def synthesize(
         UserError: the data set has no clip to begin with, does not fit the model, or ``out`` holds other clips.
     """
     inputs = (model_key(trained), judge_key(judge), arrays_key(limits))
-    key = content_key(4, *inputs, str(store.manifest.get("key")), str(asdict(options)))
+    settings = {name: value for name, value in asdict(options).items() if name != "fps" or value}  # keys from before it
+    key = content_key(4, *inputs, str(store.manifest.get("key")), str(settings))
     if (out / MARK).exists():
         mark = read_json(out / MARK, cure=f"delete {out}")
         if mark.get("key") != key:
@@ -124,13 +129,11 @@ def _generate(
     """Leaves each demonstration in a file of its own, those that exist excepted."""
     source, chosen = store.source(options.split), choose_clips(store, options)
     spread = np.asarray(trained.assets.normalization.action_std)
+    _check_fits(source[chosen[0]], store, trained, options)
     for first in range(0, options.demos, options.batch):
         numbers = range(first, min(first + options.batch, options.demos))
         if not all(_file(folder, number).exists() for number in numbers):
             clips = [source[chosen[number % len(chosen)]] for number in numbers]
-            if clips[0]["actions"].shape[1] != len(spread):
-                width = clips[0]["actions"].shape[1]
-                raise UserError(f"{store.path}: actions of {width} numbers, the model takes {len(spread)}")
             rng = [np.random.default_rng([options.seed, number]) for number in numbers]
             noisy = [
                 perturb(clip["actions"], options.noise * spread, *limits, each)
@@ -141,6 +144,18 @@ def _generate(
             ):
                 write_atomically(_file(folder, number), encode(record))
         report(numbers[-1] + 1, options.demos)
+
+
+def _check_fits(clip: Record, store: Store, trained: TrainedModel, options: Synthesis) -> None:
+    """Raises UserError unless the model takes clips like this one, and they have what the exports need."""
+    size, width = trained.config.clips.image_size, len(trained.assets.normalization.action_std)
+    if clip["actions"].shape[1] != width:
+        raise UserError(f"{store.path}: actions of {clip['actions'].shape[1]} numbers, the model takes {width}")
+    if clip["rgb"].shape[1:3] != (size, size):
+        height, wide = clip["rgb"].shape[1:3]
+        raise UserError(f"{store.path}: frames of {wide} × {height} pixels, the model takes {size} × {size}")
+    if not options.fps and not frame_rate(clip, store.manifest):
+        raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
 
 
 def _generated(
@@ -167,13 +182,12 @@ def _generated(
             "actions": taken,
             "task": clip["task"],
             "episode": f"generated-{number}",
+            "fps": options.fps or frame_rate(clip, store.manifest),
         }
         if video.depth is not None and not np.isnan(video.depth[row]).any():
             made["depth"] = np.maximum(np.asarray(video.depth[row], np.float32), 1e-3)
         if found is not None:
             made["success"] = found[row] == SUCCESS
-        if rate := frame_rate(clip, store.manifest):
-            made["fps"] = rate
         origin = clip["provenance"]
         made["provenance"] = {
             "source": "generated",

@@ -17,7 +17,7 @@ from rsjax.policies import synthesize as module
 from rsjax.policies.demos import load_demos
 from rsjax.policies.synthesize import Synthesis, perturb, synthesize
 from tests.ingest.formats.reading import read_all
-from tests.policies.toy import CONTROLS, WIDTH, demo_store, picture
+from tests.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, picture
 from tests.policies.worlds import judge
 
 LIMITS = (np.full(CONTROLS * WIDTH, -1.0), np.full(CONTROLS * WIDTH, 1.0))
@@ -37,7 +37,8 @@ def trained(store: Any, fails_at: int = -1, weight: float = 1.0) -> Any:
         rgb = np.stack([[picture(place) for place in row] for row in np.rint(places)])
         return Video(rgb, np.full(rgb.shape[:-1], 0.5, np.float32))
 
-    config = SimpleNamespace(prompt_frames=1, clips=None, tokenizer=None, model=SimpleNamespace(family="toy"))
+    clips, family = SimpleNamespace(image_size=SIZE), SimpleNamespace(family="toy")
+    config = SimpleNamespace(prompt_frames=1, clips=clips, tokenizer=None, model=family)
     assets = SimpleNamespace(normalization=Normalization.create(store), tokenizer=None)
     return SimpleNamespace(
         config=config, model=SimpleNamespace(generate=generate), params={"w": weight}, assets=assets, calls=calls
@@ -123,3 +124,19 @@ def test_what_cannot_be_made_is_named(tmp_path: Path, store: Any) -> None:
     other.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None), tokenizer=None)
     with pytest.raises(UserError, match="actions of 6 numbers, the model takes 7"):
         synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
+    other = trained(store)
+    other.config.clips.image_size = 64
+    with pytest.raises(UserError, match="frames of 16 × 16 pixels, the model takes 64 × 64"):
+        synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
+
+
+def test_clips_without_a_frame_rate_need_one_before_anything_is_generated(tmp_path: Path) -> None:
+    still = demo_store(tmp_path / "still", fps=None)
+    model = trained(still)
+    with pytest.raises(UserError, match="still: its clips do not say how many frames a second have; give --fps"):
+        synthesize(model, still, tmp_path / "out", Synthesis(2), LIMITS)
+    assert not model.calls
+    synthesize(model, still, tmp_path / "out", Synthesis(2, fps=12.5), LIMITS)
+    assert read_all("lerobot", tmp_path / "out" / "lerobot-v3.0")[0].fps == 12.5
+    with pytest.raises(UserError, match="--fps -1: frames per second"):
+        Synthesis(fps=-1)

@@ -35,12 +35,12 @@ def demos(count: int = 4) -> Demos:
     return Demos(tuple(demo(number) for number in range(count)), CONTROLS)
 
 
-def demo_store(path: Path, count: int = 6, depth: bool = True) -> Store:
+def demo_store(path: Path, count: int = 6, depth: bool = True, fps: float | None = 5.0) -> Store:
     """Demonstrations of which each third one fails."""
 
     def clips() -> Any:
         for number in range(count):
-            made = demo(number) | {"success": number % 3 != 2, "task": "move right", "fps": 5.0}
+            made = demo(number) | {"success": number % 3 != 2, "task": "move right", "fps": fps}
             made["provenance"] = {"control_steps": CONTROLS, "camera": "front"}
             yield made | (
                 {"depth": np.tile(np.linspace(0.5, 1, SIZE, dtype=np.float32), (8, SIZE, 1))} if depth else {}
