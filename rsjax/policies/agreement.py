@@ -13,12 +13,14 @@ from rsjax.evaluation.statistics import Estimate
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of predicted and true success rates over policies.
+    """Agreement of predicted success rates y and true ones x, over policies.
 
     Attributes:
         pearson: r with its Fisher interval (None with fewer than 4 policies).
         r2_line: R² of the line that fits best, which is r².
-        r2_identity: R² of the predictions themselves, 1 - SS_res / SS_tot; below 0 for worse than the mean.
+        r2_identity: R² of the line y = x, 1 - Σ(y - x)² / Σ(y - ȳ)², comparable with ``r2_line``: of the spread of y.
+        r2_prediction: R² of y as a prediction of x, 1 - Σ(y - x)² / Σ(x - x̄)². Where the spreads differ, one may be
+            above 0 (better than the mean) and the other below.
         spearman: the correlation of the ranks.
         mmrv: mean maximum rank violation (SIMPLER): how far apart, in truth, policies are that are ranked wrongly.
         bias: mean of predicted - true.
@@ -27,13 +29,14 @@ class Agreement:
     pearson: Estimate
     r2_line: float
     r2_identity: float
+    r2_prediction: float
     spearman: float
     mmrv: float
     bias: float
 
 
 def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"], level: float = 0.95) -> Agreement:
-    """Compares success rates. Correlations are NaN where either does not vary.
+    """Compares success rates. Correlations are NaN where either does not vary, R² where its spread is 0.
 
     Raises:
         ValueError: fewer than 2 policies, or other numbers of them.
@@ -41,16 +44,21 @@ def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"],
     x, y = np.asarray(true, np.float64), np.asarray(predicted, np.float64)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 2:
         raise ValueError(f"agreement needs the same two policies or more in both, not {x.shape} and {y.shape}")
-    r, total = correlation(x, y), float(np.sum((x - x.mean()) ** 2))
-    identity = 1 - float(np.sum((x - y) ** 2)) / total if total else float("nan")
+    r = correlation(x, y)
     return Agreement(
         pearson=fisher(r, len(x), level),
         r2_line=r**2,
-        r2_identity=identity,
+        r2_identity=_r2(x, y, y),
+        r2_prediction=_r2(x, y, x),
         spearman=correlation(ranks(x), ranks(y)),
         mmrv=rank_violation(x, y),
         bias=float(np.mean(y - x)),
     )
+
+
+def _r2(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"], of: Float[np.ndarray, " P"]) -> float:
+    total = float(np.sum((of - of.mean()) ** 2))
+    return 1 - float(np.sum((y - x) ** 2)) / total if total > 1e-12 else float("nan")
 
 
 def correlation(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"]) -> float:

@@ -25,6 +25,13 @@ from rsjax.report.video import write_mp4
 
 SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training at which policies are kept, beside the last one
 
+NUMBERS = {"r2_line": "R² of the line", "r2_identity": "R² of y = x", "r2_prediction": "R² of y for x"}
+NUMBERS |= {"spearman": "Spearman", "mmrv": "MMRV"}
+FORMULAS = (
+    "x: success in the simulator, y: in the world model. R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²; R² of y for x, a "
+    "prediction of x, is 1 - Σ(y - x)² / Σ(x - x̄)². Where y spreads more than x, the first is higher; signs may differ."
+)
+
 
 def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int = 8) -> dict[str, Policy]:
     """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name."""
@@ -144,18 +151,24 @@ def _title(row: Mapping[str, Any]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Returns the results in Markdown: agreement, success, and the judges that decided on it."""
-    names = ("Pearson r", "95 %", "R² of the line", "R² of y = x", "Spearman", "MMRV", "bias", "same outcome")
-    lines = [f"| run | {' | '.join(names)} | uninterpretable |", "|---" * (len(names) + 2) + "|"]
+    names = ("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable")
+    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
     for row in rows:
         if "pearson" in row:
             value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
             bounds = "" if low is None or high is None else f"{low:.2f} … {high:.2f}"
-            numbers = [value, *(row[name] for name in ("r2_line", "r2_identity", "spearman", "mmrv"))]
+            numbers = [value, *(row[name] for name in NUMBERS)]
             r, *others = ["–" if number is None else f"{number:.3f}" for number in numbers]
             cells = [row["run"], r, "no variation" if value is None else bounds, *others, f"{row['bias']:+.3f}"]
             cells += [f"{100 * row[name]:.0f} %" for name in ("same_outcome", "uninterpretable")]
             lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", "| policy | in | success | 95 % | uninterpretable | numbers clipped |", "|---|---|---|---|---|---|"]
+    lines += [
+        "",
+        FORMULAS,
+        "",
+        "| policy | in | success | 95 % | uninterpretable | numbers clipped |",
+        "|---|---|---|---|---|---|",
+    ]
     for number, row in enumerate(rows):
         for world in ("simulator", "world_model") if not number else ("world_model",):
             place = "the simulator" if world == "simulator" else row["run"]

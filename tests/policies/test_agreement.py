@@ -39,7 +39,18 @@ def test_a_perfect_predictor_and_a_shifted_one(pairs: list[tuple[int, int]]) -> 
     assert shifted.mmrv == 0 and shifted.bias == pytest.approx(np.mean(0.1 - 0.5 * x))
     if len(set(x)) > 1:
         assert perfect.r2_identity == pytest.approx(1)
+        assert perfect.r2_prediction == pytest.approx(1)
         assert shifted.r2_line == pytest.approx(1) and shifted.r2_identity < 1
+
+
+def test_the_line_y_x_and_the_prediction_of_x_have_different_spreads() -> None:
+    """The rates of docs/results/policies.md: of the spread of y the line is better than the mean, of x far worse."""
+    x, y = np.array([[0, 0, 0, 2, 12, 20, 26, 30], [0, 0, 4, 4, 16, 74, 82, 78]]) / 100
+    found = agreement(x, y)
+    assert (found.r2_identity, found.r2_prediction) == (pytest.approx(0.18, abs=0.005), pytest.approx(-6.55, abs=0.005))
+    assert found.r2_identity <= found.r2_line
+    swapped = agreement(y, x)
+    assert (swapped.r2_prediction, swapped.r2_identity) == pytest.approx((found.r2_identity, found.r2_prediction))
 
 
 def test_a_wrong_rank_costs_what_lies_between() -> None:

@@ -75,13 +75,14 @@ def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
     results = compare(policies, simulated(5), models, TRIALS, tmp_path)
     same, slow = results["runs"]
     assert same["run"] == "true" and same["same_outcome"] == 1
-    assert same["pearson"]["value"] == pytest.approx(1) and same["r2_identity"] == 1
+    assert same["pearson"]["value"] == pytest.approx(1) and same["r2_identity"] == same["r2_prediction"] == 1
     assert (same["mmrv"], same["bias"]) == (0, 0)
     assert slow["bias"] < 0 and slow["mmrv"] >= 0 and slow["same_outcome"] < 1
     assert {path.name for path in (tmp_path / "videos").iterdir()} == {
         f"{run}-{name}-00.mp4" for run in ("true", "slow") for name in policies
     }
     text = (tmp_path / "results.md").read_text()
+    assert "R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²" in text
     assert "| true | 1.000 |" in text and "| speed-1.0 | the simulator | 60 % |" in text
     assert (tmp_path / "scatter.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "results.json").read_text()) == results
