@@ -17,7 +17,7 @@ from rsjax.config import ConfigError
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 
-# Of what the planner is given (any type) and N candidates, (N, H, A): (N,), lower is better.
+# Of what the planner is given (any type) and N candidates, (N, H, A): (N,), lower is better; inf: never.
 Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray, " N"]]
 
 
@@ -35,7 +35,7 @@ class PlannerConfig:
         candidates: drawn in each round; the mean itself is one of them, and in later rounds the best so far.
         rounds: of a decision.
         elites: for "cem".
-        temperature: λ for "mppi", in standard deviations of the candidates' energies.
+        temperature: λ for "mppi", in standard deviations of the candidates' finite energies.
         spread: standard deviation of the first candidates, as a share of half the actions' range.
         memory: correlation of a candidate's noise from one step to the next: arms do not tremble.
         hold: numbers of an action are this often the same: an action that is ``hold`` controls after one another is
@@ -99,7 +99,7 @@ def search(
         high: greatest actions.
 
     Raises:
-        UserError: the energies have another shape or are not numbers.
+        UserError: the energies have another shape, or are NaN or -inf.
     """
     deviation = np.broadcast_to(config.spread * (high - low) / 2, mean.shape)
     best, lowest, history = mean, np.inf, []
@@ -112,11 +112,14 @@ def search(
         if energies[first] < lowest:
             best, lowest = drawn[first], float(energies[first])
         history.append(lowest)
+        finite = np.isfinite(energies)
+        if not finite.any():
+            continue  # nothing to move towards
         if config.method == "cem":
             elites = drawn[np.argsort(energies, kind="stable")[: config.elites]]
             mean, deviation = elites.mean(0), elites.std(0) + 0.05 * (high - low) / 2
         else:
-            scale = config.temperature * max(float(energies.std()), 1e-12)
+            scale = config.temperature * max(float(energies[finite].std()), 1e-12)
             weights = np.exp(-(energies - energies[first]) / scale)
             mean = np.einsum("n,nha->ha", weights / weights.sum(), drawn)
     return Plan(best.astype(np.float32), lowest, np.array(history))
@@ -181,9 +184,10 @@ def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float
 
 def _checked(energies: Any, count: int) -> Float[np.ndarray, " N"]:
     found = np.asarray(energies, np.float64)
-    if found.shape != (count,) or np.isnan(found).any():
+    wrong = np.isnan(found) | (found == -np.inf)
+    if found.shape != (count,) or wrong.any():
         raise UserError(
-            f"the energy of {count} candidates has shape {found.shape}, {np.isnan(found).sum()} of it NaN; "
+            f"the energy of {count} candidates has shape {found.shape}, {wrong.sum()} of it NaN or -inf; "
             f"expected ({count},), numbers"
         )
     return found

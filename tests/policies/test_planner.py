@@ -52,6 +52,20 @@ def test_a_search_finds_the_way_to_the_goal_and_a_closed_loop_reaches_it(method:
     np.testing.assert_array_equal(planner(np.zeros(2)), first)
 
 
+@pytest.mark.parametrize("method", ["cem", "mppi"])
+def test_impossible_candidates_are_left_out_of_the_search(method: Any) -> None:
+    def walled(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+        """No way leads through a wall, which most of the first candidates hit."""
+        hit = (start + 0.5 * candidates.cumsum(1))[..., 0].min(-1) < 0
+        return np.where(hit, np.inf, distance(start, candidates))
+
+    config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
+    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config)
+    assert search(walled, *inputs, np.random.default_rng(0)).energy < 0.05
+    nowhere = search(lambda _, rows: np.full(len(rows), np.inf), *inputs, np.random.default_rng(0))
+    assert nowhere.energy == np.inf and np.isfinite(nowhere.actions).all()
+
+
 def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
     config = PlannerConfig(candidates=8, elites=2, hold=3)
     seen: list[np.ndarray] = []
@@ -63,7 +77,7 @@ def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
         Planner(distance, -np.ones(6), np.ones(6), replace(config, hold=4))
     with pytest.raises(ConfigError, match="planner.elites is 9"):
         replace(config, elites=9)
-    for wrong in (np.zeros((8, 1)), np.full(8, np.nan)):
+    for wrong in (np.zeros((8, 1)), np.full(8, np.nan), np.full(8, -np.inf)):
         with pytest.raises(UserError, match=r"the energy of 8 candidates has shape .*; expected \(8,\), numbers"):
             Planner(lambda _, rows, wrong=wrong: wrong, -np.ones(6), np.ones(6), config)(None)  # type: ignore[misc]
 
