@@ -20,7 +20,7 @@ from rsjax.policies.rollouts import FirstFrame, World
 from rsjax.policies.simulator import Episode
 from rsjax.policies.training import train_policy
 from rsjax.policies.trials import FPS, Result, Trials, first_frames, save_arrays, try_policy
-from rsjax.progress import stage
+from rsjax.progress import note, stage
 from rsjax.report.video import write_mp4
 
 SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training at which policies are kept, beside the last one
@@ -34,10 +34,15 @@ FORMULAS = (
 
 
 def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int = 8) -> dict[str, Policy]:
-    """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name."""
+    """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name.
+
+    A training of few steps has fewer stages, which a note says.
+    """
     steps = config.train.steps
     shares = np.interp(np.linspace(0, 1, count - 1), np.linspace(0, 1, len(SHARES)), SHARES)
     stops = sorted({max(1, round(share * steps)) for share in shares} - {steps})
+    if len(stops) < count - 1:
+        note(f"{steps} training steps have {len(stops) + 1} stages, not {count}; more steps, or fewer checkpoints")
     last = train_policy(config, demos, directory, name="policy", stops=stops)
     return {f"step-{stop}": load_policy(directory / f"at-{stop}") for stop in stops} | {f"step-{steps}": last}
 

@@ -122,7 +122,9 @@ def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_p
     assert toy_judge.__qualname__ == "judge"  # the keys of functions are their names
 
 
-def test_checkpoints_go_from_the_first_steps_to_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_go_from_the_first_steps_to_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     stopped: list[int] = []
 
     def train(config: Any, source: Any, directory: Path, *, name: str, stops: list[int]) -> ToyPolicy:
@@ -135,6 +137,10 @@ def test_checkpoints_go_from_the_first_steps_to_the_last(tmp_path: Path, monkeyp
     found: Any = comparison.checkpoints(config, demos(), tmp_path, 8)
     assert stopped == [10, 30, 60, 120, 250, 500, 750]
     assert [(name, policy.speed) for name, policy in found.items()] == [(f"step-{n}", n) for n in (*stopped, 1000)]
+    assert not capsys.readouterr().out
+    few = comparison.checkpoints(replace(config, train=replace(config.train, steps=20)), demos(), tmp_path, 8)
+    assert len(few) == 6
+    assert "20 training steps have 6 stages, not 8; more steps, or fewer checkpoints" in capsys.readouterr().out
 
 
 def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
