@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import require
+from rsjax.config.leaves import leaves
+from rsjax.config.model import FAMILIES
 from rsjax.errors import UserError, did_you_mean
 from rsjax.evaluation.protocols import OWN
 from rsjax.evaluation.results import NAME, Result, read_result
@@ -19,6 +21,7 @@ ALIKE = {
     "data": ("key", "split", "frames", "image_size", "fps"),
 }
 MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
+SEEDED = ("family", "preset", "settings")  # of a result's model, what the runs of a group have in common
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
 
@@ -76,7 +79,8 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
         label: the results' label, such as ``paper``; None: the only one that all runs have, but "run" only if alone.
 
     Raises:
-        UserError: two groups have one name, a run has no such result, or results cannot be put side by side.
+        UserError: two groups have one name, a run has no such result, results cannot be put side by side, or runs of a
+            group differ in more than their seed or are one training.
     """
     named = [parse_group(text) for text in texts]
     for name, count in Counter(name for name, _ in named).items():
@@ -87,6 +91,8 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
     for name, paths in named:
         folders = tuple(_folder(run, label) for run in paths)
         groups.append(Group(name, tuple(map(read_result, folders)), folders))
+    for group in groups:
+        check_seeds(group)
     check_alike(groups)
     return groups
 
@@ -103,12 +109,14 @@ def _common(runs: Sequence[Path]) -> str:
     chosen = sorted(common - {OWN} or common)
     labels = " ".join(map(str, runs))
     require(bool(chosen), f"no protocol has evaluated all of them; python -m experiments.evaluate {labels}")
-    require(len(chosen) == 1, f"all of them have results of {', '.join(chosen)}; choose with --protocol")
+    require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
     return chosen[0]
 
 
 def _folder(run: Path, label: str) -> Path:
     found = results_of(run)
+    if parts := [each for each in found if each.startswith(f"{label},")] if label not in found else []:
+        raise UserError(f"{run}: no result {label}, but {' and '.join(parts)}; choose one of them with --protocol")
     if label not in found:
         has = f"it has {', '.join(found)}" if found else "it has none"
         raise UserError(
@@ -131,6 +139,36 @@ def check_alike(groups: Sequence[Group]) -> None:
                 f"{name} ({first.model['run']}) and {other} ({result.model['run']}) were not evaluated alike: "
                 f"{'; '.join(lines)}; evaluate both by one protocol on the same clips (python -m experiments.evaluate)"
             )
+
+
+def check_seeds(group: Group) -> None:
+    """Raises :class:`UserError` if a group's runs differ in more than their seed, or two of them are one training."""
+    first, trained = group.results[0].model, dict[str, str]()
+    for model in (result.model for result in group.results):
+        there, here = _deciding(first), _deciding(model)
+        pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some
+        lines = [f"model.{name} is {a} in the first, {b} in the other" for name, (a, b) in pairs.items() if a != b]
+        runs = f"{group.name}: {first['run']} and {model['run']}"
+        require(not lines, f"{runs} differ in more than their seed: {'; '.join(lines)}; make them groups of their own")
+        weights = str(model.get("weights_sha256") or len(trained))
+        same = f"{group.name}: {trained.get(weights)} and {model['run']} have the same weights"
+        require(weights not in trained, f"{same}; a group takes each training once")
+        trained[weights] = model["run"]
+
+
+def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the :data:`SEEDED` fields of a result's model that decide scores, by dotted name."""
+    kind = FAMILIES.get(model["family"])
+    runtime = {f"settings.{name}" for name, leaf in leaves(kind()).items() if leaf.runtime} if kind else set()
+    named = _flat({name: model[name] for name in SEEDED if name in model})
+    return {name: value for name, value in named.items() if name not in runtime}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return out
 
 
 def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...] | None]) -> list[str]:

@@ -147,7 +147,7 @@ def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray
     lines = []
     for entry in comparison.entries:
         curves: list[Curves] = [result.curves for result in entry.group.results]
-        name = f"{metric.name}{entry.suffix}"
+        name = entry.score(metric)
         if all(name in each for each in curves):
             points = np.mean([np.array(each[name], float) for each in curves], axis=0)
             lines.append((entry.name, np.array(curves[0]["frame"], float), points))

@@ -8,7 +8,7 @@ from typing import Any
 
 SOURCE = (
     "arXiv 2506.23135, on AgiBot-World: other clips, other resolution; not comparable with the columns to the left; "
-    "its Physics-IQ counts the prompt's frame too, as our …_all_frames do"
+    "its Physics-IQ counts the prompt's frame too, so it stands beside our …_all_frames"
 )
 COLUMNS = ("lpips", "psnr", "depth_absrel", "depth_delta1", "depth_delta2", "delta_psnr")
 _PHYSICS = ("physics_iq_spatial", "physics_iq_spatiotemporal", "physics_iq_weighted", "physics_iq_mse")
@@ -59,8 +59,10 @@ def published(name: str, protocol: str) -> dict[str, float]:
 
 def score_of(scores: Mapping[str, float], metric: str, depth_suffix: str) -> float | None:
     """Returns the published score that belongs beside one of our metrics; the paper names neither net nor alignment."""
-    if metric.startswith("lpips_"):
+    if metric in ("lpips_alex", "lpips_vgg"):
         return scores.get("lpips")
+    if metric in _PHYSICS:
+        return None
     if metric.startswith("depth_"):
         return scores.get(metric.removesuffix(depth_suffix)) if metric.endswith(depth_suffix) else None
-    return scores.get(metric)
+    return scores.get(metric.removesuffix("_all_frames"))

@@ -4,7 +4,7 @@ Axes: S seeds, B clips.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Literal
@@ -36,21 +36,26 @@ class Entry:
     group: Group
     suffix: str = ""
 
+    def score(self, metric: Metric) -> str:
+        """Returns the name of its score in a result, such as ``psnr_tokenizer_second_half``."""
+        base = base_of(metric.name)
+        return f"{base}{self.suffix}{metric.name.removeprefix(base)}"
+
     def seeds(self, metric: Metric) -> list[float]:
         """Returns each seed's score over all clips; empty where a result has none."""
-        name = f"{metric.name}{self.suffix}"
-        values = [result.metrics.get(name) for result in self.group.results]
+        values = [result.metrics.get(self.score(metric)) for result in self.group.results]
         known = [float(value) for value in values if value is not None and math.isfinite(value)]
         return known if len(known) == len(values) else []
 
     def per_clip(self, metric: Metric) -> Float[np.ndarray, "S B"] | None:
         """Returns the clips' scores; None where a result has none."""
-        rows = [result.per_clip.get(f"{metric.name}{self.suffix}", []) for result in self.group.results]
+        rows = [result.per_clip.get(self.score(metric), []) for result in self.group.results]
         return np.array(rows) if rows[0] and len({len(row) for row in rows}) == 1 else None
 
     def reason(self, metric: Metric) -> str:
         """Returns why there is no score; "" if that is not recorded."""
-        return next((each.reasons[metric.name] for each in self.group.results if metric.name in each.reasons), "")
+        base = base_of(metric.name)
+        return next((each.reasons[base] for each in self.group.results if base in each.reasons), "")
 
 
 @dataclass(frozen=True)
@@ -109,7 +114,7 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
     found = [
         replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
     ]
-    found += [_best_of(name) for name in names if name.endswith(BEST)]
+    found += _parts(names)
     if not only:
         other_depth = {each.name for each in found if each.name.startswith("depth_")} - depth
         return [each for each in found if each.column and each.name not in other_depth]
@@ -128,11 +133,24 @@ def _depth_suffix(groups: Sequence[Group]) -> str:
     return "" if alignment == "none" else f"_{alignment}_{source}"
 
 
-def _best_of(name: str) -> Metric:
-    """Returns the metric of a score such as ``psnr_best100_incl_ctx``."""
-    base, _, samples = name.removesuffix(BEST).rpartition("_best")
-    metric = metrics()[base]
-    return replace(metric, name=name, title=f"{metric.title}, best of {samples}, prompt included", statistic="mean")
+def base_of(score: str) -> str:
+    """Returns the name of the registered metric that a score belongs to, the longest that begins it; "" without."""
+    return max((name for name in metrics() if f"{score}_".startswith(f"{name}_")), key=len, default="")
+
+
+def _parts(names: Collection[str]) -> list[Metric]:
+    """Returns the metrics of scores such as ``delta_psnr_t4``, of which those of the best of samples are for tables."""
+    found = []
+    for name in names:
+        base = base_of(name)
+        part, whole = name.removeprefix(base), name.rpartition("_")[0]
+        bound = part.endswith(("_low", "_high")) and whole in names
+        if base and part and not bound and not part.startswith(tuple(BASELINES)):
+            best = part.removeprefix("_best").removesuffix(BEST) if part.endswith(BEST) else ""
+            words = f"best of {best}, prompt included" if best else part[1:].replace("_", " ")
+            metric = metrics()[base]
+            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=bool(best)))
+    return found
 
 
 def cell(entry: Entry, metric: Metric) -> Cell:

@@ -168,6 +168,26 @@ def test_metrics_are_chosen_by_pattern(make: Make) -> None:
         compare(groups, against="b")
 
 
+def test_parts_of_metrics_are_compared_beside_their_baselines(make: Make) -> None:
+    plain = toy.result(0.0)
+    names = "delta_psnr delta_psnr_t4 psnr_second_half physics_iq_mse physics_iq_mse_all_frames psnr_n1_pred_only"
+    scores = dict.fromkeys([*names.split(), "psnr_tokenizer_second_half", "psnr_second_half_low", "clips"], 1.0)
+    groups = read_groups([make("a", replace(plain, metrics=plain.metrics | scores))], None)
+    only = ["delta_*", "*_all_frames", "psnr_second_half", "*_n1_pred_only"]
+    found = compare(groups, only)
+    wanted = ["delta_psnr", "delta_psnr_t4", "psnr_second_half", "physics_iq_mse_all_frames", "psnr_n1_pred_only"]
+    assert [each.name for each in found.metrics] == wanted
+    assert [each.title for each in found.metrics][1:3] == ["ΔPSNR, another clip's actions, t4", "PSNR, second half"]
+    assert [cell.spread and cell.spread.mean for cell in found.cells["psnr_second_half"]] == [1.0, None, 1.0]
+    rows = {row["metric"]: row["mean"] for row in as_json(found)["scores"] if row["entry"] == "RoboScape"}
+    assert rows == {"delta_psnr": 3.3435, "physics_iq_mse_all_frames": 0.0184}
+    assert {*(each.name for each in compare(groups).metrics)}.isdisjoint({"delta_psnr_t4", "psnr_second_half"})
+    whole = "psnr_low psnr_repeat_first success_share nothing"
+    for name in whole.split():
+        with pytest.raises(ConfigError, match="no metric of these results"):
+            compare(groups, [name])
+
+
 def test_groups_are_paths_lists_or_patterns_with_commas_in_names(tmp_path: Path) -> None:
     for name in ("x=1,seed=0", "x=1,seed=1", "plain"):
         (tmp_path / name).mkdir()
@@ -191,8 +211,32 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no protocol has evaluated all of them; python -m experiments.evaluate"):
         read_groups([str(tmp_path / "bare")], None)
     toy.run(tmp_path / "a,seed=0", replace(toy.result(0.0), label="horizon48"))
-    with pytest.raises(UserError, match="results of horizon48, paper; choose with --protocol"):
+    with pytest.raises(UserError, match="results of horizon48 and of paper; choose one with --protocol"):
         read_groups([f"a={tmp_path}/a,seed=0"], None)
+    toy.run(tmp_path / "b", replace(toy.result(0.0), label="unseen,unseen_camera"))
+    with pytest.raises(UserError, match="no result unseen, but unseen,unseen_camera; choose one of them with --proto"):
+        read_groups([f"{tmp_path}/b"], "unseen")
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"family": "genie"}, "model.family is roboscape in the first, genie in the other"),
+        ({"preset": "debug"}, "model.preset is tiny in the first, debug in the other"),
+        ({"settings": {"loss": {"gamma": 9.0}}}, "model.settings.loss.gamma is 5.0 in the first, 9.0 in the other"),
+        ({"weights_sha256": "w0"}, "have the same weights; a group takes each training once"),
+        ({"seed": 1, "settings": {"loss": {"gamma": 5.0}, "unroll": 4, "new": 1}}, ""),
+    ],
+)
+def test_runs_of_a_group_differ_in_their_seed_alone(make: Make, changes: dict, says: str) -> None:
+    plain = toy.result(0.0)
+    own = plain.model | {"preset": "tiny", "settings": {"loss": {"gamma": 5.0}, "unroll": 1}, "weights_sha256": "w0"}
+    group = make("a", replace(plain, model=own), replace(plain, model=own | {"weights_sha256": "w1"} | changes))
+    if not says:
+        assert len(read_groups([group], None)[0].results) == 2
+        return
+    with pytest.raises(UserError, match=f"a: runs/0.0 and runs/0.0 .*{re.escape(says)}"):
+        read_groups([group], None)
 
 
 def test_rows_of_the_paper() -> None:
