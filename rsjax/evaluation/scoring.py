@@ -67,7 +67,10 @@ def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> d
     if not scenes[""].alternatives.keys() >= set(metric.needs):
         raise Unavailable(f"protocol {protocol.name} generates no videos under other actions")
     scores = _named(metric, scenes[""], "")
-    for suffix in filter(None, scenes if not metric.needs else ()):
+    if metric.needs:  # the first frame repeated ignores actions
+        still = f"{metric.name}_repeat_first"
+        return scores | {still + name.removeprefix(metric.name): np.zeros_like(each) for name, each in scores.items()}
+    for suffix in filter(None, scenes):
         with suppress(Unavailable):
             scores |= _named(metric, scenes[suffix], suffix)
     return scores
@@ -144,7 +147,6 @@ def summarised(scored: Scored, interval: bool = True) -> dict[str, float]:
                 continue
             estimate = bootstrap(values, statistic=metric.statistic)
             flat |= estimate.flat(name) if metric.interval and interval else {name: estimate.value}
-        flat |= {f"{metric.name}_repeat_first": 0.0} if metric.needs else {}  # this baseline ignores actions
     for name, values in scored.best.items():
         estimate = bootstrap(values)
         flat |= estimate.flat(name) if interval else {name: estimate.value}

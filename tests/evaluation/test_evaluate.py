@@ -98,7 +98,7 @@ def test_own_actions_in_place_of_random_ones_make_no_difference(clips: Store, mo
     monkeypatch.setattr(evaluation.delta_psnr, "uniform_actions", lambda own, *_, seed: own[None])
     metrics = evaluate(toy.trained(clips, config), clips).metrics
     deltas = {name: value for name, value in metrics.items() if name.startswith("delta_psnr")}
-    assert len(deltas) == 14
+    assert len(deltas) == 24
     assert set(deltas.values()) == {0.0}
 
 
@@ -137,6 +137,8 @@ def test_scores_of_single_clips_and_frames_have_the_scores_as_their_means(result
         assert np.mean(np.array(result.curves[name], float)) == pytest.approx(result.metrics[name], rel=1e-5)
     assert np.mean(np.array(result.curves["delta_psnr"], float)) == pytest.approx(result.metrics["delta_psnr"])
     assert "delta_psnr_repeat_first" not in result.curves
+    still = {name: scores for name, scores in result.per_clip.items() if name.startswith("delta_psnr_repeat_first")}
+    assert still == dict.fromkeys(("delta_psnr_repeat_first", "delta_psnr_repeat_first_t4"), [0.0] * toy.TEST)
 
 
 def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, tmp_path: Path) -> None:
