@@ -64,7 +64,7 @@ class Cell:
 
     Attributes:
         spread: mean and standard deviation over seeds; None without a score.
-        interval: of the mean over seeds and clips; None for a score of the whole set.
+        interval: of the same mean, over seeds and clips; None for a score of the whole set.
         reason: why there is no score.
     """
 

@@ -151,6 +151,8 @@ def legend(comparison: Comparison) -> list[str]:
         f"only where every interval there is, that of Welch's t over seeds too, excludes zero. No correction for many "
         f"comparisons.",
     ]
+    if medians := [metric.title for metric in comparison.metrics if metric.statistic == "median"]:
+        lines.insert(1, f"Each seed's score is its median over clips, not its mean: {'; '.join(medians)}.")
     if 1 in counts:
         lines.append("A group of one seed is one training: its intervals say nothing about other seeds.")
     if comparison.papers:

@@ -70,10 +70,19 @@ def bootstrap(
         raise ValueError(f"an interval needs one finite number per clip, not {values}")
     if len(values) == 1:
         return Estimate(float(values[0]), None, None)
+    resampled = _resampled(values[None], seed, resamples, statistic)
+    return _estimate(_SUMMARIES[statistic](values), resampled[:, 0], level)
+
+
+def _resampled(
+    scores: Float[np.ndarray, "S B"], seed: int, resamples: int, statistic: Statistic
+) -> Float[np.ndarray, "R S"]:
+    """Returns each seed's mean or median over the clips of each resample, which all seeds share."""
+    clips = scores.shape[1]
     if statistic == "mean":
-        return _estimate(values.mean(), _share_of_clips(len(values), resamples, seed) @ values, level)
-    drawn = np.random.default_rng(seed).integers(len(values), size=(resamples, len(values)))
-    return _estimate(np.median(values), np.median(values[drawn], axis=1), level)
+        return _share_of_clips(clips, resamples, seed) @ scores.T
+    drawn = np.random.default_rng(seed).integers(clips, size=(resamples, clips))
+    return np.stack([np.median(each[drawn], axis=1) for each in scores], axis=1)
 
 
 @lru_cache(maxsize=2)  # of scores, and of the points of curves
@@ -92,15 +101,16 @@ def paired_bootstrap(
     resamples: int = 10_000,
     statistic: Statistic = "mean",
 ) -> Estimate:
-    """Returns the mean or median over clips of a - b, and its percentile-bootstrap interval over seeds and clips.
+    """Returns the score of a less that of b, and its percentile-bootstrap interval over seeds and clips.
 
-    Each resample draws S seeds of ``a``, Z seeds of ``b`` and B clips, which both share, so clips stay paired. With one
-    seed each this is :func:`bootstrap` of the clips' differences; the interval then says nothing about other seeds. Two
-    or three seeds understate how seeds vary; read :func:`welch` beside it.
+    A score is the mean over seeds of each seed's mean or median over clips. Each resample draws S seeds of ``a``, Z
+    seeds of ``b`` and B clips, which all share, so clips stay paired. With one seed each the interval says nothing
+    about other seeds, and of means this is :func:`bootstrap` of the clips' differences. Two or three seeds understate
+    how seeds vary; read :func:`welch` beside it.
 
     Args:
         a, b: a number per seed and clip; the same clips in the same order. One seed may come without its axis.
-        seed, level, resamples, statistic: as in :func:`bootstrap`; clips are summarised after the mean over seeds.
+        seed, level, resamples, statistic: as in :func:`bootstrap`.
 
     Raises:
         ValueError: the clips differ in number, there are none, or a value is not finite.
@@ -110,11 +120,14 @@ def paired_bootstrap(
         raise ValueError(f"a paired interval needs a finite number per seed and clip, not {a.shape} and {b.shape}")
     if a.shape[1] == 1:
         return Estimate(float(a.mean() - b.mean()), None, None)
-    rng, summarise = np.random.default_rng(seed), _SUMMARIES[statistic]
-    clips = rng.integers(a.shape[1], size=(resamples, a.shape[1]))
-    over_seeds_a, over_seeds_b = (_share_of_seeds(len(each), resamples, rng) @ each for each in (a, b))
-    resampled = np.take_along_axis(over_seeds_a - over_seeds_b, clips, axis=1)
-    return _estimate(summarise(a.mean(0) - b.mean(0)), summarise(resampled, axis=1), level)
+    rng, summarise = np.random.default_rng([seed, 1]), _SUMMARIES[statistic]  # of seeds alone
+
+    def over_seeds(scores: Float[np.ndarray, "S B"]) -> Float[np.ndarray, " R"]:
+        by_seed = _resampled(scores, seed, resamples, statistic)
+        return (_share_of_seeds(len(scores), resamples, rng) * by_seed).sum(1)
+
+    value = summarise(a, axis=1).mean() - summarise(b, axis=1).mean()
+    return _estimate(value, over_seeds(a) - over_seeds(b), level)
 
 
 def _share_of_seeds(seeds: int, resamples: int, rng: np.random.Generator) -> Float[np.ndarray, "R S"]:

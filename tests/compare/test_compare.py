@@ -172,7 +172,7 @@ def test_parts_of_metrics_are_compared_beside_their_baselines(make: Make) -> Non
     plain = toy.result(0.0)
     names = "delta_psnr delta_psnr_t4 psnr_second_half physics_iq_mse physics_iq_mse_all_frames psnr_n1_pred_only"
     scores = dict.fromkeys([*names.split(), "psnr_tokenizer_second_half", "psnr_second_half_low", "clips"], 1.0)
-    groups = read_groups([make("a", replace(plain, metrics=plain.metrics | scores))], None)
+    groups = read_groups([make("a", replace(plain, metrics={**plain.metrics, **scores}))], None)
     only = ["delta_*", "*_all_frames", "psnr_second_half", "*_n1_pred_only"]
     found = compare(groups, only)
     wanted = ["delta_psnr", "delta_psnr_t4", "psnr_second_half", "physics_iq_mse_all_frames", "psnr_n1_pred_only"]
@@ -186,6 +186,23 @@ def test_parts_of_metrics_are_compared_beside_their_baselines(make: Make) -> Non
     for name in whole.split():
         with pytest.raises(ConfigError, match="no metric of these results"):
             compare(groups, [name])
+
+
+def test_differences_of_medians_are_those_of_the_scores_beside_them(make: Make) -> None:
+    def result(seed: int, scale: float) -> Result:
+        plain, errors = toy.result(0.0, seed), scale * np.random.default_rng(seed).exponential(size=toy.CLIPS)
+        score, per_clip = {"cube_error_widths": float(np.median(errors))}, {"cube_error_widths": errors.tolist()}
+        return replace(plain, metrics={**plain.metrics, **score}, per_clip=plain.per_clip | per_clip)
+
+    groups = [make("a", result(0, 1.0), result(1, 2.0)), make("b", result(2, 1.0), result(3, 3.0))]
+    found = compare(read_groups(groups, None), ["cube_error_widths", "psnr"])
+    a, b = (cell for cell in found.cells["cube_error_widths"][:2])
+    change = found.differences["cube_error_widths"][1]
+    assert a.spread and b.spread and a.interval and change and change.interval and change.welch
+    assert a.interval.value == pytest.approx(a.spread.mean)
+    assert change.interval.value == pytest.approx(b.spread.mean - a.spread.mean)
+    assert change.welch.difference.value == pytest.approx(change.interval.value)
+    assert re.search(r"median over clips, not its mean: [^;]*cube[^;]*\.", as_markdown(found))
 
 
 def test_groups_are_paths_lists_or_patterns_with_commas_in_names(tmp_path: Path) -> None:
