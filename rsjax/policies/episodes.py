@@ -79,7 +79,8 @@ class Episodes:
         observation_space: likewise.
 
     Raises:
-        UserError: the run is missing or unfinished, or its family of models cannot generate frame by frame.
+        UserError: the run is missing or unfinished, its family of models cannot generate frame by frame, or the judge
+            is missing, damaged or of frames of another size.
     """
 
     def __init__(self, run: Path | str | TrainedModel, count: int | None, settings: Settings) -> None:
@@ -94,7 +95,7 @@ class Episodes:
         self._depth = config.model.uses_depth and norm.depth_range is not None
         store = Path(settings.store) if settings.store else None
         self._starts = Starts(config, where, Path(settings.data_dir), store, settings.split, self._depth)
-        self._settings, self._judge = settings, judge_of(run, settings.judge)
+        self._settings, self._judge = settings, judge_of(run, settings.judge, size)
         self._low, self._high, self._unit = action_range(config, norm)
         self._recent = np.zeros((count, HISTORY, size, size, 3), np.uint8)
         self._steps, self._clipped = np.zeros(count, int), np.zeros(count, int)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import linen as nn
+from flax.errors import ScopeParamShapeError
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -80,11 +81,14 @@ class TrainedJudge:
         write_file(folder / FILE, encode(arrays | {"temperature": self.temperature}))
 
 
-def load_judge(folder: Path) -> TrainedJudge:
+def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     """Reads a judge that ``python -m experiments.judge`` trained, with its validation unless that is another judge's.
 
+    Args:
+        side: of the frames that it will see, pixels; None: not known yet.
+
     Raises:
-        UserError: there is none, or its file is damaged.
+        UserError: there is none, its file is damaged, or it does not take frames of that size.
     """
     path, report = folder / FILE, folder / VALIDATION
     try:
@@ -95,6 +99,14 @@ def load_judge(folder: Path) -> TrainedJudge:
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path}: damaged ({error}); train it again with python -m experiments.judge RUN") from error
     judge = TrainedJudge(unflatten_dict({tuple(name.split("/")): x for name, x in record.items()}), temperature)
+    if side is not None:
+        try:
+            jax.eval_shape(_logits, judge.params, np.zeros((1, HISTORY, side, side, 3), np.uint8))
+        except ScopeParamShapeError as error:
+            raise UserError(
+                f"{path}: was trained on frames of another size, these have {side} × {side} pixels; train one on such "
+                f"with python -m experiments.judge RUN"
+            ) from error
     found = read_json(report, cure="train the judge again") if report.exists() else None
     # An interrupted training may have left the validation of the judge before; older ones do not name theirs.
     return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge

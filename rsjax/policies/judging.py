@@ -52,16 +52,19 @@ class JudgeSettings:
         require_range(self, "judge", 0, 2**32 - 1, "reconstructed", "seed")
 
 
-def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None) -> Judge | None:
+def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, side: int) -> Judge | None:
     """Returns a judge: itself, the one in a directory, or for "run" that of the run if it has one.
 
+    Args:
+        side: of the run's frames, pixels.
+
     Raises:
-        UserError: the directory has no judge, or its file is damaged.
+        UserError: the directory has no judge, its file is damaged, or it is of frames of another size.
     """
     if judge == "run":
         folder = None if isinstance(run, TrainedModel) else Path(run) / FOLDER
-        return load_judge(folder) if folder is not None and folder.exists() else None
-    return load_judge(Path(judge)) if isinstance(judge, Path | str) else judge
+        return load_judge(folder, side) if folder is not None and folder.exists() else None
+    return load_judge(Path(judge), side) if isinstance(judge, Path | str) else judge
 
 
 def make_judge(

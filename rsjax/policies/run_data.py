@@ -70,7 +70,7 @@ class RunData:
         """Returns the run's world model as a world of ``count`` episodes, with the run's judge or another one's folder.
 
         Raises:
-            UserError: the run is unfinished, or there is no judge.
+            UserError: the run is unfinished, or there is no judge for its frames.
         """
         low, high, _ = action_range(self.config, self.trained.assets.normalization)
         return Imagined(self.trained, count, self.judge(judge), low, high)
@@ -99,9 +99,9 @@ class RunData:
         """Returns the run's judge, or the one in another folder.
 
         Raises:
-            UserError: there is none.
+            UserError: there is none, or it is of frames of another size than the run's.
         """
-        return load_judge(folder or self.run / FOLDER)
+        return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
 
     def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
         """Returns the first frames of so many clips, with depth where they have it."""

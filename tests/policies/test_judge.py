@@ -1,6 +1,8 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -50,8 +52,11 @@ def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: Traine
 def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudge, tmp_path: Path) -> None:
     judge.save(tmp_path / "judge")
     frames = footage(2, 3).rgb
-    np.testing.assert_array_equal(load_judge(tmp_path / "judge")(frames), judge(frames))
+    np.testing.assert_array_equal(load_judge(tmp_path / "judge", 32)(frames), judge(frames))
     assert load_judge(tmp_path / "judge").key == judge.key != replace(judge, temperature=3.0).key
+    for name in ("judge", "run"):  # a directory of one, or the run's own
+        with pytest.raises(UserError, match="was trained on frames of another size, these have 64 × 64 pixels"):
+            judging.judge_of(tmp_path, tmp_path / name if name == "judge" else name, 64)
     report = tmp_path / "judge" / "validation.json"
     for name, known in ((judge.key, True), ("another", False)):
         report.write_text(json.dumps({"judge": name}))
@@ -115,8 +120,8 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
     }
     loaded = judging.saved_judge(run)
     assert loaded.validation == json.loads((run / "judge" / "validation.json").read_text()) and loaded.validation
-    assert judging.judge_of(run, "run").temperature == loaded.temperature  # type: ignore[union-attr]
-    assert judging.judge_of(tmp_path, "run") is None
+    assert judging.judge_of(run, "run", 64).temperature == loaded.temperature  # type: ignore[union-attr]
+    assert judging.judge_of(tmp_path, "run", 64) is None
 
 
 def test_a_success_ends_an_episode_with_a_reward(tmp_path: Path, store_env: Store) -> None:
@@ -161,3 +166,32 @@ def test_a_language_model_answers_in_words(tmp_path: Path) -> None:
     assert {answer: answer_label(answer) for answer in answers} == answers
     with pytest.raises(UserError, match="needs torch and transformers|no config.json"):
         LanguageJudge.load(tmp_path)
+
+
+class Words:
+    """Stands in for a processor of transformers: a token of the prompt for each picture and text, one of the answer."""
+
+    def __init__(self) -> None:
+        self.seen: list[list[Any]] = []
+
+    def apply_chat_template(self, chat: list[Any], **settings: Any) -> dict[str, np.ndarray]:
+        assert settings["tokenize"] and settings["add_generation_prompt"] and chat[0]["role"] == "user"
+        self.seen.append(chat[0]["content"])
+        return {"input_ids": np.zeros((1, len(chat[0]["content"])), int)}
+
+    def decode(self, tokens: np.ndarray, skip_special_tokens: bool) -> str:
+        return ("Yes.", "no", "I cannot see it")[tokens.item()]
+
+
+def test_a_language_model_sees_the_last_frames_and_its_answer_counts() -> None:
+    videos, words = footage(3, 0).rgb, Words()
+    answers = iter(range(3))
+
+    def generate(input_ids: np.ndarray, **settings: Any) -> np.ndarray:
+        return np.concatenate([input_ids, [[next(answers)]]], 1)  # the prompt, then the answer
+
+    judge = LanguageJudge(SimpleNamespace(generate=generate), words, "Is it up?", frames=2)
+    np.testing.assert_array_equal(judge(videos), np.eye(3))
+    for video, (*pictures, text) in zip(videos, words.seen, strict=True):
+        np.testing.assert_array_equal([picture["image"] for picture in pictures], video[-2:])
+        assert text["text"] == "Is it up? Answer with one word: yes, no or unclear."

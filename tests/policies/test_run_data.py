@@ -1,12 +1,16 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 from rsjax.config import Config, presets, to_dict
 from rsjax.errors import UserError
 from rsjax.files import write_json
+from rsjax.policies.judge import Network, TrainedJudge
 from rsjax.policies.run_data import RunData
+from rsjax.policies.verdicts import HISTORY
 
 
 def run(path: Path, config: Config, trained: bool = True) -> RunData:
@@ -33,3 +37,13 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
         small.check_world(first)
     with pytest.raises(UserError, match="new: its world model is not trained yet"):
         run(tmp_path / "new", config, trained=False).check_world(first)
+
+
+def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:
+    first = run(tmp_path / "first", presets.debug())
+    for side in (32, 64):
+        params = Network().init(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))["params"]
+        TrainedJudge(params, 1.0).save(tmp_path / f"judge-{side}")
+    first.judge(tmp_path / "judge-64")
+    with pytest.raises(UserError, match=r"judge-32/judge.msgpack: was trained on frames of another size"):
+        first.judge(tmp_path / "judge-32")
