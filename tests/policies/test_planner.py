@@ -12,7 +12,7 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, create_model
 from rsjax.models.trained import TrainedModel
-from rsjax.policies import planning
+from rsjax.policies import energies, planning
 from rsjax.policies.energies import Seen, imagined, judged, pixel_distance, token_distance
 from rsjax.policies.planner import Planner, PlannerConfig, search
 from rsjax.policies.planning import PlanSettings, compare, folder, table
@@ -116,6 +116,21 @@ def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:
     assert found[1] == 0 < found[0] <= 1
     by_hand = [bin(int(x)).count("1") for x in np.bitwise_xor(*model.encode(frames)["rgb"][:, 0]).ravel()]
     assert found[0] == pytest.approx(np.mean(by_hand) / model.config.tokenizer.code_bits)
+
+
+def test_the_distance_of_lpips_compares_last_frames_with_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    def distances(params: float, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        assert one.shape == other.shape
+        return params * np.abs(one.astype(float) - other).mean((1, 2, 3))
+
+    monkeypatch.setattr(energies, "load_lpips", lambda weights: 2.0)
+    monkeypatch.setattr(energies, "distances", distances)
+    monkeypatch.setattr(energies, "min_size", lambda params: 8)
+    goal, videos = np.full((8, 8, 3), 7, np.uint8), np.zeros((2, 3, 8, 8, 3), np.uint8)
+    videos[1, -1] = 7
+    assert energies.lpips_distance(Path("weights"), goal)(videos).tolist() == [14, 0]
+    with pytest.raises(UserError, match="weights: frames have 4 pixels; this network needs 8"):
+        energies.lpips_distance(Path("weights"), goal[:4, :4])
 
 
 class FakeLift:
