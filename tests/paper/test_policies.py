@@ -57,7 +57,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def plan(trained: Any, place: Path, settings: Any) -> Any:
         asked["plan"] = settings
-        ways = {"random": [False, False], "expert": [True, True], "cem": [False, True]}
+        ways = {"random": [False, False], "expert": [True, True], "cem": [False, True], "mppi": [True, True]}
         return {"episodes": [{"way": way, "success": hit} for way, row in ways.items() for hit in row]}
 
     monkeypatch.setattr(policies, "_judged", lambda run, size: Data())
@@ -85,13 +85,17 @@ def test_every_comparison_has_its_scores(tmp_path: Path, asked: dict[str, Any]) 
             found[name, one, other] = scores[one], scores[other]
     assert found["policy-learning", "many", "real"] == ([0, 1], [1, 0])
     assert found["policy-learning", "many", "few"] == ([0, 1], [0, 0])
-    assert asked["cells"] == [("synthetic-10", "policies"), ("synthetic-40", "policies"), ("real-40", "policies")]
+    assert found["policy-learning", "few", "real_few"] == ([0, 0], [1, 0])
+    assert found["policy-learning", "both", "repeated"] == ([1, 1], [1, 0])
+    cells = ["synthetic-10", "synthetic-40", "real-40-synthetic-40", "real-10", "real-40", "real-40-repeated"]
+    assert asked["cells"] == [(name, "policies") for name in cells]
     assert asked["demos"] == 40
     assert found["policy-evaluation", "same_outcome", "same_outcome"][0] == [1, 0, 1, 0] and asked["world"] == ["cell"]
     assert found["policy-evaluation", "pearson", "strong"] == ([0.7], [0.9])
     assert found["policy-improvement", "after", "before"] == ([1, 1], [0, 0])
     assert found["policy-improvement", "after", "control"] == ([1, 1], [1, 0])
     assert (asked["starts"], asked["old"]) == (2 * 40, 10)
+    assert found["planning", "mppi", "random"] == ([1, 1], [0, 0])
     assert found["planning", "cem", "random"] == ([0, 1], [0, 0]) and asked["plan"].episodes == 10
 
 
