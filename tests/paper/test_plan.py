@@ -20,6 +20,7 @@ from tests.paper import toy
 DATA = Path("data")
 TINY = presets.tiny()
 KNOWN = tuple(claims().values())
+RATES = (", 0.3 × the rate", ", 3 × the rate")
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +161,15 @@ def test_all_families_can_be_compared_on_several_tasks() -> None:
     models = {arm.name: plan.of("table1", arm.name)[0].config for arm in plan.claims[0].arms}
     assert {config.sim for config in models.values()} == {plan.scale.base.sim}
     assert models["CogVideoX"].model.text.tasks == plan.scale.base.sim.train_tasks  # type: ignore[attr-defined]
+
+
+def test_every_family_of_table_1_has_three_trials_of_its_learning_rate(three_hours: Plan) -> None:
+    for family in claims()["table1"].arms:
+        cells = {arm: three_hours.of("learning-rates", family.name + arm)[0] for arm in ("", *RATES)}
+        rates = {arm: cell.config.train.optimizer.learning_rate for arm, cell in cells.items()}
+        assert [rates[arm] / rates[""] for arm in RATES] == pytest.approx([0.3, 3])
+        assert cells[""] == three_hours.of("table1", family.name)[0], "its own rate is trained once for both claims"
+        assert {cell.config.train.steps for cell in cells.values()} == {cells[""].config.train.steps}
 
 
 def test_more_seeds_are_more_trainings() -> None:

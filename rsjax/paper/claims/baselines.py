@@ -78,7 +78,7 @@ _FAIR = (
     "RoboScape and Genie also learn from moved copies of the clips (model.shifts), the other families do not.",
 )
 
-register(
+TABLE_1 = register(
     Claim(
         name="table1",
         title="RoboScape against other world models",

@@ -1,0 +1,34 @@
+"""Equally many trials of the learning rate for every family of Table 1."""
+
+from dataclasses import replace
+
+from rsjax.config import presets
+from rsjax.paper.claim import Arm, Claim, pairs, register
+from rsjax.paper.claims.baselines import TABLE_1
+
+_FACTORS = {"0.3 × the rate": 0.3, "3 × the rate": 3.0}
+
+
+def _trials(arm: Arm) -> tuple[Arm, ...]:
+    """Returns an arm of Table 1, and the same with other learning rates of the world model."""
+    preset = f"{arm.preset}_tiny" if arm.preset else "tiny"  # Genie has the settings of RoboScape's preset
+    own, arm = presets.get(preset).train.optimizer.learning_rate, replace(arm, published={})
+    rates = {what: float(f"{factor * own:.2g}") for what, factor in _FACTORS.items()}
+    trials = {f"{arm.name}, {what}": {"train.optimizer.learning_rate": rate} for what, rate in rates.items()}
+    return (arm, *(replace(arm, name=name, values=values) for name, values in trials.items()))
+
+
+register(
+    Claim(
+        name="learning-rates",
+        title="The learning rates of Table 1",
+        statement="Each family trains with the best of three learning rates.",
+        place="the fairness of Table 1",
+        arms=tuple(trial for arm in TABLE_1.arms for trial in _trials(arm)),
+        comparisons=tuple(
+            each for arm in TABLE_1.arms for what in _FACTORS for each in pairs(arm.name, f"{arm.name}, {what}", "psnr")
+        ),
+        rank=6,
+        notes=("Three trials a family; autoencoders keep the rates of their presets.",),
+    )
+)
