@@ -120,9 +120,14 @@ def physics_iq_score(prediction: Four, second_take: Four) -> float:
     Args:
         prediction: the model's metrics against the first take.
         second_take: those of the second take against the first.
+
+    Raises:
+        Unavailable: no motion of the second take is where the first one's is.
     """
     mean, limit = _means(prediction), _means(second_take)
     limit = {name: round(value, 5 if name == "spatial" else 4) for name, value in limit.items()}
+    if empty := [name for name, value in limit.items() if name != "mse" and not value]:
+        raise Unavailable(f"the second take's motion and the first's have nothing in common ({', '.join(empty)} IoU 0)")
     ratios = [mean[name] / limit[name] for name in ("spatiotemporal", "spatial", "weighted")]
     return round(float(np.clip(100 * (np.mean(ratios) - (mean["mse"] - limit["mse"])), 0, 100)), 2)
 

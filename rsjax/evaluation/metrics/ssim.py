@@ -7,7 +7,7 @@ from jaxtyping import Float, Num
 
 from rsjax.clip import Array
 from rsjax.evaluation.metrics.psnr import PEAK, same_frames
-from rsjax.evaluation.registry import PerClip, PerFrame, Scene, metric
+from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
 
 _WINDOW = 11
 _SIGMA = 1.5
@@ -16,7 +16,14 @@ _K2 = 0.03
 
 
 def per_frame(scene: Scene) -> PerFrame:
-    """Scores every predicted frame."""
+    """Scores every predicted frame.
+
+    Raises:
+        Unavailable: the frames are smaller than the window.
+    """
+    side = min(scene.truth.rgb.shape[2:4])
+    if side < _WINDOW:
+        raise Unavailable(f"frames of {side} pixels; SSIM takes windows of {_WINDOW}")
     return np.asarray(ssim(scene.truth.rgb, scene.prediction.rgb))[:, scene.prompt_frames :]
 
 

@@ -120,6 +120,9 @@ def test_the_score_by_hand() -> None:
     assert physics_iq_score(takes, takes) == 100
     assert physics_iq_score(four(1, 1, [1, 1], [0, 0]), takes) == 100, "clipped"
     assert physics_iq_score(four(0, 0, [0, 0], [0.9, 0.9]), takes) == 0
+    for limits in (four(0, 0, [1, 0], [0, 0]), four(0.000004, 0.5, [1, 0.6], [0, 0])):
+        with pytest.raises(Unavailable, match=r"have nothing in common \(spatial.* IoU 0\)"):
+            physics_iq_score(made, limits)
     rough = four(0.8, 0.5, [0.50004, 0.50004], [0.01, 0.01])
     assert physics_iq_score(rough, takes) == physics_iq_score(four(0.8, 0.5, [0.5, 0.5], [0.01, 0.01]), takes)
 

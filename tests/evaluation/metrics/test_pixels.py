@@ -3,8 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsjax.clip import Video
 from rsjax.evaluation.metrics.psnr import PSNR_CAP, psnr
 from rsjax.evaluation.metrics.ssim import ssim
+from rsjax.evaluation.registry import Scene, Unavailable
+from tests.evaluation.metrics import scored
 
 
 def _pair(seed, shape=(2, 3, 14, 17, 3), noise=30):
@@ -80,3 +83,10 @@ def test_bad_shapes_are_named():
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
     with pytest.raises(ValueError, match="at least 11×11"):
         ssim(np.zeros((10, 64, 3)), np.zeros((10, 64, 3)))
+
+
+def test_frames_smaller_than_the_window_have_no_ssim():
+    small = Video(np.zeros((1, 3, 16, 10, 3), np.uint8))
+    for result in (scored.score, scored.per_frame):
+        with pytest.raises(Unavailable, match="frames of 10 pixels; SSIM takes windows of 11"):
+            result("ssim", Scene(small, small))
