@@ -33,17 +33,19 @@ class Batch:
         kind: of the actions, :data:`OWN`, "other" or "uniform"; or :data:`SAMPLE`.
         draw: which of the draws of actions, or which sample.
         start: the first clip's row.
+        clips: how many; with other devices or settings there may be more or fewer.
     """
 
     run: int
     kind: str
     draw: int
     start: int
+    clips: int
 
     @property
     def name(self) -> str:
         """Its file's."""
-        return f"{self.run:03d}-{self.kind}-{self.draw:03d}-{self.start:06d}.msgpack"
+        return f"{self.run:03d}-{self.kind}-{self.draw:03d}-{self.start:06d}+{self.clips}.msgpack"
 
 
 @dataclass(frozen=True)
@@ -71,13 +73,12 @@ class Generation:
     def make(self, index: int = 0, count: int = 1) -> None:
         """Generates the batches that are not there yet, or process ``index``'s share of them among ``count``."""
         batches = list(self._batches())[index::count]
-        clips = [min(self._size, len(self.clips.rgb) - batch.start) for batch in batches]
-        with Progress("evaluation", sum(clips), "rollouts") as progress:
+        with Progress("evaluation", sum(batch.clips for batch in batches), "rollouts") as progress:
             done = 0
-            for batch, number in zip(batches, clips, strict=True):
+            for batch in batches:
                 if self._read(batch) is None:
                     self._keep(batch, self._generate(batch))
-                progress.update(done := done + number)
+                progress.update(done := done + batch.clips)
 
     def videos(self, run: int) -> dict[str, list[Video]]:
         """Returns one repetition's videos of all clips by kind, one for each draw."""
@@ -105,13 +106,8 @@ class Generation:
                 yield from self._row(run, SAMPLE, sample)
 
     def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
-        yield from (Batch(run, kind, draw, start) for start in range(0, len(self.clips.rgb), self._size))
-
-    @cached_property
-    def _size(self) -> int:
-        """Clips of a batch: the run's, rounded up so that the devices share them evenly."""
-        devices = jax.local_device_count()
-        return -(-self.trained.config.eval.batch_size // devices) * devices
+        count, size = len(self.clips.rgb), batch_size(self.trained)
+        yield from (Batch(run, kind, draw, start, min(size, count - start)) for start in range(0, count, size))
 
     @cached_property
     def _truth(self) -> Video:
@@ -148,9 +144,8 @@ class Generation:
 
     def _generate(self, batch: Batch) -> Record:
         """Generates a batch; the last one is filled up, so that one program is compiled."""
-        clips, sampled = len(self.clips.rgb), batch.kind == SAMPLE
-        rows = np.arange(batch.start, min(batch.start + self._size, clips))
-        padded = np.minimum(np.arange(batch.start, batch.start + self._size), clips - 1)
+        sampled, rows = batch.kind == SAMPLE, np.arange(batch.start, batch.start + batch.clips)
+        padded = np.minimum(np.arange(batch.start, batch.start + batch_size(self.trained)), rows[-1])
         actions = self.draws[OWN][0] if sampled else self.draws[batch.kind][batch.draw]
         repetition = batch.run * self.protocol.samples + (batch.draw if sampled else 0)
         index = self.clips.index[padded] + repetition * self.split_size
@@ -162,12 +157,18 @@ class Generation:
         return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth}
 
 
+def batch_size(trained: TrainedModel) -> int:
+    """Returns the clips of a batch: the run's, rounded up so that the devices of this process share them evenly."""
+    devices = jax.local_device_count()
+    return -(-trained.config.eval.batch_size // devices) * devices
+
+
 def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
     """Predicts every frame's tokens from the true frames before it; None if the model cannot.
 
-    This costs less than one of the several rollouts of each clip.
+    This costs less than one of the several rollouts of each clip, so it is not kept, nor shared with other processes.
     """
-    size, video, parts = trained.config.eval.batch_size, clips.video, list[TeacherForced]()
+    size, video, parts = batch_size(trained), clips.video, list[TeacherForced]()
     count = len(clips.rgb)
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is filled up

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -192,6 +193,24 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
     assert again.kept["rows"].tolist() == sorted({0, toy.TEST - 1, *ends.tolist()})
     assert [clip["number"] for clip in again.clips] == list(range(toy.TEST))
     assert len({clip["sha256"] for clip in again.clips}) == toy.TEST
+
+
+def test_batches_for_other_devices_are_made_anew(
+    clips: Store, trained: TrainedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    protocol = replace(of_run(trained.config), action_draws=0)
+    held_out, made = HeldOut.read(clips, "test", protocol, trained.config.clips), []
+
+    def true_frames(self: Generation, batch: Batch) -> Record:
+        made.append((batch.start, batch.clips))
+        return {"rgb": self.clips.rgb[batch.start : batch.start + batch.clips], "depth": None}
+
+    monkeypatch.setattr(Generation, "_generate", true_frames)
+    evaluation.plan(trained, clips, held_out, tmp_path).make(0, 2)  # stopped before the second of three batches
+    monkeypatch.setattr(jax, "local_device_count", lambda: 4)
+    resumed = evaluation.plan(trained, clips, held_out, tmp_path).videos(0)["own"][0]
+    np.testing.assert_array_equal(resumed.rgb, held_out.clips.rgb)
+    assert made == [(0, 2), (4, 1), (0, 4)], "the last clip is a batch of both sizes"
 
 
 def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: Path) -> None:

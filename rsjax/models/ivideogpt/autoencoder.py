@@ -22,6 +22,7 @@ from rsjax.config import ConditionalVQConfig, Config, IVideoGPTConfig, Tokenizer
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
+from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
@@ -176,7 +177,7 @@ class ConditionalCodec:
         for start in range(0, total, size):
             chunk = [x[start : start + size] for x in arrays]
             padded = [np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) for x in chunk]
-            made = _apply(self.config, method, self.params, *padded)
+            made = _apply(self.config, method, self.params, *divide(padded, self.params))
             parts.append([np.asarray(x)[: len(chunk[0])] for x in (made if isinstance(made, tuple) else (made,))])
         return tuple(np.concatenate(same) for same in zip(*parts, strict=True))
 

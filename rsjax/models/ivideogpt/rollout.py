@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import TopKConfig
+from rsjax.devices import divide
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.models.roboscape.attention import KeyValues
@@ -53,7 +54,8 @@ def generate(
             used[..., used.shape[-1] // 2 :] -= used[:, :1, used.shape[-1] // 2 :]
         used = np.pad(used, ((0, 0), (0, count - used.shape[1]), (0, 0)))[:, layout.context :]
         sequence = layout.join(tokens["context"], tokens["future"])
-        drawn = sample(arch, params, sequence, used, folded(keys, jnp.full(len(index), begin)))
+        inputs = (sequence, used, folded(keys, jnp.full(len(index), begin)))
+        drawn = sample(arch, params, *divide(inputs, params))
         whole = codec.decode({"context": tokens["context"], "future": layout.future(np.asarray(drawn))}).rgb
         made.append(whole[:, given:])
         begin, given = begin + count - layout.context, layout.context

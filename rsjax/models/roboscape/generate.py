@@ -76,7 +76,8 @@ def teacher_forced(
     tokens, has_depth = _prompt(arch, codec, video)
     if arch.use_depth and "depth" not in tokens:
         tokens["depth"] = jnp.zeros_like(tokens["rgb"])
-    return score_tokens(arch, config.sample, params, tokens, _inputs(config, codec, actions), ~has_depth, past)
+    tokens, inputs = divide((tokens, _inputs(config, codec, actions)), params)
+    return score_tokens(arch, config.sample, params, tokens, inputs, ~has_depth, past)
 
 
 def _prompt(arch: Architecture, codec: Codec, prompt: Video) -> tuple[Tokens, np.ndarray]:
