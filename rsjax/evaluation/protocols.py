@@ -4,11 +4,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from rsjax.config import Config, require, to_dict
-from rsjax.config.fields import check_numbers, require_range
+from rsjax.config.fields import added, check_numbers, require_range
 from rsjax.errors import UserError, did_you_mean
 
 OWN = "run"  # the protocol of a run's own configuration, which its evaluation stage uses
-SAMPLING = ("steps", "temperature", "top_k", "unmask")  # fields that replace those of model.sample
+# Fields that replace those of model.sample.
+SAMPLING = ("steps", "temperature", "top_k", "unmask", "mean_codes", "guidance")
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Protocol:
         prompt_frames: recorded frames that generation starts from.
         horizon: predicted frames; 0: to the clips' end.
         resolution: pixels per side of the frames that are scored; 0: those of the run's clips.
-        steps, temperature, top_k, unmask: settings of sampling; None: the run's own.
+        steps, temperature, top_k, unmask, mean_codes, guidance: settings of sampling; None: the run's own.
         samples: videos per clip. Scores are those of the first; with more, pixel scores are also reduced to the best
             of each clip and metric, over all frames with the prompt as the model sees it, as ``NAME_bestN_incl_ctx``.
         clips: how many of the split's clips, spread evenly; all if it has fewer.
@@ -41,6 +42,8 @@ class Protocol:
     temperature: float | None = None
     top_k: int | None = None
     unmask: Literal["random", "greedy"] | None = None
+    mean_codes: bool | None = added(None)
+    guidance: float | None = added(None)
     samples: int = 1
     clips: int = 100
     repetitions: int = 1
@@ -78,12 +81,14 @@ class Protocol:
         return "" if self.depth_alignment == "none" else f"_{self.depth_alignment}_{self.depth_source}"
 
     def described(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready, with the frames that count in words."""
+        """Returns the fields, JSON-ready, with the frames that count in words; added ones only where they are set."""
+        late = {field.name for field in fields(self) if field.metadata.get("added")}
+        values = {name: value for name, value in to_dict(self).items() if name not in late or value is not None}
         frames = {
             "scores": "predicted frames",
             "best of samples": "all frames, the prompt as the model sees it included",
         }
-        return to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
+        return values | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
 
 
 PAPER = Protocol(
@@ -101,6 +106,8 @@ PROTOCOLS = {
             steps=2,
             temperature=0.0,
             unmask="random",
+            mean_codes=False,
+            guidance=1.0,
             action_draws=0,
             teacher_forced=True,
             reference="reconstruction",

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from experiments import compare as compare_command
-from rsjax.config import Config, to_dict
+from rsjax.config import Config, presets, to_dict
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
-from rsjax.evaluation.protocols import Protocol
+from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
@@ -173,6 +173,12 @@ def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
     assert (result.sampling["steps"], result.sampling["temperature"], result.sampling["unmask"]) == (2, 0.0, "random")
     assert result.protocol["teacher_forced"]
     assert len(result.clips) == 3
+    tiny: Any = presets.tiny()
+    assert tiny.model.sample.shows_means
+    assert not replace(tiny.model.sample, **find("1xgpt", tiny).sampling).shows_means
+    late = {"mean_codes": False, "guidance": 1.0}
+    assert result.protocol.items() >= late.items()
+    assert not late.keys() & find("paper", tiny).described().keys(), "keys of results from before these fields stay"
 
 
 def test_a_comparison_of_a_run_with_itself(
