@@ -105,6 +105,30 @@ def read_json_lines(path: Path, field: str, kind: type, cure: str = "delete the 
     return rows
 
 
+def content_hash(path: Path, pattern: str = "*") -> str:
+    """Returns a hash of a file's content: 16 hex digits. That of a folder is of the files in it, with their names.
+
+    Args:
+        pattern: of a folder's files that count; what is hidden never does.
+
+    Raises:
+        FileError: a file cannot be read.
+    """
+
+    def hashed(file: Path) -> str:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+
+    try:
+        if not path.is_dir():
+            return hashed(path)[:16]
+        files = {str(file.relative_to(path)): file for file in path.rglob(pattern) if file.is_file()}
+        shown = {name: hashed(file) for name, file in sorted(files.items()) if "/." not in f"/{name}"}
+        return hashlib.sha256(json.dumps(shown).encode()).hexdigest()[:16]
+    except OSError as error:
+        raise FileError(f"{error.filename}: cannot be read ({error.strerror}); mend the path or permission") from error
+
+
 def placeholder(content: Path | bytes) -> str:
     """Says what lies in place of a data file, such as a Git-LFS pointer, and the cure; "" if nothing shows it.
 

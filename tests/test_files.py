@@ -16,7 +16,7 @@ from rsjax.data.labels import Labels
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
-from rsjax.files import holder, is_held, lock, making, placeholder, read_json
+from rsjax.files import FileError, content_hash, holder, is_held, lock, making, placeholder, read_json
 from rsjax.ingest.annotators.networks.local import require_weights
 from rsjax.ingest.episode import SourceError
 from rsjax.ingest.selection import select
@@ -24,6 +24,22 @@ from rsjax.pipeline.videos import Request, _foreign_actions
 from rsjax.tokenizers.lpips import load_lpips
 from rsjax.training.log import read_rows
 from tests.ingest.toy import Source
+
+
+def test_a_hash_of_content_is_the_files_wherever_they_lie(tmp_path: Path) -> None:
+    for place in ("a", "b"):
+        (tmp_path / place / "sub").mkdir(parents=True)
+        (tmp_path / place / "sub" / "x.py").write_bytes(b"1")
+    a, b = tmp_path / "a", tmp_path / "b"
+    (b / ".git").mkdir()
+    (b / ".git" / "x").touch()
+    whole = content_hash(a)
+    assert whole == content_hash(b) != content_hash(a / "sub")
+    assert content_hash(a / "sub" / "x.py") == "6b86b273ff34fce1", "SHA-256 of 1"
+    (b / "sub" / "y").touch()
+    assert content_hash(b) != whole == content_hash(b, "*.py")
+    with pytest.raises(FileError, match="none: cannot be read"):
+        content_hash(tmp_path / "none")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from jaxtyping import Float32, UInt8
 
 from rsjax.config import ConfigError, EvalConfig, require
 from rsjax.evaluation.registry import EstimatedDepth
+from rsjax.files import content_hash
 from rsjax.ingest.annotators.choose import choose
 from rsjax.ingest.annotators.depth import inverse_of, stretch
 from rsjax.ingest.annotators.protocols import DepthEstimator, DepthMaps
@@ -41,6 +42,22 @@ def choose_estimator(settings: EvalConfig, load: bool = False) -> DepthEstimator
         estimator.load()
     found: DepthEstimator = estimator
     return found
+
+
+def by_content(settings: EvalConfig) -> str:
+    """Returns the network and all its fields, its files by a hash of their content; "" without one.
+
+    Of a checkout, which may hold anything beside its code, only Python files count. Errors as in
+    :func:`choose_estimator` and :func:`rsjax.files.content_hash`.
+    """
+    estimator = choose_estimator(settings)
+    if estimator is None:
+        return ""
+    fields = []
+    for name, value in vars(estimator).items():
+        content = content_hash(value, "*.py" if name == "checkout" else "*") if isinstance(value, Path) else value
+        fields.append(f"{name}={content}")
+    return f"{settings.depth_estimator.partition(':')[0]}:{','.join(fields)}"
 
 
 def estimate_depth(

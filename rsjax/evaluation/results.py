@@ -2,18 +2,20 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from rsjax.config import EvalConfig, to_dict
 from rsjax.data.codec import decode, encode
 from rsjax.data.store import StoreError
+from rsjax.evaluation import depth_estimator
 from rsjax.evaluation.evaluate import Evaluation
 from rsjax.evaluation.frame_curves import Curves
-from rsjax.files import FileError, read_json, write_file, write_json
+from rsjax.files import FileError, content_hash, read_json, write_file, write_json
 
 NAME, FRAMES = "result.json", "frames.msgpack"
 
@@ -27,8 +29,8 @@ class Result:
         key: changes with whatever decides the scores, the code excepted.
         protocol: every field of the protocol.
         sampling: all settings of sampling, of which the protocol may fix some; empty for a family without any.
-        settings: of the metrics; files of weights by a hash of their content. ``physics_iq_threshold``: grey levels of
-            255 above which a pixel moves; results of earlier versions lack it.
+        settings: of the metrics; their files, and those of the depth estimator, by a hash of their content.
+            ``physics_iq_threshold``: grey levels of 255 above which a pixel moves; results of earlier versions lack it.
         data: ``path``, ``key``, ``manifest_sha256``, ``split``, ``frames``, ``image_size`` and ``fps`` of the scored
             clips; ``fps``, frames per second, is None where nothing says it and absent in results of earlier versions.
         model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters``, ``weights_sha256``, and the key
@@ -106,6 +108,17 @@ def read_frames(folder: Path) -> dict[str, np.ndarray]:
         return decode((folder / FRAMES).read_bytes())
     except (OSError, ValueError) as error:
         raise StoreError(f"{folder / FRAMES}: cannot be read ({error}); evaluate again with --overwrite") from error
+
+
+def by_content(settings: EvalConfig) -> EvalConfig:
+    """Returns the settings with a hash of each file's content in place of its path.
+
+    Raises:
+        UserError: a file cannot be read.
+    """
+    files = {name: value for name, value in to_dict(settings).items() if name.endswith("_weights") and value}
+    hashes: dict[str, Any] = {name: content_hash(Path(value)) for name, value in files.items()}
+    return replace(settings, **hashes, depth_estimator=depth_estimator.by_content(settings))
 
 
 def fingerprint(params: Any) -> str:

@@ -1,6 +1,5 @@
 """Evaluates run directories by protocols. Each result is a folder, ``RUN/evaluations/LABEL``, with ``result.json``."""
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
-from rsjax.evaluation.results import NAME, fingerprint, read_result, result_of, write_result
+from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, lock
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
@@ -109,20 +108,22 @@ def evaluate_own(run: Run) -> Evaluation:
     trained, store = load(run.directory), run.open_clips()
     held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
     folder = run.directory / "evaluation"
-    return _evaluate(folder, held_out.protocol.name, trained, run, store, held_out)
+    return _evaluate(folder, held_out.protocol.name, _key(trained, store, held_out), trained, run, store, held_out)
 
 
 def evaluate_into(
     folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut, overwrite: bool
 ) -> None:
     """Evaluates into a folder unless its result is up to date. Several processes share the work."""
-    fresh = not overwrite and _key_of(folder) == _key(trained, store, held_out)
-    if fresh:
+    key = _key(trained, store, held_out)
+    if not overwrite and _key_of(folder) == key:
         if is_lead():
             note(f"{folder}: up to date, skipped (--overwrite evaluates again)")
         barrier("evaluation")
         return
-    parts = _parts(folder, _key(trained, store, held_out))
+    parts = _parts(folder, key)
+    if overwrite:  # batches of an interrupted evaluation may be another version's
+        on_lead("old batches", lambda: shutil.rmtree(parts, ignore_errors=True))
     if jax.process_count() > 1:
         with disk_guard(parts):
             plan = evaluation.plan(trained, store, held_out, parts)
@@ -131,13 +132,14 @@ def evaluate_into(
 
     def finish() -> None:
         with lock(folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here"):
-            _evaluate(folder, name, trained, run, store, held_out)
+            _evaluate(folder, name, key, trained, run, store, held_out)
 
     on_lead("evaluation", finish)
 
 
-def _evaluate(folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> Evaluation:
-    key = _key(trained, store, held_out)
+def _evaluate(
+    folder: Path, name: str, key: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut
+) -> Evaluation:
     parts = _parts(folder, key)
     with disk_guard(folder):
         for old in folder.glob("parts-*"):
@@ -182,7 +184,7 @@ def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
     ]
     protocol = json.dumps([held_out.protocol.described(), _sample_settings(trained.config), data, held_out.split])
     takes = [] if held_out.second_takes is None else [json.dumps([second_takes.RECIPE, second_takes.JITTER])]
-    return content_key(RECIPE, "evaluation", protocol, _weights(trained), trained.config.eval, *takes)
+    return content_key(RECIPE, "evaluation", protocol, _weights(trained), by_content(trained.config.eval), *takes)
 
 
 def _weights(trained: TrainedModel) -> str:
@@ -202,10 +204,8 @@ def _parts(folder: Path, key: str) -> Path:
 
 def _settings(settings: EvalConfig) -> dict[str, Any]:
     """Returns what the metrics depend on: files by their content, and the constant of the masks of what moves."""
-    values = {name: value for name, value in to_dict(settings).items() if name not in NOT_OF_METRICS}
-    files = {name: Path(value) for name, value in values.items() if name.endswith("_weights") and value}
-    hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in files.items()}
-    return values | hashes | {"physics_iq_threshold": THRESHOLD}
+    values = {name: value for name, value in to_dict(by_content(settings)).items() if name not in NOT_OF_METRICS}
+    return values | {"physics_iq_threshold": THRESHOLD}
 
 
 def _take_settings(held_out: HeldOut) -> dict[str, Any]:

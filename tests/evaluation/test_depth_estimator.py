@@ -7,7 +7,7 @@ import pytest
 
 from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.depth_estimator import choose_estimator, estimate_depth
+from rsjax.evaluation.depth_estimator import by_content, choose_estimator, estimate_depth
 from rsjax.ingest.annotators.depth import metric_depth, relative_depth
 from rsjax.ingest.annotators.protocols import AnnotationError, DepthMaps
 from rsjax.ingest.episode import Episode
@@ -86,6 +86,25 @@ def test_the_configured_network_is_loaded_from_its_files(tmp_path: Path) -> None
         choose_estimator(EvalConfig(depth_estimator=f"{word},input_size=14"), load=True)
     for name in [name for name in sys.modules if name.startswith("video_depth_anything")]:
         del sys.modules[name]  # other tests have checkouts of their own
+
+
+def test_an_estimator_is_known_by_the_content_of_its_files(tmp_path: Path) -> None:
+    def described(folder: Path, more: str = "") -> str:
+        word = f"video-depth-anything:checkout={folder},weights={folder / 'w'}{more}"
+        return by_content(EvalConfig(depth_estimator=word))
+
+    for name in ("here", "there"):
+        check_out(tmp_path / name, "video_depth_anything/video_depth.py")
+        (tmp_path / name / "w").write_bytes(b"1")
+    here, there = tmp_path / "here", tmp_path / "there"
+    first = described(here)
+    (there / "README.md").write_text("no code")
+    assert described(there) == first != described(there, ",input_size=14")
+    assert str(tmp_path) not in first
+    (there / "w").write_bytes(b"2")
+    (here / "video_depth_anything" / "more.py").touch()
+    assert len({first, described(there), described(here)}) == 3
+    assert by_content(EvalConfig()) == ""
 
 
 @pytest.mark.parametrize(

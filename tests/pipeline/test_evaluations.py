@@ -129,6 +129,34 @@ def test_what_is_up_to_date_is_skipped_and_other_weights_are_another_model(run: 
     assert MADE[2] != MADE[1]
 
 
+def test_other_weights_of_a_metric_at_the_same_path_are_evaluated_anew(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "check_files", lambda settings: None)
+
+    def evaluated(name: str) -> str:
+        settings = {"fvd_weights": str(tmp_path / name)}
+        return read_result(*evaluate_run(run.directory, run.data_directory, Request("run", settings=settings))).key
+
+    (tmp_path / "i3d").write_bytes(b"1")
+    first = evaluated("i3d")
+    MADE.clear()
+    (tmp_path / "i3d").rename(tmp_path / "moved")
+    assert evaluated("moved") == first
+    assert not MADE
+    (tmp_path / "moved").write_bytes(b"2")
+    assert evaluated("moved") != first
+    assert len(MADE) == 1
+
+
+def test_overwriting_begins_without_the_batches_of_an_interrupted_evaluation(run: Run, folder: Path) -> None:
+    left = folder / f"parts-{read_result(folder).key}"
+    left.mkdir()
+    MADE.clear()
+    evaluated(run, overwrite=True)  # the stand-in makes this folder, which must not be there
+    assert [left] == MADE
+
+
 def test_the_evaluation_stage_writes_such_a_file_too(run: Run) -> None:
     found = evaluate_own(run)
     own = read_result(run.directory / "evaluation")
