@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -34,7 +34,7 @@ from rsjax.pipeline.videos import resampled
 from rsjax.progress import Progress, note
 from rsjax.sim import second_takes
 from rsjax.sim.collect import Report, collect, collection_key
-from rsjax.sim.unseen import collect_unseen
+from rsjax.sim.unseen import collect_unseen, unseen_splits
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
@@ -230,14 +230,17 @@ def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
 
 def _splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
     """Returns the store's splits of these names; those that end in ``*`` stand for all that begin so."""
-    found = [split for split in store.splits if any(fnmatchcase(split, pattern) for pattern in wanted)]
-    for pattern in wanted:
-        if not any(fnmatchcase(split, pattern) for split in store.splits):
-            raise StoreError(
-                f"{store.path}: no split {pattern!r}; it has {', '.join(store.splits)}: choose with --split, or name "
-                f"another store with --data"
-            )
-    return found
+    if lacking := _lacking(store.splits, wanted):
+        raise StoreError(
+            f"{store.path}: no split {lacking[0]!r}; it has {', '.join(store.splits)}: choose with --split, or name "
+            f"another store with --data"
+        )
+    return [split for split in store.splits if any(fnmatchcase(split, pattern) for pattern in wanted)]
+
+
+def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
+    """Returns the wanted names or patterns that fit none of the splits."""
+    return [pattern for pattern in wanted if not any(fnmatchcase(split, pattern) for split in splits)]
 
 
 def _held_out(run: Run, store: Store, protocol: Protocol) -> Store:
@@ -245,13 +248,13 @@ def _held_out(run: Run, store: Store, protocol: Protocol) -> Store:
     sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
     if run.config.data.key:
         return store
-    if not any(fnmatchcase(split, pattern) for split in store.splits for pattern in protocol.splits):
+    if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
         count = min(protocol.clips, sim.test_episodes)
         return _simulated(
             f"scenes never seen, {count} episodes of each kind",
             lambda report: collect_unseen(sim, store, count, report),
         )
-    if needed <= sim.frames:
+    if needed <= sim.frames or _lacking(store.splits, protocol.splits):
         return store
     longer = longer_episodes(sim, needed, protocol.clips)
     path = run.data_directory / f"{sim.env}-{collection_key(longer)}"

@@ -19,6 +19,7 @@ from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
+from rsjax.pipeline import evaluations
 from rsjax.pipeline.evaluations import Request, evaluate_own, evaluate_run, longer_episodes
 from rsjax.pipeline.own_data import on_store
 from rsjax.pipeline.run import Run
@@ -235,6 +236,28 @@ def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says:
     with pytest.raises(UserError, match=says) as refused:
         list(evaluate_run(run.directory, run.data_directory, request_))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("splits", "frames", "simulated"),
+    [
+        (("test",), FRAMES, None),
+        (("test",), FRAMES + 9, "longer"),
+        (("tset",), FRAMES, None),
+        (("tset",), FRAMES + 9, None),
+        (("unseen_camera", "tset"), FRAMES, None),
+        (("unseen_camera",), FRAMES, "unseen"),
+        (("unseen*",), FRAMES + 9, "unseen"),
+    ],
+)
+def test_only_splits_that_there_can_be_are_simulated(
+    run: Run, splits: tuple[str, ...], frames: int, simulated: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulating = replace(run, config=toy.config())
+    monkeypatch.setattr(evaluations, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
+    protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
+    store = run.open_clips()
+    assert evaluations._held_out(simulating, store, protocol) == (simulated or store)
 
 
 def test_longer_episodes_are_none_of_the_runs_own() -> None:
