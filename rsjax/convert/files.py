@@ -32,6 +32,8 @@ _HARMLESS = (
     *(f"numpy.dtypes.{name}DType" for name in ("Bool", "Int32", "Int64", "Float16", "Float32", "Float64")),
     *(f"omegaconf.{name}" for name in ("dictconfig.DictConfig", "listconfig.ListConfig", "nodes.AnyNode")),
     *(f"omegaconf.base.{name}" for name in ("ContainerMetadata", "Metadata")),
+    # Types that OmegaConf's metadata name; plain dicts and lists have opcodes of their own and are read as such.
+    *(f"builtins.{name}" for name in ("dict", "int", "list")),
 )
 
 
@@ -124,6 +126,11 @@ class _Placeholder:
     def __setstate__(self, state: object) -> None: ...
 
 
+def _without_default(*_: object) -> dict[Any, Any]:
+    """Stands for collections.defaultdict, whose factory is dropped and never called."""
+    return {}
+
+
 def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, int]]:
     try:
         torch: Any = importlib.import_module("torch")
@@ -151,8 +158,9 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
 
 def _unpickled(path: Path, torch: Any) -> Any:
     """Loads a file of PyTorch's with ``weights_only``, so tensors and plain values alone, and placeholders."""
+    stand_ins = [(_Placeholder, name) for name in _HARMLESS] + [(_without_default, "collections.defaultdict")]
     try:
-        with torch.serialization.safe_globals([(_Placeholder, name) for name in _HARMLESS]):
+        with torch.serialization.safe_globals(stand_ins):
             return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many types for damage and for content that it refuses
         # Its messages advise to load the file without this protection, so they are not shown.

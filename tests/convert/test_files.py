@@ -4,7 +4,9 @@ import pickle
 import struct
 import sys
 from argparse import Namespace
+from collections import defaultdict
 from pathlib import Path, PurePath
+from types import ModuleType
 from typing import Any
 
 import ml_dtypes
@@ -12,6 +14,25 @@ import numpy as np
 import pytest
 
 from rsjax.convert.files import PICKLED, ConvertError, Tensors, read_tensors, write_safetensors
+
+
+def omega(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A value with the types that OmegaConf.create({"lr": 1}) pickles, under their names; OmegaConf is not needed."""
+    for name in ("omegaconf", "omegaconf.base", "omegaconf.dictconfig", "omegaconf.listconfig", "omegaconf.nodes"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+
+    def made(module: str, name: str, **state: Any) -> Any:
+        kind = type(name, (), {"__module__": f"omegaconf.{module}"})
+        monkeypatch.setattr(sys.modules[kind.__module__], name, kind, raising=False)
+        value = kind()
+        value.__dict__.update(state)
+        return value
+
+    cache = defaultdict(dict, {"now": {"x": 1}})
+    metadata = made("base", "ContainerMetadata", ref_type=Any, object_type=dict, key_type=int, resolver_cache=cache)
+    inner = made("base", "Metadata", ref_type=list, resolver_cache=defaultdict(dict))
+    content = {"lr": made("nodes", "AnyNode", _metadata=inner, _val=1), "of": made("listconfig", "ListConfig")}
+    return made("dictconfig", "DictConfig", _metadata=metadata, _content=content)
 
 
 class Evil:
@@ -91,6 +112,26 @@ def test_what_training_scripts_save_beside_tensors_is_left_out(tmp_path: Path, z
         assert read.tensors["block.b"] == 3
         counts = {"optimizer": 2, "other": 1, holder: 1}
         assert read.others == {f"the file's key {key}": number for key, number in counts.items()}
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
+def test_omegaconfs_settings_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
+    torch = pytest.importorskip("torch")
+    path, more = tmp_path / "x.pt", defaultdict(list, {"moments": [torch.zeros(1)]})
+    content = {"ema": {"a": torch.arange(2.0)}, "args": omega(monkeypatch), "more": more}
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "omegaconf"]:
+        monkeypatch.delitem(sys.modules, name)
+    read = read_tensors(path, ("ema",))
+    np.testing.assert_array_equal(read.tensors["a"], [0.0, 1.0])
+    assert read.others == {"the file's key more": 1}
+
+
+def test_a_default_that_could_run_code_is_refused(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    torch.save({"a": torch.zeros(1), "more": defaultdict(breakpoint)}, tmp_path / "x.pt")
+    with pytest.raises(ConvertError, match="refused: it holds breakpoint, which could run code"):
+        read_tensors(tmp_path / "x.pt")
 
 
 def test_a_name_that_is_left_twice_is_refused(tmp_path: Path) -> None:
