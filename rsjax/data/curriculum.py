@@ -83,16 +83,22 @@ def plan(
     return loop, LoaderFactory(loop, tuple(resolved), directory / NAME)
 
 
-def check_stages(loop: LoopConfig, own: Store) -> None:
+def check_stages(loop: LoopConfig, own: Store) -> list[Store]:
     """Checks early that the stages' stores exist and, where they are labelled, that some record passes the patterns.
+
+    Returns:
+        These stores, the first of which is ``own``.
 
     Raises:
         StoreError: as :func:`plan`.
     """
+    others = []
     for part in (part for stage in loop.curriculum for part in stage.components):
         store = open_store(part.store) if part.store else own
+        others += [store] if part.store else []
         if store.labelled(SPLIT):
             choose(part, store)
+    return [own, *others]
 
 
 def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:

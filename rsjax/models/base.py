@@ -114,6 +114,14 @@ class WorldModel(Trainable[B], Protocol[B]):
         """
         return
 
+    def check_clips(self, clips: Store) -> None:
+        """Checks the labels of clips that training reads, before anything is trained.
+
+        Raises:
+            UserError: the model cannot be trained on some of them.
+        """
+        return
+
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store | None:
         """Makes the store that training reads instead of clips (tokens, latents), unless it exists.
 

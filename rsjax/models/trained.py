@@ -42,7 +42,8 @@ class TrainedModel:
             actions: in the recording's units; row t leads into frame t, and row 0 is ignored. T may exceed the length
                 of the training clips.
             depth: z-depth of the frames in metres; None if unknown.
-            task: the robot's task in words, one for all clips or one for each; only CogVideoX reads it.
+            task: the robot's task in words, one for all clips or one for each; only CogVideoX reads it, and says so if
+                it has no text of the task.
 
         Returns:
             All T frames with their depth (None without a depth branch or ``depth``); without a leading axis for one
@@ -51,12 +52,7 @@ class TrainedModel:
         Raises:
             ShapeError: an argument has the wrong shape or type for this model; the message says which.
         """
-        prompt, single = self._video(frames, depth)
-        if task is not None:
-            tasks = np.array([task] * len(prompt) if isinstance(task, str) else list(task))
-            if tasks.shape != (len(prompt),):
-                raise ShapeError(f"task has {len(tasks)} texts; expected one, or {len(prompt)}, one for each clip")
-            prompt = replace(prompt, tasks=tasks)
+        prompt, single = self._prompt(frames, depth, task)
         sequences = self._actions(actions, prompt, () if single else (len(prompt),))
         video = self.model.generate(self.params, self.assets, prompt, sequences[None] if single else sequences)
         return _first(video) if single else video
@@ -66,13 +62,14 @@ class TrainedModel:
         frames: UInt8[np.ndarray, "P H W 3"],
         actions: Float[np.ndarray, "N T A"],
         depth: Float[np.ndarray, "P H W"] | None = None,
+        task: str | None = None,
     ) -> Video:
         """Generates the N videos that follow the frames of one clip under N action sequences.
 
         All candidates share their random draws, so they differ only by their actions. Arguments and errors are those of
         :meth:`generate`.
         """
-        prompt, single = self._video(frames, depth)
+        prompt, single = self._prompt(frames, depth, task)
         if not single:
             raise ShapeError(f"frames have shape {np.shape(frames)}; a plan starts from one clip, (P, H, W, 3)")
         return self.model.plan(self.params, self.assets, prompt, self._actions(actions, prompt, ("N",)))
@@ -129,6 +126,16 @@ class TrainedModel:
         if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
             raise ShapeError(f"actions are {actions.dtype} with values that are not finite numbers; expected floats")
         return actions.astype(np.float32)
+
+    def _prompt(self, frames: Any, depth: Any, task: str | Sequence[str] | None) -> tuple[Video, bool]:
+        """Returns :meth:`_video` with its tasks."""
+        prompt, single = self._video(frames, depth)
+        if task is None:
+            return prompt, single
+        tasks = np.array([task] * len(prompt) if isinstance(task, str) else list(task))
+        if tasks.shape != (len(prompt),):
+            raise ShapeError(f"task has {len(tasks)} texts; expected one, or {len(prompt)}, one for each clip")
+        return replace(prompt, tasks=tasks), single
 
     def _video(self, frames: Any, depth: Any) -> tuple[Video, bool]:
         """Checks and returns the arguments with a leading axis over clips, and whether that axis was added."""

@@ -127,8 +127,9 @@ def train_tokenizer(run: Run, resume: bool) -> None:
     train, directory = run.config.tokenizer_train, run.directory / "tokenizer"
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
-    # Checks the world model's curriculum before the tokenizer is trained.
-    check_stages(run.config.train, run.open_clips())
+    # Checks the world model's curriculum and clips before the tokenizer is trained.
+    for store in check_stages(run.config.train, run.open_clips()):
+        create_model(run.config).check_clips(store)
     setup, model = tokenizer_setup(run), create_autoencoder(run.config)
     note_curriculum(setup.loader)
     for line in model.notes() if is_lead() else ():

@@ -94,6 +94,20 @@ def test_generated_depth_is_that_of_the_clips_that_have_it(model: TrainedModel) 
     assert model.generate(rgb, ACTIONS, np.full_like(depth, np.nan)).depth is None
 
 
+def test_tasks_reach_the_model(model: TrainedModel) -> None:
+    class Told:
+        def generate(self, params: Any, assets: Any, prompt: Video, actions: Any) -> Video:
+            return prompt
+
+        plan = generate
+
+    told, rgb = replace(model, model=Told()), PROMPT[0]  # type: ignore[arg-type]
+    assert told.plan(rgb[0], ACTIONS, task="lift").tasks.tolist() == ["lift"]  # type: ignore[union-attr]
+    with pytest.raises(ShapeError, match="task has 2 texts; expected one, or 1, one for each clip"):
+        told.plan(rgb[0], ACTIONS, task=["lift", "press"])  # type: ignore[arg-type]
+    assert told.generate(rgb, ACTIONS, task=["lift", "press"]).tasks.tolist() == ["lift", "press"]  # type: ignore[union-attr]
+
+
 def test_rollouts_refuse_depth_without_its_tokens(model: TrainedModel, clips: Store) -> None:
     assert isinstance(model.model, RoboScape)
     arch, sample = model.model.architecture, model.model.config.sample

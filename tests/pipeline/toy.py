@@ -10,6 +10,7 @@ import numpy as np
 
 from rsjax.clip import Clip
 from rsjax.config import Config, EvalConfig, SampleConfig, presets
+from rsjax.data.labels import Label
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store, encode_clip, open_store, write_store
 from rsjax.models.base import Assets, create_model
@@ -58,7 +59,7 @@ def clip(number: int, success: bool = False) -> Clip:
     )
 
 
-def store(path: Path, depth: bool = True) -> Store:
+def store(path: Path, depth: bool = True, label: Label | None = None) -> Store:
     """A store of clips."""
     train, test = [clip(i) for i in range(TRAIN)], [clip(TRAIN + i, SUCCESS[i]) for i in range(TEST)]
     actions = np.concatenate([c.actions[1:] for c in train])
@@ -71,7 +72,7 @@ def store(path: Path, depth: bool = True) -> Store:
         "action_std": actions.std(0).tolist(),
         "success_share": 0.25,
     }
-    write_store(path, "clips", {"train": map(encode_clip, train), "test": map(encode_clip, test)}, meta)
+    write_store(path, "clips", {"train": map(encode_clip, train), "test": map(encode_clip, test)}, meta, label)
     return open_store(path)
 
 

@@ -24,7 +24,7 @@ from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.cogvideox import pretrained
 from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining, notes_on_filling
 from rsjax.models.cogvideox.rollout import rollout
-from rsjax.models.cogvideox.text import check_tasks, empty_texts, texts_of
+from rsjax.models.cogvideox.text import check_store, check_tasks, empty_texts, texts_of
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, forward_flops
 from rsjax.models.diffusion.schedule import add_noise, target
 from rsjax.progress import note
@@ -90,6 +90,10 @@ class CogVideoX(WorldModel[Batch]):
         """Checks the file of texts, if there is one."""
         check_tasks(self.config.text, ())
 
+    def check_clips(self, clips: Store) -> None:
+        """Checks that every task has a text."""
+        check_store(self.config.text, clips)
+
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Makes the latents of every clip and its image, stored beside the clips for all runs with this autoencoder.
 
@@ -109,8 +113,7 @@ class CogVideoX(WorldModel[Batch]):
 
         size = self.clips.image_size
         store = prepare_store(clips, codec.config, codec.params, encode, size, folder, max_damaged)
-        for split in filter(store.labelled, store.splits):
-            check_tasks(self.config.text, store.labels(split).words["task"])
+        self.check_clips(store)
         return store
 
     def transform(self, normalization: Normalization) -> Transform:

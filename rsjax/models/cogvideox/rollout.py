@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 from rsjax.clip import Video
 from rsjax.devices import divide
 from rsjax.models.cogvideox.autoencoder import CausalCodec
-from rsjax.models.cogvideox.text import empty_texts, texts_of
+from rsjax.models.cogvideox.text import empty_texts, known_tasks, texts_of
 from rsjax.models.cogvideox.transformer import Architecture, Transformer
 from rsjax.models.diffusion.samplers import denoise, make_plan
 from rsjax.trainable import Params
@@ -37,7 +37,7 @@ def rollout(
     """
     made, image, number = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1], 0
     count, text = len(prompt), arch.model.text
-    texts, empty = texts_of(text, prompt.tasks, count), empty_texts(text, count)
+    texts, empty = texts_of(text, known_tasks(text, prompt.tasks, count), count), empty_texts(text, count)
     for number in range(-(-(frames - prompt.rgb.shape[1]) // (clip_frames - 1))):
         key = jax.random.fold_in(jax.random.key(arch.model.sample.seed), number)
         given = codec.images(image)["mean"][:, 0]

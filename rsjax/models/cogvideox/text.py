@@ -17,7 +17,9 @@ from jaxtyping import Float32
 
 from rsjax.clip import UNKNOWN
 from rsjax.config import TextConfig
+from rsjax.data.store import Store
 from rsjax.errors import UserError, first_line
+from rsjax.progress import note
 
 EMBEDDINGS, TEXTS = "embeddings", "texts"
 EMPTY = ""
@@ -86,15 +88,44 @@ def empty_texts(config: TextConfig, count: int) -> np.ndarray:
     return texts_of(config, None, count) if config.file else np.zeros(count, np.int32)
 
 
+def known_tasks(config: TextConfig, tasks: Iterable[str] | None, count: int) -> list[str]:
+    """Returns clips' tasks, the empty text for one that has none of its own; a note says so once for each task."""
+    wanted = [UNKNOWN] * count if tasks is None else list(map(str, tasks))
+    if not (config.file or config.tasks):
+        return wanted
+    names = _names(config)
+    for task in sorted(set(wanted) - {*names}):
+        _note_empty(config, task)
+    return [task if task in names else EMPTY for task in wanted]
+
+
+@lru_cache
+def _note_empty(config: TextConfig, task: str) -> None:
+    trained = bool(config.file) or config.dropout > 0
+    if task != UNKNOWN or not trained:
+        which = "a clip has no task" if task == UNKNOWN else _lacking(config, task)
+        how = "" if trained else ", which training without model.text.dropout shows only for clips without a task"
+        cure = f"; {config.file} can be made again with --task {task!r} too" if config.file else ""
+        note(f"{which}: it reads the empty text{how}{cure}")
+
+
+def check_store(config: TextConfig, store: Store) -> None:
+    """Checks the tasks of a store's records, where they are labelled. Errors as in :func:`check_tasks`."""
+    for split in filter(store.labelled, store.splits):
+        check_tasks(config, store.labels(split).words.get("task", ()))
+
+
 def check_tasks(config: TextConfig, tasks: Iterable[str]) -> None:
     """Raises :class:`UserError` if a task has no text of its own, or the file is missing or does not fit."""
     if not (config.file or config.tasks):
         return
-    names = _names(config)
-    if missing := sorted(set(tasks) - {*names, UNKNOWN}):
-        where, cure = (config.file, CURE) if config.file else ("model.text.tasks", "name it there")
-        listed = ", ".join(map(repr, names[1:])) or "none"
-        raise UserError(f"{where}: no text of the task {missing[0]!r}, only of {listed}; {cure}")
+    if missing := sorted(set(tasks) - {*_names(config), UNKNOWN}):
+        raise UserError(f"{_lacking(config, missing[0])}; {CURE if config.file else 'name it there'}")
+
+
+def _lacking(config: TextConfig, task: str) -> str:
+    listed = ", ".join(map(repr, _names(config)[1:])) or "none"
+    return f"{config.file or 'model.text.tasks'}: no text of the task {task!r}, only of {listed}"
 
 
 def _names(config: TextConfig) -> tuple[str, ...]:

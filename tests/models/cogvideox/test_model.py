@@ -12,7 +12,7 @@ import pytest
 
 from rsjax.bench import inputs
 from rsjax.clip import Video
-from rsjax.config import CogVideoXConfig, ConfigError, NoiseConfig, TextConfig, presets, to_dict
+from rsjax.config import CogVideoXConfig, ConfigError, GuidedDenoiseConfig, NoiseConfig, TextConfig, presets, to_dict
 from rsjax.config.cogvideox import latent_frames, padded_frames
 from rsjax.config.leaves import with_values
 from rsjax.data.normalization import Normalization
@@ -26,8 +26,9 @@ from rsjax.models.cogvideox.rollout import _chunk, rollout
 from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
 from rsjax.models.diffusion.schedule import alphas
+from rsjax.pipeline.own_data import on_store
 from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import run_all
+from rsjax.pipeline.stages import run_all, train_tokenizer
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.trainable import StepContext
 from tests.models.cogvideox import toy
@@ -232,6 +233,57 @@ def test_texts_come_from_a_file_or_are_learned(tmp_path: Path) -> None:
     assert texts_of(TextConfig(), ["whatever"], 1).tolist() == [1]
     with pytest.raises(UserError, match="model.text.tasks: no text of the task 'x'"):
         texts_of(learned, ["x"], 1)
+
+
+def test_a_task_without_a_text_reads_the_empty_one_and_a_note_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Clips of an unseen task are generated too, and an empty text that was not trained is not read in silence."""
+    seen: list[Any] = []
+
+    def chunk(arch: Any, params: Any, key: Any, image: Any, texts: Any, *_: Any) -> np.ndarray:
+        seen.append(np.asarray(texts))
+        return np.zeros((len(image), arch.frames, *image.shape[1:]), np.float32)
+
+    monkeypatch.setattr("rsjax.models.cogvideox.rollout._chunk", chunk)
+    codec = CausalCodec(toy.AUTOENCODER, toy.autoencoder_params(CONFIG))
+
+    def shown(text: TextConfig, *tasks: str) -> tuple[Any, str]:
+        arch = replace(MODEL.architecture, model=replace(toy.MODEL, text=text, sample=GuidedDenoiseConfig(guidance=1)))
+        prompt = replace(inputs.video(CONFIG, 2, 1), tasks=np.array(tasks) if tasks else None)
+        rollout(arch, codec, CONFIG.clips.frames, {}, prompt, CONFIG.clips.frames, np.arange(2))
+        return seen[-1], capsys.readouterr().out
+
+    learned = TextConfig(tokens=2, width=4, tasks=("lift", "press"), dropout=0.0)
+    rows, said = shown(learned, "press", "push")
+    assert rows.tolist() == [2, 0]
+    assert "model.text.tasks: no text of the task 'push', only of 'lift', 'press': it reads the empty text, " in said
+    rows, said = shown(learned)
+    assert rows.tolist() == [0, 0]
+    untrained = "which training without model.text.dropout shows only for clips without a task"
+    assert f"a clip has no task: it reads the empty text, {untrained}" in said
+    assert shown(learned, "press", "push")[1] == "", "once is enough"
+    assert shown(replace(learned, dropout=0.1))[1] == ""
+    file = tmp_path / "text.safetensors"
+    embeddings = RNG.normal(size=(2, 2, 4)).astype(np.float32)
+    file.write_bytes(write_texts(["", "lift"], embeddings))
+    rows, said = shown(TextConfig(file=str(file), tokens=2, width=4, dropout=0.0), "lift", "push")
+    np.testing.assert_array_equal(rows, embeddings[[1, 0]])
+    assert f"only of 'lift': it reads the empty text; {file} can be made again with --task 'push' too" in said
+
+
+def test_a_task_without_a_text_is_an_error_before_the_autoencoder_is_trained(tmp_path: Path) -> None:
+    text = replace(toy.MODEL.text, tasks=("lift",))
+    clips = store(tmp_path / "clips", label=lambda record: {"task": record["task"]})
+    run = Run(on_store(toy.config(text=text), clips.path), tmp_path / "run", tmp_path)
+    with pytest.raises(UserError, match="model.text.tasks: no text of the task 'drift', only of 'lift'; name it there"):
+        train_tokenizer(run, resume=True)
+    assert not run.directory.exists()
+
+
+def test_shapes_need_no_file_of_texts() -> None:
+    text = TextConfig(file="absent.safetensors", tokens=2, width=4, dropout=0.3)
+    assert describe(toy.config(text=text)).figures["bytes_activations_per_clip"] > 0
 
 
 def test_a_missing_file_of_texts_is_an_error_before_anything_is_simulated(tmp_path: Path) -> None:
