@@ -143,7 +143,8 @@ def _kept(config: Config) -> list[jax.ShapeDtypeStruct]:
 
         return jax.vjp(loss, params)[1]  # a tree of the arrays that are kept
 
-    one = inputs.batch_shapes(model, config)
+    with inputs.random_texts(config) as readable:
+        one = inputs.batch_shapes(create_model(readable), readable)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((_CLIPS, *x.shape[1:]), x.dtype), one)
     kept = jax.eval_shape(backward, params, batch, jax.random.key(0))
     return [x for x in jax.tree.leaves(kept) if x.size % _CLIPS == 0]
