@@ -60,9 +60,9 @@ def test_impossible_candidates_are_left_out_of_the_search(method: Any) -> None:
         return np.where(hit, np.inf, distance(start, candidates))
 
     config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
-    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config)
-    assert search(walled, *inputs, np.random.default_rng(0)).energy < 0.05
-    nowhere = search(lambda _, rows: np.full(len(rows), np.inf), *inputs, np.random.default_rng(0))
+    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    assert search(walled, *inputs).energy < 0.05
+    nowhere = search(lambda _, rows: np.full(len(rows), np.inf), *inputs)
     assert nowhere.energy == np.inf and np.isfinite(nowhere.actions).all()
 
 
