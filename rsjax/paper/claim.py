@@ -74,7 +74,8 @@ class Claim:
         arms: what is trained. Arms of the same configuration are trained once for all claims.
         comparisons: its parts.
         beside: scores that stand beside each arm's in the report, by the measurement that they are from.
-        rank: claims of rank 0 come first, with all their seeds; then the others by rank, seed by seed.
+        rank: claims of rank 0 come first, with all their seeds; then the others by rank, each with two seeds; then
+            their further seeds.
         notes: what differs from the paper, one line each.
     """
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from rsjax.ablation.grid import SEED, Value, cell_name
-from rsjax.config import Config, ConfigError, CurriculumStageConfig, presets
+from rsjax.config import Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
 from rsjax.config.curriculum import parse_stage
 from rsjax.config.leaves import with_values
 from rsjax.paper import budget
@@ -14,9 +14,10 @@ from rsjax.paper.budget import Scale
 from rsjax.paper.claim import Arm, Claim
 from rsjax.paper.measurements import seconds_of
 from rsjax.pipeline.run import Run
-from rsjax.sim.expert import MODES, SIMPLE
+from rsjax.sim import expert
 
 SLACK = 1.05  # of the budget that the estimates may take
+TOLD = 2  # seeds of each arm without which nothing is told
 KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
 
 
@@ -121,12 +122,14 @@ def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> 
 
 
 def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
-    """Claims of rank 0 with all seeds; then the first seed of all others, then the second …"""
+    """Claims of rank 0 with all seeds; then each other one with the seeds that a verdict takes; then further seeds."""
     first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
+    few, more = seeds[:TOLD], seeds[TOLD:]
     return [
         *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
-        *((claim, arm, seed) for seed in seeds for claim in others for arm in claim.arms),
+        *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
+        *((claim, arm, seed) for seed in more for claim in others for arm in claim.arms),
     ]
 
 
@@ -186,7 +189,7 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
         return (parse_stage(f"all#{some}:{drawn / some!r}"),)
     if not arm.curriculum:
         return ()
-    simple = sum(MODES[mode] for mode in SIMPLE)
+    simple = _simple_share(config.sim)
     expected = {"simple": simple * clips, "difficult": (1 - simple) * clips}
     epochs = {name: float(number) for name, _, number in (word.partition(":") for word in arm.curriculum)}
     read = {name: number * expected[name] for name, number in epochs.items()}
@@ -195,3 +198,11 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
         parts = "+".join(f"{name}={number!r}" for name, number in read.items())
         return (parse_stage(f"{parts}:{drawn / clips!r}"),)
     return tuple(parse_stage(f"{name}:{number * factor!r}") for name, number in epochs.items())
+
+
+def _simple_share(sim: SimConfig) -> float:
+    """Returns the expected share of simple clips: of the tasks, which take turns, or of the modes of Lift's expert."""
+    tasks = sim.train_tasks
+    if tasks:
+        return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)
+    return sum(expert.MODES[mode] for mode in expert.SIMPLE)

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,16 @@ def test_the_estimates_keep_to_the_budget_and_the_tables_come_first(hours: float
     assert seeds == [0] * 4 + [1] * 4 + [2] * 4
 
 
+def test_every_other_claim_has_two_seeds_before_the_next_and_a_third_after_all(three_hours: Plan) -> None:
+    """As nothing is told of one seed."""
+    tasks = [task for task in (*three_hours.tasks, *three_hours.left_out) if claims()[task.claim].rank]
+    made = [(three_hours.cells[task.cell].config.train.seed, task.claim) for task in tasks if not task.measurement]
+    third = [seed == 2 for seed, _ in made]
+    assert third == sorted(third) and any(third)
+    two = [claim for claim, _ in groupby(claim for seed, claim in made if seed < 2)]
+    assert len(two) == len(set(two)) > 10
+
+
 def test_no_configuration_is_there_twice_and_every_arm_has_its_seeds(three_hours: Plan) -> None:
     cells = three_hours.cells.values()
     keys = Counter(Run(cell.config, Path(), DATA).keys()["evaluation"] for cell in cells)
@@ -107,13 +118,14 @@ def test_equal_time_is_equal_steps_times_their_seconds(three_hours: Plan) -> Non
     assert genie.train.steps * step_seconds(genie) == pytest.approx(base.train.steps * step_seconds(base), rel=0.01)
 
 
-def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(three_hours: Plan) -> None:
+@pytest.mark.parametrize(("preset", "simple"), [("tiny", 0.55), ("multitask", 0.5)])
+def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(preset: str, simple: float) -> None:
     """With as many clips of each difficulty as expected, every clip is drawn as often in both."""
-    plan, clips = three_hours, three_hours.scale.base.sim.episodes - three_hours.scale.base.sim.test_episodes
-    counts = {"simple": 0.55 * clips, "difficult": 0.45 * clips}
+    at = scale(presets.get(preset), 3 * HOUR)
+    clips = at.base.sim.episodes - at.base.sim.test_episodes
+    counts = {"simple": simple * clips, "difficult": (1 - simple) * clips}
     ordered, mixed = (
-        arm_config(Arm("", curriculum=("simple:2", "difficult:3"), mixed=on), plan.scale, 0).train
-        for on in (False, True)
+        arm_config(Arm("", curriculum=("simple:2", "difficult:3"), mixed=on), at, 0).train for on in (False, True)
     )
     drawn = {
         s.components[0].difficulties[0]: s.epochs * counts[s.components[0].difficulties[0]] for s in ordered.curriculum

@@ -18,7 +18,8 @@ register(
         rank=4,
         notes=(
             "Both arms draw the same shares of simple and difficult clips in the same number of steps; the paper "
-            "reports no number. Simple: the expert lifts the cube; difficult: it misses, drops it or explores.",
+            "reports no number. Simple in Lift: the expert lifts the cube; difficult: it misses, drops it or explores. "
+            "Simple in Meta-World: the tasks that Seo et al. (2022) call easy.",
         ),
     )
 )
