@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -122,27 +123,29 @@ def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> St
 def share(run: Run, others: Sequence[Run], shared: Path) -> None:
     """Gives a cell's run the stages that it has in common with others, and makes those that nobody has made.
 
+    Any finished run beside it serves, also one of an earlier command, if its own mark has the stage's content key.
     Processes that need the same stage wait for the one that makes it. If that one is killed, the next continues from
     its checkpoints.
 
     Args:
-        others: the other cells' runs.
+        others: the other cells' runs, for which it makes what they have in common.
         shared: the directory where shared stages are made and kept.
     """
     if not run.finished("collect"):
         with run.stage("collect"):
             stages.collect_clips(run)
-    for name in (name for name in SHARED if name in run.stages):
+    cells = [path for path in sorted(run.directory.parent.iterdir()) if path.is_dir() and path != run.directory]
+    beside = [replace(run, directory=path) for path in cells]
+    for name in (name for name in SHARED if name in run.stages and not run.finished(name)):
         key = run.keys()[name]
-        same = [other for other in others if other.keys().get(name) == key]
-        if run.finished(name) or (name == "world_model" and not same):
-            continue
-        maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
-        with lock(maker.lock_file, wait=f"waiting for another process that makes the {name}"):
-            source = next((source for source in (maker, *same) if source.finished(name)), None)
-            if source is None:
-                _make(maker, run, name)
-            link_stage(source or maker, run, name)
+        if source := next((source for source in beside if source.finished(name)), None):
+            link_stage(source, run, name)
+        elif name != "world_model" or any(other.keys().get(name) == key for other in others):
+            maker = Run(run.config, shared / f"{name}-{key}", run.data_directory)
+            with lock(maker.lock_file, wait=f"waiting for another process that makes the {name}"):
+                if not maker.finished(name):
+                    _make(maker, run, name)
+                link_stage(maker, run, name)
 
 
 def _make(maker: Run, run: Run, name: str) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +16,18 @@ from experiments import paper
 from rsjax.ablation import sweep
 from rsjax.ablation.figure import draw
 from rsjax.clip import Video
+from rsjax.config import presets
+from rsjax.config.leaves import with_values
 from rsjax.errors import Preempted
 from rsjax.evaluation.statistics import Verdict
 from rsjax.paper import measurements
 from rsjax.paper import report as page
+from rsjax.paper.budget import HOUR, Scale
 from rsjax.paper.claim import Comparison
 from rsjax.paper.claims import baselines
 from rsjax.paper.judge import judge_all
 from rsjax.paper.measurements import measurement
-from rsjax.paper.plan import Plan
+from rsjax.paper.plan import Plan, make_plan
 from rsjax.paper.run import run_plan, runs_of, write
 from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run
@@ -261,6 +265,26 @@ def test_seconds_a_frame_stand_beside_each_arm(tmp_path: Path, monkeypatch: pyte
         "| PSNR of the reconstruction | seconds a frame | trained parameters |"
         in (tmp_path / "out" / "report.md").read_text()
     )
+
+
+@pytest.mark.parametrize("sound", [True, False])
+def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, sound: bool) -> None:
+    """But the marks of the runs that are there must have the same content keys."""
+    first, later = (
+        make_plan([toy.claim()], Scale(HOUR, with_values(presets.debug(), {"eval.fvd_weights": file})), Path("data"), 1)
+        for file in ("", "i3d.pt")
+    )
+    assert not first.cells.keys() & later.cells.keys()
+    run(first, tmp_path)
+    for there in runs_of(first, tmp_path / "out", tmp_path / "data").values():
+        mark, key = there.directory / "world_model" / "stage.json", there.keys()["world_model"]
+        mark.write_text(mark.read_text().replace(key, key if sound else "0" * 16))
+    run(later, tmp_path)
+    counts = Counter(line.split()[0] for line in made(tmp_path))
+    assert (counts["tokenizer"], counts["tokens"], counts["evaluation"]) == (1, 1, 4)
+    assert counts["world_model"] == (2 if sound else 4)
+    for there in runs_of(later, tmp_path / "out", tmp_path / "data").values():
+        assert (there.output("world_model") / "weights").read_text() == there.keys()["world_model"]
 
 
 def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
