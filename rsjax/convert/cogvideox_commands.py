@@ -52,7 +52,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     """
     if source.is_dir():
         return [_export(source, out, part)]
-    tensors, _, names, others = _read(source)
+    tensors, _, names, others, _ = _read(source)
     settings, vae = published_settings(source, *cogvideox.CLASSES.values()), cogvideox.is_autoencoder(source, tensors)
     part, other = PARTS if vae else PARTS[::-1]
     if settings.get("_class_name", cogvideox.CLASSES[part]) != cogvideox.CLASSES[part]:
@@ -86,7 +86,7 @@ def _read(source: Path) -> TensorFile:
     files = [read_tensors(source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}")) for i in numbers]
     tensors = {name: x for file in files for name, x in file.tensors.items()}
     names = {name: known for file in files for name, known in file.names.items()}
-    return TensorFile(tensors, {}, names, {})
+    return TensorFile(tensors, {}, names, {}, "")
 
 
 def _export(source: Path, out: Path, part: Part | None) -> str:

@@ -25,7 +25,7 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
         tensors = to_tensors(params, tokenizer.table(config))
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]
-    tensors, metadata, names, others = read_tensors(source)
+    tensors, metadata, names, others, _ = read_tensors(source)
     own = _exported_config(source, metadata)
     config, params, aside = tokenizer.from_public(source, tensors, weights, own, names)
     replaces = REPLACES * directory.save(out, config, params)
@@ -51,7 +51,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
         write_json(beside, settings)
         text = f"under their public names; settings in {genie.CONFIG}{replaces}"
         return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]
-    tensors, _, names, others = read_tensors(source)
+    tensors, _, names, others, _ = read_tensors(source)
     settings = genie.read_settings(source)
     config, params = genie.from_public(source, tensors, settings, heads, names)
     replaces = REPLACES * directory.save(out, config, params)
@@ -72,7 +72,7 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
     names: dict[str, str] = {}
     aside = 0
     for source in sources:
-        tensors, _, own, others = read_tensors(source)
+        tensors, _, own, others, _ = read_tensors(source)
         if twice := merged.keys() & tensors.keys():
             raise ConvertError(f"{source}: {own[min(twice)]} is also in an earlier file; pass each part once")
         merged |= tensors

@@ -29,12 +29,15 @@ def convert_irasim(source: Path, out: Path, weights: Literal["ema", "raw"], head
         tensors = irasim.to_public(config, params)
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]
-    tensors, metadata, names, others = read_tensors(source, ("ema", *HOLDERS) if weights == "ema" else HOLDERS)
+    holders = ("ema", *HOLDERS) if weights == "ema" else HOLDERS
+    tensors, metadata, names, others, key = read_tensors(source, holders)
+    lacking = ", as it has no ema" if weights == "ema" and key != "ema" else ""
     own = _exported(source, metadata)
     config, params, aside = irasim.from_public(source, tensors, own, heads, names)
     replaces = REPLACES * directory.save(out, config, params)
     return [
         f"{out}: an IRASim of {len(tensors) - aside} tensors, {config}{replaces}",
+        *([f"read from the file's key {key}{lacking}"] if key else []),
         *left_aside({"fixed positions, which the network computes": aside}, others),
     ]
 
@@ -55,7 +58,7 @@ def convert_sdxl(source: Path, out: Path) -> list[str]:
         write_json(beside, settings)
         text = f"under their public names; settings in {kl_autoencoder.CONFIG}{replaces}"
         return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]
-    tensors, _, names, others = read_tensors(source)
+    tensors, _, names, others, _ = read_tensors(source)
     settings = published_settings(source, kl_autoencoder.CLASS)
     config, params = kl_autoencoder.from_public(source, tensors, settings, names)
     replaces = REPLACES * directory.save(out, config, params)

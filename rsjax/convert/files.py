@@ -49,12 +49,14 @@ class TensorFile(NamedTuple):
         metadata: of a safetensors file; empty for PyTorch's.
         names: each tensor's name in the file, by the name in ``tensors``.
         others: how many more tensors the file has, by the keys under which they lie; empty for a safetensors file.
+        key: under which the tensors lie; empty if under none.
     """
 
     tensors: Tensors
     metadata: dict[str, str]
     names: dict[str, str]
     others: dict[str, int]
+    key: str
 
 
 def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
@@ -75,10 +77,11 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         raise ConvertError(f"{path}: {instead}")
     metadata: dict[str, str] = {}
     others: dict[str, int] = {}
+    key = ""
     if path.suffix == SAFE:
         read, metadata = _read_safetensors(path)
     elif path.suffix in PICKLED:
-        read, others = _read_torch(path, holders)
+        read, others, key = _read_torch(path, holders)
     else:
         raise ConvertError(f"{path}: unknown kind of file; pass one that ends in {SAFE} or {', '.join(PICKLED)}")
     names: dict[str, str] = {}
@@ -87,7 +90,7 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
         if own in names:
             raise ConvertError(f"{path}: {own} occurs twice, as {names[own]} and as {name}; keep one of them")
         names[own] = name
-    return TensorFile({own: read[name] for own, name in names.items()}, metadata, names, others)
+    return TensorFile({own: read[name] for own, name in names.items()}, metadata, names, others, key)
 
 
 def left_aside(*groups: Mapping[str, int]) -> list[str]:
@@ -131,7 +134,7 @@ def _without_default(*_: object) -> dict[Any, Any]:
     return {}
 
 
-def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, int]]:
+def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, int], str]:
     try:
         torch: Any = importlib.import_module("torch")
     except ImportError:
@@ -140,20 +143,18 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
             f"same weights as a {SAFE} file"
         ) from None
     content = _unpickled(path, torch)
-    state = content
-    for holder in holders:
-        if isinstance(content, dict) and _tensors(content.get(holder), torch):
-            state = content[holder]
-            break
+    holding = (holder for holder in holders if isinstance(content, dict) and _tensors(content.get(holder), torch))
+    key = next(holding, "")
+    state = content[key] if key else content
     tensors = _tensors(state, torch)
     if not tensors:
         raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(holders)}")
     others = {}
-    for key, value in content.items():
-        read = len(tensors) if value is state else state is content and key in tensors
+    for name, value in content.items():
+        read = len(tensors) if value is state else state is content and name in tensors
         if more := _count(value, torch) - read:
-            others[f"the file's key {key}"] = more
-    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}, others
+            others[f"the file's key {name}"] = more
+    return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}, others, key
 
 
 def _unpickled(path: Path, torch: Any) -> Any:

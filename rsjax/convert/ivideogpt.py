@@ -139,7 +139,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     """
     if source.is_dir():
         return [_export(source, out, part)]
-    tensors, metadata, names, others = read_tensors(source)
+    tensors, metadata, names, others, _ = read_tensors(source)
     own = _exported(source, metadata)
     if "dynamics_quantize.embedding.weight" in tensors:
         given = None if own is None else (own[0].autoencoder, own[1].image_size)

@@ -51,8 +51,8 @@ def test_reading_inverts_writing(tmp_path: Path) -> None:
     tensors: Tensors = {"a.weight": whole.transpose(2, 0, 1), "b": whole[:, 1:3, ::2], "n": np.array(7, np.int64)}
     tensors["c"] = rng.normal(size=6).astype(ml_dtypes.bfloat16)
     write_safetensors(path, tensors, {"net": "x"})
-    read, metadata, _, others = read_tensors(path)
-    assert not others
+    read, metadata, _, others, key = read_tensors(path)
+    assert not others and key == ""
     assert metadata == {"net": "x"}
     assert read.keys() == tensors.keys()
     for name in tensors:
@@ -209,8 +209,8 @@ def test_pytorchs_tensors_are_read_bare_or_as_a_state_dict(tmp_path: Path) -> No
     }
     for name, content in (("bare.pt", state), ("whole.ckpt", {"state_dict": state, "epoch": 3})):
         torch.save(content, tmp_path / name)
-        read, metadata, _, others = read_tensors(tmp_path / name)
-        assert metadata == others == {}
+        read, metadata, _, others, key = read_tensors(tmp_path / name)
+        assert metadata == others == {} and key == ("" if name == "bare.pt" else "state_dict")
         np.testing.assert_array_equal(read["a.weight"], np.arange(6.0, dtype=np.float32).reshape(2, 3).T)
         np.testing.assert_array_equal(read["p"], [0.0, 1.0])
         np.testing.assert_array_equal(read["half"], np.array([0.1, 3.0], ml_dtypes.bfloat16).astype(np.float32))

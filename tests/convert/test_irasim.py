@@ -97,18 +97,27 @@ def test_a_trained_autoencoder_has_no_public_form(tmp_path: Path) -> None:
         to_public(replace(SMALL, kl_weight=0.0), params)
 
 
-@pytest.mark.parametrize(("options", "scale"), [((), 1.0), (("--weights", "raw"), 2.0)])
+@pytest.mark.parametrize(
+    ("options", "scale", "line"),
+    [
+        ((), 1.0, "read from the file's key ema\n"),
+        (("--weights", "raw"), 2.0, "read from the file's key model\n"),
+        ((), 2.0, "read from the file's key model, as it has no ema\n"),
+    ],
+)
 def test_training_checkpoints_are_read_without_running_them(
-    options: tuple[str, ...], scale: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: tuple[str, ...], scale: float, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     torch = pytest.importorskip("torch")
     ema = {name: torch.from_numpy(x) for name, x in public.random_weights(NET).items()}
     raw = {f"module.{name}": 2 * x for name, x in ema.items()}
     moments = {number: {"exp_avg": x} for number, x in enumerate(ema.values())}
-    torch.save({"model": raw, "ema": ema, "opt": {"state": moments}, "args": None}, tmp_path / "0300000.pt")
+    networks = {"model": raw} if "no ema" in line else {"model": raw, "ema": ema}
+    torch.save(networks | {"opt": {"state": moments}, "args": None}, tmp_path / "0300000.pt")
     convert("irasim", tmp_path / "0300000.pt", tmp_path / "own", "--heads", NET.heads, *options)
     said = capsys.readouterr().out
-    for key in ("model" if scale == 1 else "ema", "opt"):
+    assert line in said
+    for key in (networks.keys() | {"opt"}) - {"ema" if scale == 1 else "model"}:
         assert f"left aside: {len(ema)} tensors of the file's key {key}\n" in said
     kernel = load_irasim(tmp_path / "own")[1]["final"]["kernel"]
     np.testing.assert_allclose(kernel, scale * public.random_weights(NET)["final_layer.linear.weight"].T)

@@ -15,6 +15,7 @@ from rsjax.errors import UserError
 from rsjax.files import read_json
 from rsjax.models.irasim.dit import Architecture, architecture
 from rsjax.models.saved import check_family
+from rsjax.progress import note
 from rsjax.trainable import Params
 
 AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
@@ -56,6 +57,11 @@ def check_network(directory: Path, own: Architecture) -> Architecture:
     free = FREE if own.conditioning == "video" else (*FREE, "frames")
     if differing := differences(saved, own, free):
         raise UserError(f"{directory}: holds another network ({differing}); set these fields of model alike")
+    if saved.action_inputs != own.action_inputs:
+        note(
+            f"{directory}: its actions have {saved.action_inputs} numbers, these {own.action_inputs}; the first layer "
+            f"of the action encoder begins fresh"
+        )
     return saved
 
 

@@ -159,12 +159,15 @@ def test_videos_start_with_the_prompt_as_the_autoencoder_sees_it() -> None:
     np.testing.assert_array_equal(made.rgb[:, :1], MODEL.reconstruct(assets, Video(prompt.rgb)).rgb)
 
 
-def test_actions_of_another_length_begin_fresh(tmp_path: Path) -> None:
+def test_actions_of_another_length_begin_fresh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     params = toy.params(CONFIG)
     arch = MODEL.architecture
     save(tmp_path / "there", arch, params)
     wider = create_model(on_width(CONFIG, arch.action_inputs + 3))
     assert wider.pretrained_shapes(tmp_path / "there")["action_fc1"]["kernel"].shape[0] == arch.action_inputs
+    lengths = f"its actions have {arch.action_inputs} numbers, these {arch.action_inputs + 3}"
+    assert f"{lengths}; the first layer of the action encoder begins fresh" in capsys.readouterr().out
+    assert MODEL.pretrained_shapes(tmp_path / "there") and not capsys.readouterr().out
     fresh = jax.tree.map(lambda x: np.zeros(x.shape), jax.eval_shape(wider.init, jax.random.key(0)))
     begun = wider.start(fresh, params, tmp_path)
     assert begun["action_fc1"]["kernel"].shape[0] == arch.action_inputs + 3
