@@ -31,7 +31,7 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
         prompt_frames=model.autoencoder.context_frames,
         sim=SimConfig(image_size=size),
         tokenizer_train=TokenizerTrainConfig(
-            steps=200_000,
+            steps=100_000,  # the public 200,000 count the discriminator's turns too
             batch_size=64,
             frames_per_clip=8,
             depth_share=0.0,

@@ -45,3 +45,9 @@ def test_full_size_presets_are_the_papers_setting(name: str) -> None:
 def test_the_public_genie_has_heads_of_32_and_64() -> None:
     networks = [Architecture.create(presets.get(name)) for name in ("genie_35m", "genie_138m")]
     assert [network.head_width for network in networks] == [32, 64]
+
+
+@pytest.mark.parametrize("name", ["ivideogpt_64", "ivideogpt_256"])
+def test_the_public_tokenizer_of_ivideogpt_has_half_of_its_counters_steps(name: str) -> None:
+    config = presets.get(name)
+    assert (config.tokenizer_train.steps, config.train.steps) == (100_000, 100_000)
