@@ -13,6 +13,7 @@ from rsjax.config import Config, ConfigError, presets
 from rsjax.paper import budget
 from rsjax.paper.budget import HOUR, parse_duration, scale, step_seconds, training_cost
 from rsjax.paper.claim import Arm, Comparison, chosen, claims
+from rsjax.paper.claims.baselines import FRAME
 from rsjax.paper.plan import Plan, arm_config, make_plan
 from rsjax.paper.run import print_plan
 from rsjax.pipeline.run import Run
@@ -54,6 +55,13 @@ def test_a_larger_budget_never_makes_anything_smaller_and_no_size_exceeds_the_pr
 
 def _sizes(config: Config) -> tuple[int, ...]:
     return config.sim.episodes, config.tokenizer_train.steps, config.eval.action_draws
+
+
+def test_both_of_table_1_have_the_seconds_of_a_frame_of_every_arm() -> None:
+    for claim in chosen(["table1*"], claims()):
+        assert claim.beside == {FRAME: FRAME}, claim.name
+        assert all(FRAME in claim.measurements(arm.name) for arm in claim.arms)
+    assert len(chosen(["table1*"], claims())) == 2
 
 
 def test_a_small_preset_keeps_its_own_sizes() -> None:

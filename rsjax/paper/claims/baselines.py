@@ -102,6 +102,7 @@ register(
         place="§3.2, Table 1",
         arms=_arms(_COLUMNS, _TABLE_1, "flops"),
         comparisons=_against_all("psnr", "psnr_motion", "delta_psnr"),
+        beside={FRAME: FRAME},
         rank=4,
         notes=(f"{_SAME} All models train with as many operations as RoboScape, autoencoders included.", *_FAIR[1:]),
     )
