@@ -1,9 +1,15 @@
 """Each family with its networks so small that a whole run of them takes no time, on the toy clips."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from rsjax.config import Config, GenieConfig, LoopConfig
+import jax
+import numpy as np
+
+from rsjax.bench import inputs
+from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, GenieConfig, LoopConfig
+from rsjax.models.base import create_autoencoder, create_model
 from tests.models.cogvideox import toy as toy_cogvideox
 from tests.models.irasim import toy as toy_irasim
 from tests.models.ivideogpt import toy as toy_ivideogpt
@@ -34,14 +40,29 @@ def ivideogpt() -> Config:
 
 
 def irasim() -> Config:
-    """IRASim with an autoencoder of its own."""
-    return engine(toy_irasim.config(integrate_actions=True))
+    """IRASim with an autoencoder of its own, whose batches are accumulated."""
+    base = engine(toy_irasim.config(integrate_actions=True))
+    return base.with_loops(accumulate=2)
 
 
 def cogvideox() -> Config:
-    """CogVideoX with an autoencoder of its own and learned texts."""
+    """CogVideoX with an autoencoder of its own and learned texts, whose clips come in two stages."""
     base = engine(toy_cogvideox.config())
-    return replace(base, tokenizer_train=replace(base.tokenizer_train, frames_per_clip=base.sim.frames))
+    stages = [CurriculumStageConfig((ComponentConfig(tasks=("drift",), clips=clips),), 4 / clips) for clips in (1, 2)]
+    tokenizer = replace(base.tokenizer_train, frames_per_clip=base.sim.frames)
+    return replace(base, tokenizer_train=tokenizer, train=replace(base.train, curriculum=tuple(stages)))
 
 
 FAMILIES = {"genie": genie, "ivideogpt": ivideogpt, "irasim": irasim, "cogvideox": cogvideox}
+
+
+def batches_of(config: Config, clips: int = 4) -> Iterator[tuple[Any, Any, Any]]:
+    """Both networks, with shapes of their parameters and a batch of clips."""
+    model = create_model(config)
+    if config.model.own_autoencoder is not None:
+        autoencoder, rng = create_autoencoder(config), np.random.default_rng(0)
+        transform = autoencoder.transform()
+        rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(clips)]
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"index": np.arange(clips)}
+        yield autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
+    yield model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, clips)

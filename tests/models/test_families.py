@@ -1,7 +1,6 @@
 """Every family goes through one training engine: what the engine promises holds for each, in both its networks."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,6 @@ import pytest
 
 import rsjax
 from rsjax.ablation.grid import expand, parse_axes
-from rsjax.bench import inputs
 from rsjax.config import Config, ConfigError, LoopConfig, presets
 from rsjax.config.leaves import with_values
 from rsjax.describe import count, describe
@@ -132,22 +130,10 @@ def test_clips_replay_alone_as_in_their_batch(run: Run) -> None:
         assert clips[0].scalars["loss"] != clips[1].scalars["loss"]
 
 
-def batches_of(config: Config) -> Iterator[tuple[Any, Any, Any]]:
-    """Both networks, with shapes of their parameters and a batch of four clips."""
-    model = create_model(config)
-    if config.model.own_autoencoder is not None:
-        autoencoder, rng = create_autoencoder(config), np.random.default_rng(0)
-        transform = autoencoder.transform()
-        rows = [transform({"rgb": toy.clip(i).rgb, "depth": None}, rng) for i in range(4)]
-        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"index": np.arange(4)}
-        yield autoencoder, autoencoder.shapes(), autoencoder.batch(arrays)
-    yield model, jax.eval_shape(model.init, jax.random.key(0)), inputs.batch(model, config, 4)
-
-
 @every_family
 def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
     """What accumulation and every sharding need: the terms of parts add up to those of the whole."""
-    for model, shapes, batch in batches_of(families.FAMILIES[family]()):
+    for model, shapes, batch in families.batches_of(families.FAMILIES[family]()):
         rng = np.random.default_rng(1)
         params = jax.tree.map(lambda x: (0.1 * rng.normal(size=x.shape)).astype(np.float32), shapes)  # noqa: B023
 

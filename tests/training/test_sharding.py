@@ -24,13 +24,25 @@ def virtual(devices: int) -> dict[str, str]:
     return os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
 
 
-@pytest.fixture(scope="module")
-def apart() -> dict[str, Any]:
-    """Results of tests/training/devices.py. The devices must exist before jax starts, hence a process of its own."""
-    command = [sys.executable, "-m", "tests.training.devices"]
+def on_four_devices(program: str) -> dict[str, Any]:
+    """The results of a program. The devices must exist before jax starts, hence a process of its own."""
+    command = [sys.executable, "-m", f"tests.training.{program}"]
     done = subprocess.run(command, cwd=ROOT, env=virtual(4), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def apart() -> dict[str, Any]:
+    """Results of tests/training/devices.py."""
+    return on_four_devices("devices")
+
+
+def test_every_familys_step_is_the_same_on_a_mesh_and_accumulated_under_pmap() -> None:
+    """Genie's is RoboScape's."""
+    found = on_four_devices("family_steps")
+    assert found.keys() == {"IVideoGPT", "KLTraining", "IRASim", "CogVideoX"}
+    assert max(found.values()) < 1e-5, found
 
 
 @pytest.mark.parametrize("kind", ["pmap", "mesh", "fsdp", "muon"])
