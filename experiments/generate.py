@@ -51,7 +51,7 @@ class Options:
     mean_codes: bool | None = None
     """Decode pictures from mean codes instead of the most probable ones; no effect at temperatures above 0."""
     guidance: float | None = None
-    """Strength of guidance by actions; 1: none; other values need a model trained with model.action_dropout."""
+    """Strength of guidance; 1: none. By actions it needs model.action_dropout, by text model.text.dropout or a file."""
     window_stride: int | None = None
     """Frames by which a full window moves (learned positions); 0: half of the window."""
     cache_dtype: Literal["float32", "bfloat16"] | None = None
