@@ -21,7 +21,7 @@ ALIKE = {
     "data": ("key", "split", "frames", "image_size", "fps"),
 }
 MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
-SEEDED = ("family", "preset", "settings")  # of a result's model, what the runs of a group have in common
+SEEDED = ("family", "preset", "settings", "training")  # of a result's model, what the runs of a group have in common
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
 

@@ -33,8 +33,9 @@ class Result:
             ``physics_iq_threshold``: grey levels of 255 above which a pixel moves; results of earlier versions lack it.
         data: ``path``, ``key``, ``manifest_sha256``, ``split``, ``frames``, ``image_size`` and ``fps`` of the scored
             clips; ``fps``, frames per second, is None where nothing says it and absent in results of earlier versions.
-        model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters``, ``weights_sha256``, and the key
-            of the data that it learned from as ``trained_on``.
+        model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters``, ``weights_sha256``, the key of
+            the data that it learned from as ``trained_on``, and how it was trained as ``training``: the settings of the
+            training loops, but for seeds and starting points, and the tokenizer's. Earlier versions lack ``training``.
         code: version and git revision of rsjax.
         made: when (ISO 8601, UTC), and on which ``machine``.
         metrics: scores by name; None for a metric without, of which ``reasons`` says why.

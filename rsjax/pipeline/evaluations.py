@@ -27,7 +27,7 @@ from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result,
 from rsjax.files import FileError, disk_guard, lock
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
-from rsjax.pipeline.provenance import code_version, data_fingerprint, machine
+from rsjax.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.pipeline.run import RECIPE, Run
 from rsjax.pipeline.trained import load, load_config
 from rsjax.pipeline.videos import resampled
@@ -168,6 +168,7 @@ def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut)
             "preset": config.name,
             "family": config.model.family,
             "settings": to_dict(config.model),
+            "training": training_settings(config),
             "seed": config.train.seed,
             "parameters": sum(x.size for x in jax.tree.leaves(trained.params)),
             "weights_sha256": _weights(trained),

@@ -7,6 +7,7 @@ import platform
 import socket
 import subprocess
 from contextlib import suppress
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,14 @@ from typing import Any
 import jax
 
 import rsjax
-from rsjax.config import to_dict
+from rsjax.config import Config, LoopConfig, to_dict
+from rsjax.config.leaves import leaves
 from rsjax.data.store import MANIFEST
 from rsjax.files import FileError, parse_json, read_json, write_json
 from rsjax.pipeline.run import Run
 
 NAME = "run.json"
+BY_SEED = ("seed", "start_from")  # settings of a training loop that differ between the seeds of one kind of run
 DECIDE = ("code", "packages", "data")  # entries that may change results under the same configuration
 
 
@@ -133,6 +136,20 @@ def _git(root: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def training_settings(config: Config) -> dict[str, Any]:
+    """Returns the settings of each training loop and of the tokenizer that decide the weights of any one seed."""
+    parts = {each.name: getattr(config, each.name) for each in fields(config)}
+    trained = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
+    if config.model.uses_tokenizer:
+        trained["tokenizer"] = config.tokenizer
+    return {name: _without_runtime(part) for name, part in trained.items()}
+
+
+def _without_runtime(part: Any) -> dict[str, Any]:
+    skipped = {name for name, leaf in leaves(part).items() if leaf.runtime or name in BY_SEED}
+    return {name: value for name, value in to_dict(part).items() if name not in skipped}
 
 
 def machine() -> dict[str, Any]:

@@ -241,6 +241,7 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
         ({"family": "genie"}, "model.family is roboscape in the first, genie in the other"),
         ({"preset": "debug"}, "model.preset is tiny in the first, debug in the other"),
         ({"settings": {"loss": {"gamma": 9.0}}}, "model.settings.loss.gamma is 5.0 in the first, 9.0 in the other"),
+        ({"training": {"train": {"steps": 9}}}, "model.training.train.steps is 5 in the first, 9 in the other"),
         ({"weights_sha256": "w0"}, "have the same weights; a group takes each training once"),
         ({"seed": 1, "settings": {"loss": {"gamma": 5.0}, "unroll": 4, "new": 1}}, ""),
     ],
@@ -248,6 +249,7 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
 def test_runs_of_a_group_differ_in_their_seed_alone(make: Make, changes: dict, says: str) -> None:
     plain = toy.result(0.0)
     own = plain.model | {"preset": "tiny", "settings": {"loss": {"gamma": 5.0}, "unroll": 1}, "weights_sha256": "w0"}
+    own |= {"training": {"train": {"steps": 5}}}
     group = make("a", replace(plain, model=own), replace(plain, model=own | {"weights_sha256": "w1"} | changes))
     if not says:
         assert len(read_groups([group], None)[0].results) == 2

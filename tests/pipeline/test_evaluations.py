@@ -98,6 +98,8 @@ def test_a_result_says_all_that_decided_it(run: Run, folder: Path) -> None:
     assert result.sampling["unmask"] == "greedy"
     assert result.model["parameters"] > 0
     assert len(result.model["weights_sha256"]) == 16
+    assert result.model["training"]["train"]["steps"] == run.config.train.steps
+    assert "seed" not in result.model["training"]["train"]
     assert result.code["version"]
     assert result.made["machine"]["devices"] >= 1
     assert [clip["number"] for clip in result.clips] == list(range(toy.TEST))
