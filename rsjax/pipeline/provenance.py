@@ -141,7 +141,7 @@ def _git(root: Path, *arguments: str) -> str | None:
 def training_settings(config: Config) -> dict[str, Any]:
     """Returns the settings of each training loop and of the tokenizer that decide the weights of any one seed."""
     parts = {each.name: getattr(config, each.name) for each in fields(config)}
-    trained = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
+    trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
     if config.model.uses_tokenizer:
         trained["tokenizer"] = config.tokenizer
     return {name: _without_runtime(part) for name, part in trained.items()}
