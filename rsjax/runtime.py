@@ -38,7 +38,7 @@ def tune_process() -> None:
     empty, nowhere.
 
     The restart has the same process id and arguments. XLA's CPU backend allocates fresh memory for every step, and
-    touching it 4 KiB at a time takes a quarter of a small model's step. glibc reads its tunables only when a process
+    touching it 4 KiB at a time takes a third of a small model's step. glibc reads its tunables only when a process
     starts, hence the restart. Does not restart if the user has set this tunable, or off Linux.
     """
     if CACHE_DIRECTORY not in os.environ and (cache := _cache_directory()):

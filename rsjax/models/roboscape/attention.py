@@ -98,7 +98,7 @@ def attend_cells(
     bf16: bool,
     causal: bool = False,
 ) -> Float[Array, "*N S h e"]:
-    """Returns :func:`attend` within each frame, or each sequence, by the fastest implementation on this platform.
+    """Returns :func:`attend` within each frame, or each sequence, by our fastest way on a CPU and jax's elsewhere.
 
     Args:
         bf16: whether products may round their operands to bf16.
