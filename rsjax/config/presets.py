@@ -98,7 +98,7 @@ def tiny() -> Config:
             embed_std=0.5,
             position_std=0.5,
             compute_dtype="bfloat16",
-            # In so few steps visible prefixes cost more than they gain (docs/results/miniature.md); corruption is untried.
+            # In so few steps corruption and visible prefixes cost more than they gain (docs/results/miniature.md).
             mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
             # A second step changes nothing in the pictures (docs/results/miniature.md) and takes half as long again.
             sample=SampleConfig(steps=1, mean_codes=True),
