@@ -45,9 +45,10 @@ def parse_duration(text: str) -> float:
     Raises:
         ConfigError: the text is no duration above 0.
     """
+    text = text.strip()
     found = list(_TERM.finditer(text))
     seconds = sum(float(term[1]) * _UNITS[term[2]] for term in found)
-    whole = "".join(term[0] for term in found) == text.strip()
+    whole = "".join(term[0] for term in found) == text
     require(whole and seconds > 0, f"--budget {text}: not a duration; write 30min, 3h, 12h or 1h30min")
     return seconds
 
@@ -84,6 +85,7 @@ def scale(preset: Config, seconds: float) -> Scale:
         "eval.batch_size": min(evaluation.batch_size, clips),
         "eval.action_draws": draws,
         "eval.localiser_steps": min(evaluation.localiser_steps, max(1, _round(LOCALISER_SHARE * each / LOCALISER))),
+        "train.curriculum": (),  # whose epochs would set the steps; a claim's arms bring theirs
         "train.eval_every": 0,
         "tokenizer_train.eval_every": 0,
     }
@@ -149,8 +151,8 @@ def collect_seconds(config: Config) -> float:
 
 
 def tokenizer_seconds(config: Config) -> float:
-    """Returns the seconds of the tokenizer's training, and of making tokens."""
-    if not config.model.uses_tokenizer or config.model.own_autoencoder is not None:
+    """Returns the seconds of the training of tokenizer or autoencoder, and of making tokens."""
+    if not config.model.uses_tokenizer:
         return 0.0
     clips = config.sim.episodes * (1 + sum(config.model.token_shifts[:1]))
     return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * clips
@@ -186,8 +188,6 @@ def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0
     return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
 
 
-def cell_seconds(config: Config) -> float:
-    """Returns the seconds of a cell beyond what it shares: no other has an autoencoder of its family's own."""
-    own = config.model.own_autoencoder is not None
-    training = sum(training_cost(config, "seconds")[0 if own else 1 :])
-    return START * (1 + own) + training + evaluation_seconds(config)
+def model_seconds(config: Config) -> float:
+    """Returns the seconds of the world model's training."""
+    return START + training_cost(config, "seconds")[1]

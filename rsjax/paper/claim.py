@@ -26,6 +26,7 @@ class Arm:
         curriculum: the stages of its training, whose epochs are scaled to the cell's steps.
         mixed: the clips of these stages are mixed instead, each as often as in the curriculum.
         data: the share of the training clips that the world model learns from.
+        rate: a factor on the learning rate of the world model.
         published: the paper's numbers for it, by metric.
     """
 
@@ -37,6 +38,7 @@ class Arm:
     curriculum: tuple[str, ...] = ()
     mixed: bool = False
     data: float = 1.0
+    rate: float = 1.0
     published: Mapping[str, float] = field(default_factory=dict)
 
 

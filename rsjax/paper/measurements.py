@@ -13,6 +13,7 @@ from typing import Any
 from rsjax.config import Config, require
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.registry import Unavailable
 from rsjax.files import FileError, read_json, write_json
 from rsjax.pipeline.run import Run
 from rsjax.progress import note
@@ -56,7 +57,10 @@ def measured(run: Run, name: str) -> bool:
 
 
 def measure(run: Run, name: str) -> None:
-    """Measures a finished run unless that was done; a failure is recorded and tried again by the next command."""
+    """Measures a finished run unless that was done; a failure is recorded and tried again by the next command.
+
+    A measurement that does not exist for this run (:class:`rsjax.evaluation.registry.Unavailable`) is not tried again.
+    """
     if measured(run, name):
         return
     result: dict[str, Any] = {}
@@ -65,6 +69,8 @@ def measure(run: Run, name: str) -> None:
         result["scores"] = {
             key: [float(x) if math.isfinite(x) else None for x in values] for key, values in scores.items()
         }
+    except Unavailable as reason:
+        result = {"scores": {}, "error": str(reason)}
     except Exception as error:
         line = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         note(f"{name} failed: {line}")

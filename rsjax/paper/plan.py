@@ -88,7 +88,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
     absent: dict[tuple[str, str], str] = {}
     cells: dict[str, Cell] = {}  # by content key
     tasks: dict[tuple[str, str], Task] = {}
-    shared = set[str]()
+    made = set[str]()
     for claim, arm, seed in _ordered(claims, range(seeds)):
         try:
             config = arm_config(arm, scale, seed)
@@ -99,7 +99,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
         key, use = keys["evaluation"], (claim.name, arm.name)
         if key not in cells:
             cells[key] = Cell(f"{cell_name(_label(arm), seed)}-{key[:8]}", config, ())
-            seconds = budget.cell_seconds(config) + _shared_seconds(config, keys, shared)
+            seconds = _new_seconds(config, keys, made) + budget.evaluation_seconds(config)
             tasks[key, ""] = Task(cells[key].name, "", claim.name, seconds)
         cells[key] = replace(cells[key], uses=(*cells[key].uses, use))
         for name in claim.measurements(arm.name):
@@ -113,9 +113,13 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
     return Plan(scale, tuple(claims), named, tuple(fits), tuple(left_out), absent)
 
 
-def _shared_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
-    """Returns the seconds of the shared stages that no cell before has made, and adds them to ``made``."""
-    parts = {"collect": budget.collect_seconds, "tokenizer": budget.tokenizer_seconds}
+def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
+    """Returns the seconds of the stages that no cell before has made, and adds their keys to ``made``."""
+    parts = {
+        "collect": budget.collect_seconds,
+        "tokenizer": budget.tokenizer_seconds,
+        "world_model": budget.model_seconds,
+    }
     new = [stage for stage in parts if stage in keys and keys[stage] not in made]
     made.update(keys[stage] for stage in new)
     return sum(parts[stage](config) for stage in new)
@@ -137,7 +141,8 @@ def _label(arm: Arm) -> dict[str, Value]:
     """Returns what an arm varies, for the name of its directory."""
     family = {"model": arm.model or arm.preset} if arm.model or arm.preset else {}
     stages = {"curriculum": "+".join(arm.curriculum) + " mixed" * arm.mixed} if arm.curriculum else {}
-    return {**family, **arm.values, **stages, **({"data": f"{arm.data:.2g}"} if arm.data < 1 else {})}
+    shares = {name: f"{share:.2g}" for name, share in (("data", arm.data), ("rate", arm.rate)) if share != 1}
+    return {**family, **arm.values, **stages, **shares}
 
 
 def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
@@ -154,6 +159,9 @@ def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
         raise ConfigError(f"the preset {config.name} has no such field ({error})") from error
     if arm.equal != "steps":
         config = _equal(config, base, arm.equal, alone=bool(arm.preset))
+    if arm.rate != 1:
+        rate = float(f"{arm.rate * config.train.optimizer.learning_rate:.2g}")
+        config = with_values(config, {"train.optimizer.learning_rate": rate})
     stages = _stages(arm, config)
     return with_values(config, {"train.curriculum": stages}) if stages else config
 

@@ -32,7 +32,6 @@ from rsjax.report.figures import filmstrip
 from rsjax.report.score_charts import SCENES
 from rsjax.report.video import webp, webp_uri
 
-OWN_STAGES = ("world_model", "evaluation", "report")  # of which every cell has its own
 LEGEND = (
     "Differences are paired by clip: mean (or median) over clips and seeds, with the 95 % interval from resampling "
     "both. A verdict takes the wider of this interval and Welch's t over the seeds; p is Welch's. A claim holds if all "
@@ -80,12 +79,13 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
 def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     base = plan.scale.base
     results = {result.name: result for outcome in outcomes for arm in outcome.arms for result in arm.results}
-    seconds = [result.run.mark(stage).get("seconds", 0.0) for result in results.values() for stage in OWN_STAGES]
+    runs = [result.run for result in results.values()]  # cells that share a stage have the mark of one
+    spent = {key: run.mark(stage).get("seconds", 0.0) for run in runs for stage, key in run.keys().items()}
     states = Counter(result.state for result in results.values())
     return {
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {jax.local_devices()[0].device_kind}, {os.cpu_count()} cores",
         "states": ", ".join(f"{count} {state}" for state, count in states.items()),
-        "spent": duration(sum(seconds)),
+        "spent": duration(sum(spent.values())),
         "budget": duration(plan.scale.seconds),
         "preset": base.name,
         "sizes": {

@@ -50,7 +50,7 @@ def run_plan(plan: Plan, out: Path, data: Path, command: str) -> dict[str, State
 
 def _measure(task: Task, run: Run, place: tuple[int, int]) -> None:
     with lock(run.lock_file) as free:
-        if not free or read_result(run).state == "failed" or not run.finished("report"):
+        if not free or not run.finished("report"):
             stage(*place, task.cell, f"{task.measurement}: left out, as its training is not finished")
         elif measured(run, task.measurement):
             stage(*place, task.cell, f"{task.measurement}: up to date, skipped")

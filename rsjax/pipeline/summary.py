@@ -70,7 +70,7 @@ def _rank(rank: int, clips: int) -> str:
     """Returns a clip's rank from below in words; 0 is a typical clip."""
     if not rank:
         return "typical"
-    ending = {2: "nd ", 3: "rd "}.get(rank % 10 * (rank // 10 % 10 != 1), "th ")
+    ending = {1: "st ", 2: "nd ", 3: "rd "}.get(rank % 10 * (rank // 10 % 10 != 1), "th ")
     return f"{'' if rank == 1 else f'{rank}{ending}'}worst of {clips}"
 
 

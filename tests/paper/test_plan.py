@@ -32,7 +32,7 @@ def three_hours() -> Plan:
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("30min", 1800), ("3h", 10800), ("1h30min", 5400), ("90 s", 90), ("0.5h", 1800), ("1d", 86400)],
+    [("30min", 1800), ("3h", 10800), ("1h30min", 5400), ("90 s", 90), ("0.5h", 1800), ("1d", 86400), (" 3h ", 10800)],
 )
 def test_durations(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
@@ -68,6 +68,18 @@ def test_a_small_preset_keeps_its_own_sizes() -> None:
     """So that a run of the preset is a cell."""
     whole = Run(presets.debug(), Path(), DATA).keys()
     assert Run(scale(presets.debug(), 3 * HOUR).base, Path(), DATA).keys() == whole
+
+
+def test_a_presets_curriculum_does_not_set_the_steps_of_a_budget() -> None:
+    assert presets.get("roboscape_s").train.curriculum
+    assert not scale(presets.get("roboscape_s"), HOUR).base.train.curriculum
+
+
+def test_a_cell_that_shares_its_world_model_costs_its_evaluation_alone(three_hours: Plan) -> None:
+    """Sampling differs, not what is trained."""
+    tasks = {task.cell: task for task in (*three_hours.tasks, *three_hours.left_out) if not task.measurement}
+    (cell, *_) = three_hours.of("departure-mean-codes", "to the letter")
+    assert tasks[cell.name].seconds == budget.evaluation_seconds(cell.config)
 
 
 @pytest.mark.parametrize("hours", [0.5, 3, 12])
@@ -190,6 +202,12 @@ def test_every_family_of_table_1_has_three_trials_of_its_learning_rate(three_hou
         assert [rates[arm] / rates[""] for arm in RATES] == pytest.approx([0.3, 3])
         assert cells[""] == three_hours.of("table1", family.name)[0], "its own rate is trained once for both claims"
         assert {cell.config.train.steps for cell in cells.values()} == {cells[""].config.train.steps}
+
+
+def test_a_trial_of_the_rate_multiplies_that_of_the_base_preset() -> None:
+    at = scale(presets.debug(), HOUR)
+    rates = [arm_config(Arm("", rate=factor), at, 0).train.optimizer.learning_rate for factor in (1.0, 3.0)]
+    assert rates[1] == pytest.approx(3 * rates[0])
 
 
 def test_more_seeds_are_more_trainings() -> None:

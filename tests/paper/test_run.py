@@ -19,6 +19,7 @@ from rsjax.clip import Video
 from rsjax.config import presets
 from rsjax.config.leaves import with_values
 from rsjax.errors import Preempted
+from rsjax.evaluation.registry import Unavailable
 from rsjax.evaluation.statistics import Verdict
 from rsjax.paper import measurements
 from rsjax.paper import report as page
@@ -192,6 +193,22 @@ def test_a_measurement_runs_once_per_run_and_again_where_it_failed(tmp_path: Pat
     (claim,) = run(plan, tmp_path)["claims"]
     assert claim["comparisons"][0]["values"]["difference"] == pytest.approx(1 / 3)
     assert sorted(longer) == sorted([*plan.cells, next(iter(plan.cells))])
+
+
+def test_a_measurement_that_a_run_cannot_have_is_tried_once(tmp_path: Path) -> None:
+    tried = []
+
+    @measurement("other tasks", lambda config: 0.0)
+    def other(run: Run) -> dict[str, list[float]]:
+        tried.append(run.directory.name)
+        raise Unavailable("one task alone")
+
+    plan = toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="other tasks")))
+    for _ in range(2):
+        (claim,) = run(plan, tmp_path)["claims"]
+    measurements._MEASUREMENTS.pop("other tasks")
+    assert claim["comparisons"][0]["reason"] == "with: one task alone"
+    assert sorted(tried) == sorted(plan.cells)
 
 
 def test_budgets_share_a_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

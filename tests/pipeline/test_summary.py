@@ -13,6 +13,7 @@ from rsjax.pipeline.summary import _rank
         (4, "4th worst of 100"),
         (12, "12th worst of 100"),
         (20, "20th worst of 100"),
+        (21, "21st worst of 100"),
         (22, "22nd worst of 100"),
     ],
 )

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 from rsjax.config import Config
 from rsjax.data.store import Store, open_store
-from rsjax.errors import UserError
 from rsjax.evaluation.evaluate import HeldOut, evaluate
 from rsjax.evaluation.protocols import PROTOCOLS
+from rsjax.evaluation.registry import Unavailable
 from rsjax.paper import budget
 from rsjax.paper.claim import Arm, Claim, Comparison, register
 from rsjax.paper.measurements import FOLDER, Scores, measurement
+from rsjax.pipeline.evaluations import longer_episodes
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
 from rsjax.progress import Progress
@@ -18,7 +19,6 @@ from rsjax.sim.collect import collect, collection_key
 from rsjax.sim.unseen import collect_unseen, unseen_splits
 
 HORIZON = PROTOCOLS["horizon48"].horizon
-LONGER_SEED = 1_000_000  # added to the seed of the episodes, for longer ones that are none of them
 
 
 def _by_protocol(run: Run, name: str, store: Store, split: str, draws: int) -> Scores:
@@ -38,10 +38,8 @@ def _long_seconds(config: Config) -> float:
 @measurement("48 frames", _long_seconds)
 def rollouts(run: Run) -> Scores:
     """Scores rollouts of 48 predicted frames, on longer episodes of another seed."""
-    sim, clips = run.config.sim, run.config.eval.clips
-    seed = (sim.seed + LONGER_SEED) % 2**32
-    longer = replace(sim, frames=HORIZON + 1, seed=seed, episodes=clips + 1, test_episodes=clips)
-    path = run.data_directory / f"{sim.env}-{collection_key(longer)}"
+    longer = longer_episodes(run.config.sim, HORIZON + 1, run.config.eval.clips)
+    path = run.data_directory / f"{longer.env}-{collection_key(longer)}"
     with Progress("collect", longer.episodes, "longer episodes") as progress:
         collect(longer, path, lambda done, total: progress.update(done))
     return _by_protocol(run, "horizon48", open_store(path), "test", 0)
@@ -56,7 +54,7 @@ def _register_unseen(split: str, name: str) -> None:
         """Scores clips of the simulator that differ from all of training."""
         config = run.config
         if split not in unseen_splits(config.sim):
-            raise UserError(f"{config.sim.env} has one task; the preset multitask holds tasks out")
+            raise Unavailable(f"{config.sim.env} has one task; the preset multitask holds tasks out")
         with Progress("collect", config.eval.clips * len(unseen_splits(config.sim)), "unseen episodes") as progress:
             show = lambda done, total: progress.update(done)  # noqa: E731
             store = collect_unseen(config.sim, run.open_clips(), config.eval.clips, show)
