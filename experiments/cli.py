@@ -74,7 +74,7 @@ class PresetOptions:
     """Options of every command with a preset. They change the preset before its fields are set."""
 
     model: str | None = None
-    """The family of the model (roboscape, genie): the preset's settings as far as both families have them."""
+    """The family of the model (roboscape, genie, ivideogpt, irasim, cogvideox), with the settings that both have."""
     store: Path | None = None
     """A store of clips made by experiments.ingest, to train on instead of simulated clips."""
 

@@ -21,7 +21,7 @@ class Options:
     """
 
     what: tyro.conf.Positional[str] = tyro.MISSING
-    """A store of clips, or a format: agibot, lerobot, robomimic, libero, rlds, bair, folder, sim."""
+    """A store of clips, or a format: agibot, lerobot, robomimic, libero, rlds, bair, folder, npz, sim."""
     path: tyro.conf.Positional[Path | None] = None
     """Path of the data set of that format."""
     option: tuple[str, ...] = ()

@@ -95,8 +95,9 @@ class LoopConfig:
     # A run directory, or one made by python -m rsjax.convert, whose weights training starts from. With it, steps may be
     # 0, which uses the weights unchanged. The content key covers the path, not the files.
     start_from: str = ""
-    # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored). Empty: all
-    # clips of this run for ``steps`` steps. rsjax/config/curriculum.py says how a stage is written on the command line.
+    # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored; commands refuse
+    # a change of it). Empty: all clips of this run for ``steps`` steps. rsjax/config/curriculum.py says how a stage is
+    # written on the command line.
     curriculum: tuple[CurriculumStageConfig, ...] = ()
     restarts: tuple[int, ...] = ()  # steps at which the learning rate schedule starts again; set by stages
     # How many steps with a loss or gradient that is not finite are skipped before training stops.

@@ -1,6 +1,6 @@
 """Measures how exact Lucas–Kanade tracks and depth colours are on a simulator's clips, as docs/annotate.md reports.
 
-python -m tests.ingest.annotators.track_accuracy data/lift-c117ee71e3e53484 --split test
+python -m tests.ingest.annotators.track_accuracy data/lift-ff4aeba8a88b318e --split test
 """
 
 import argparse
