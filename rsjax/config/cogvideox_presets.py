@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from rsjax.config.cogvideox import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
-from rsjax.config.run import Config
+from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
@@ -42,6 +42,7 @@ def _cogvideox(name: str, model: CogVideoXConfig) -> Config:
             checkpoint_every=500,
             eval_every=1000,
         ),
+        eval=FULL_SIZE_EVAL,
     )
 
 

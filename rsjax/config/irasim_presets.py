@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from rsjax.config.diffusion import DenoiseConfig
 from rsjax.config.irasim import IRASimConfig, KLConfig
-from rsjax.config.run import Config
+from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
@@ -50,6 +50,7 @@ def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
             checkpoint_every=1000,
             eval_every=10_000,
         ),
+        eval=FULL_SIZE_EVAL,
     )
 
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig
-from rsjax.config.run import Config
+from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
@@ -41,6 +41,7 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
         train=LoopConfig(steps=100_000, batch_size=64, optimizer=cosine),
+        eval=FULL_SIZE_EVAL,
     )
     return config.with_loops(log_every=100, checkpoint_every=1000, eval_every=5000)
 

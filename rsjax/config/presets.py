@@ -26,6 +26,7 @@ from rsjax.config.curriculum import parse_stage
 from rsjax.config.irasim_presets import irasim_b, irasim_l, irasim_s, irasim_xl
 from rsjax.config.ivideogpt_presets import ivideogpt_64, ivideogpt_256
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
+from rsjax.config.run import FULL_SIZE_EVAL
 from rsjax.errors import did_you_mean
 
 
@@ -225,7 +226,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             checkpoint_every=1000,
             eval_every=5000,
         ),
-        eval=EvalConfig(clips=1200, repetitions=5),  # the authors' numbers
+        eval=FULL_SIZE_EVAL,
     )
 
 

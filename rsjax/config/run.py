@@ -45,6 +45,9 @@ class EvalConfig:
         )
 
 
+FULL_SIZE_EVAL = EvalConfig(clips=1200, repetitions=5)  # the authors' numbers, for every family's full-size presets
+
+
 @dataclass(frozen=True)
 class Config:
     """Everything that one run depends on. Built from a preset; never changed while it runs.

@@ -42,6 +42,12 @@ def test_full_size_presets_are_the_papers_setting(name: str) -> None:
     assert (network.action_inputs > 0) == (dual or name.endswith("actions"))
 
 
+def test_full_size_presets_of_every_family_are_scored_alike() -> None:
+    full_size = [each for name, each in presets.PRESETS.items() if not name.endswith(("debug", "tiny", "multitask"))]
+    assert {each.model.family for each in full_size} == {"roboscape", "genie", "ivideogpt", "irasim", "cogvideox"}
+    assert {(each.eval.clips, each.eval.repetitions) for each in full_size} == {(1200, 5)}
+
+
 def test_the_public_genie_has_heads_of_32_and_64() -> None:
     networks = [Architecture.create(presets.get(name)) for name in ("genie_35m", "genie_138m")]
     assert [network.head_width for network in networks] == [32, 64]
