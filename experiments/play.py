@@ -24,7 +24,7 @@ class Options:
     split: Literal["test", "train"] = "test"
     """The clips to begin with."""
     policy: Path | None = None
-    """A policy that can take the stick, made by experiments.policy_learning."""
+    """A policy that can take over the controls, made by experiments.policy_learning."""
     host: str = "127.0.0.1"
     """The address to listen at; any but this machine's own demands a token, which is printed with the address."""
     port: int = 8642

@@ -66,8 +66,7 @@ def irasim_tiny(base: Config) -> Config:
             optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
         ),
         model=IRASimConfig(
-            # The convolutions of tiny's tokenizer as it is now, with two thirds of the parameters and half of the
-            # operations of those that it had when this model was planned (docs/baselines.md).
+            # The convolutions of tiny's tokenizer.
             autoencoder=KLConfig(
                 network="magvit2",
                 latent_channels=16,
