@@ -149,6 +149,8 @@ def of_run(config: Config) -> Protocol:
 def find(name: str, config: Config) -> Protocol:
     """Returns a protocol; a preset that asks for more clips or repetitions than the protocol gets them.
 
+    A protocol of several samples keeps its own counts, which belong to what was published.
+
     Raises:
         UserError: there is none of this name.
     """
@@ -158,6 +160,8 @@ def find(name: str, config: Config) -> Protocol:
         known = (*PROTOCOLS, OWN)
         raise UserError(f"unknown protocol {name!r}{did_you_mean(name, known)} (protocols: {', '.join(known)})")
     found, settings = PROTOCOLS[name], config.eval
+    if found.samples > 1:
+        return found
     repetitions = max(found.repetitions, settings.repetitions)
     return replace(found, clips=max(found.clips, settings.clips), repetitions=repetitions)
 

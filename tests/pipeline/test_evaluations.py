@@ -212,6 +212,11 @@ def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
     assert not late.keys() & find("paper", tiny).described().keys(), "keys of results from before these fields stay"
 
 
+def test_a_full_size_preset_raises_the_clips_but_not_those_of_several_samples() -> None:
+    full_size = presets.get("ivideogpt_64")
+    assert [find(name, full_size).clips for name in ("paper", "ivideogpt-bair")] == [1200, 256]
+
+
 def test_a_comparison_of_a_run_with_itself(
     run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
