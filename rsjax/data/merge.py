@@ -134,6 +134,9 @@ def _copies(
 
 def _write_part(store: Store, numbers: Numbers, out: Path, key: str) -> None:
     meta = {name: value for name, value in store.manifest.items() if name not in (*OF_WHOLE, "action_count")}
+    if store.manifest.get("success_share") is not None:
+        ends = [store.source(name)[number]["success"][-1] for name in store.splits for number in numbers[name]]
+        meta["success_share"] = sum(map(bool, ends)) / len(ends)
     labelled = _labelled([store])
     splits = {name: _copies([(store, name, numbers[name])], labelled, {}) for name in store.splits}
     write_store(out, store.manifest["kind"], splits, meta | {"key": key}, _words if labelled else None)

@@ -14,6 +14,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.policies.diffusion_policy import Range
+from rsjax.progress import note
 
 Only = Literal["success", "all"]
 
@@ -54,8 +55,10 @@ class Demos:
         """Returns the first of them.
 
         Raises:
-            UserError: there are fewer.
+            UserError: there are fewer, or none is asked for.
         """
+        if count < 1:
+            raise UserError(f"{count} demonstrations are asked for; it takes 1 at least")
         if count > len(self):
             raise UserError(f"{count} demonstrations are asked for, there are {len(self)}; make more, or ask for fewer")
         return Demos(self.records[:count], self.controls)
@@ -81,7 +84,7 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
     Raises:
         UserError: the store has none.
     """
-    labelled = only == "success" and store.manifest.get("success_share") is not None
+    labelled = chooses(store, only)
     records: list[Record] = []
     controls = 1
     for split in splits:
@@ -96,6 +99,14 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
         )
     order = np.random.default_rng(seed).permutation(len(records))
     return Demos(tuple(records[number] for number in order), controls)
+
+
+def chooses(store: Store, only: Only) -> bool:
+    """Returns whether only clips that end in success count; notes that all do where the store does not say which."""
+    known = store.manifest.get("success_share") is not None
+    if only == "success" and not known:
+        note(f"{store.path}: does not say which of its clips end in success, so all of them are taken")
+    return only == "success" and known
 
 
 def controls_of(clip: Record, manifest: dict[str, Any]) -> int:

@@ -21,7 +21,7 @@ from rsjax.errors import UserError
 from rsjax.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.files import disk_guard, making, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
-from rsjax.policies.demos import Only, controls_of
+from rsjax.policies.demos import Only, chooses, controls_of
 from rsjax.policies.judge_validation import summary
 from rsjax.policies.keys import arrays_key, judge_key, model_key
 from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
@@ -210,7 +210,7 @@ def choose_clips(store: Store, options: Synthesis) -> list[int]:
         UserError: there is none.
     """
     source = store.source(options.split)
-    labelled = options.only == "success" and store.manifest.get("success_share") is not None
+    labelled = chooses(store, options.only)
     order = np.random.default_rng(options.seed).permutation(len(source)).tolist()
     chosen = []
     for number, clip in readable(source, order):

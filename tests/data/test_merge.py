@@ -48,6 +48,7 @@ def test_a_split_by_label_holds_each_record_once_and_merges_back(tmp_path: Path)
     }
     for store in parts.values():
         assert store.manifest["action_mean"] == whole.manifest["action_mean"]
+        assert store.manifest["success_share"] == 0
         assert_labels_are_those_of_the_records(store)
     back = merge(list(parts), tmp_path / "b")
     assert sorted(numbers(back)) == list(range(7))

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
 from rsjax.config.policy import PolicyConfig, policy_preset, public, toy
+from rsjax.data.merge import into_parts, merge, split
+from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.policies import training
 from rsjax.policies.ddpm import add_noise, cosine_schedule
@@ -23,7 +25,7 @@ from rsjax.policies.policy import Actor, Policy, load_policy
 from rsjax.policies.training import train_policy
 from rsjax.policies.unet1d import Conv, Double, spatial_softmax, step_embedding
 from rsjax.trainable import StepContext
-from tests.policies.toy import CONTROLS, SIZE, WIDTH, demos, picture
+from tests.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, demos, picture
 
 CONTEXT = StepContext(jnp.int32(0), None, None)
 
@@ -212,14 +214,24 @@ def test_impossible_settings_are_named() -> None:
         policy_preset("tinyy")
 
 
-def test_demos_that_succeed_are_chosen(tmp_path: Path) -> None:
-    from tests.policies.toy import demo_store
-
+def test_demos_that_succeed_are_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store = demo_store(tmp_path / "store")
     found = load_demos(store, store.splits)
     assert (len(found), len(load_demos(store, store.splits, "all"))) == (4, 6)
     assert (found.controls, found.width, found.image_size) == (CONTROLS, WIDTH, SIZE)
     with pytest.raises(UserError, match="9 demonstrations are asked for, there are 4"):
         found.first(9)
+    for none in (0, -3):
+        with pytest.raises(UserError, match=f"{none} demonstrations are asked for; it takes 1 at least"):
+            found.first(none)
     with pytest.raises(UserError, match="cannot be mixed"):
         found + Demos(found.records, 1)
+    parts = split(store.path, into_parts(store.path, 2, tmp_path)).values()
+    assert sum(len(load_demos(part, part.splits)) for part in parts) == 4
+    assert not capsys.readouterr().out
+    place = store.path / "manifest.json"
+    place.write_text(json.dumps(json.loads(place.read_text()) | {"success_share": None}))
+    unlabelled = open_store(store.path)
+    merged = merge([unlabelled.path, *(part.path for part in parts)], tmp_path / "merged")
+    assert len(load_demos(merged, merged.splits)) == 12
+    assert "merged: does not say which of its clips end in success, so all of them" in capsys.readouterr().out
