@@ -1,10 +1,11 @@
-"""Checks the actions that somebody's policy gives to an environment."""
+"""Checks the actions that somebody's policy gives to an environment, and that a world model reads them."""
 
 from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from rsjax.config.model import ModelConfig
 from rsjax.errors import UserError
 
 OutOfRange: TypeAlias = Literal["clip", "refuse"]
@@ -12,6 +13,15 @@ OutOfRange: TypeAlias = Literal["clip", "refuse"]
 
 class ActionError(UserError):
     """An action of the wrong shape, with a value that is not finite, or out of range. The message says which."""
+
+
+def check_takes_actions(model: ModelConfig, name: str = "the model") -> None:
+    """Raises :class:`UserError` unless what a model generates depends on actions."""
+    if not model.takes_actions:
+        raise UserError(
+            f"{name} takes no actions (family {model.family!r}), so its videos do not show what actions do; take a run "
+            f"whose model does"
+        )
 
 
 def checked_actions(

@@ -20,6 +20,7 @@ from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
 from rsjax.files import parse_json, write_file, write_json
 from rsjax.models.trained import TrainedModel
+from rsjax.policies.actions import check_takes_actions
 from rsjax.policies.energies import Score, Seen, imagined, judged, lpips_distance, pixel_distance, token_distance
 from rsjax.policies.judge_validation import markdown, summary
 from rsjax.policies.judging import saved_judge
@@ -168,11 +169,12 @@ def compare(
         policies: further ways to act, by name.
 
     Raises:
-        UserError: the run is of recordings, or something that the energy needs is missing.
+        UserError: the run is of recordings, its model takes no actions, or something that the energy needs is missing.
     """
     config = trained.config
     if config.data.key:
         raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
+    check_takes_actions(config.model, f"{run}: the model")
     policies = policies or {}
     others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
     ways = actors(trained, run, settings, others)

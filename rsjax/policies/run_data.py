@@ -15,6 +15,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load, load_config
+from rsjax.policies.actions import check_takes_actions
 from rsjax.policies.demos import Demos, Only, load_demos
 from rsjax.policies.episodes import action_range
 from rsjax.policies.judge import load_judge
@@ -70,8 +71,9 @@ class RunData:
         """Returns the run's world model as a world of ``count`` episodes, with the run's judge or another one's folder.
 
         Raises:
-            UserError: the run is unfinished, or there is no judge for its frames.
+            UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
         """
+        check_takes_actions(self.config.model, f"{self.run}: the model")
         low, high, _ = action_range(self.config, self.trained.assets.normalization)
         return Imagined(self.trained, count, self.judge(judge), low, high)
 
@@ -79,8 +81,10 @@ class RunData:
         """Checks, without loading weights, that policies can act in the run's model, on clips like another run's.
 
         Raises:
-            UserError: it is unfinished, its family cannot generate frame by frame, or frames or actions differ.
+            UserError: it is unfinished, takes no actions, its family cannot generate frame by frame, or frames or
+                actions differ.
         """
+        check_takes_actions(self.config.model, f"{self.run}: the model")
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
         if type(create_model(self.config)).imagine is WorldModel.imagine:
             raise UserError(

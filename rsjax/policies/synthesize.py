@@ -21,6 +21,7 @@ from rsjax.errors import UserError
 from rsjax.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.files import disk_guard, making, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
+from rsjax.policies.actions import check_takes_actions
 from rsjax.policies.demos import Only, chooses, controls_of
 from rsjax.policies.judge_validation import summary
 from rsjax.policies.keys import arrays_key, judge_key, model_key
@@ -148,6 +149,7 @@ def _generate(
 
 def _check_fits(clip: Record, store: Store, trained: TrainedModel, options: Synthesis) -> None:
     """Raises UserError unless the model takes clips like this one, and they have what the exports need."""
+    check_takes_actions(trained.config.model)
     size, width = trained.config.clips.image_size, len(trained.assets.normalization.action_std)
     if clip["actions"].shape[1] != width:
         raise UserError(f"{store.path}: actions of {clip['actions'].shape[1]} numbers, the model takes {width}")

@@ -185,3 +185,6 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
         compare(model, tmp_path, replace(settings, energy="judge"))
     with pytest.raises(ConfigError, match="needs lpips_weights"):
         replace(settings, energy="lpips")
+    still: Any = replace(model.config.model, action_encoder="none")  # type: ignore[call-arg]
+    with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
+        compare(replace(model, config=replace(model.config, model=still)), tmp_path, settings)

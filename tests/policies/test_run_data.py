@@ -28,6 +28,12 @@ def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path:
     other = run(tmp_path / "other", config.with_family("irasim"))
     with pytest.raises(UserError, match="other: a model of family 'irasim' cannot generate frame by frame"):
         other.check_world(first)
+    without = config.with_family("genie")
+    without = replace(without, model=replace(without.model, action_encoder="none"))  # type: ignore[call-arg]
+    still = run(tmp_path / "still", without)
+    for act in (lambda: still.check_world(first), lambda: still.world(5)):
+        with pytest.raises(UserError, match=r"still: the model takes no actions \(family 'genie'\)"):
+            act()
     small = run(
         tmp_path / "small", replace(config, sim=replace(config.sim, control_steps=config.sim.control_steps + 1))
     )

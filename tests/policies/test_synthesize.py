@@ -37,7 +37,7 @@ def trained(store: Any, fails_at: int = -1, weight: float = 1.0) -> Any:
         rgb = np.stack([[picture(place) for place in row] for row in np.rint(places)])
         return Video(rgb, np.full(rgb.shape[:-1], 0.5, np.float32))
 
-    clips, family = SimpleNamespace(image_size=SIZE), SimpleNamespace(family="toy")
+    clips, family = SimpleNamespace(image_size=SIZE), SimpleNamespace(family="toy", takes_actions=True)
     config = SimpleNamespace(prompt_frames=1, clips=clips, tokenizer=None, model=family)
     assets = SimpleNamespace(normalization=Normalization.create(store), tokenizer=None)
     return SimpleNamespace(
@@ -123,6 +123,10 @@ def test_what_cannot_be_made_is_named(tmp_path: Path, store: Any) -> None:
     other = trained(store)
     other.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None), tokenizer=None)
     with pytest.raises(UserError, match="actions of 6 numbers, the model takes 7"):
+        synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
+    other = trained(store)
+    other.config.model.takes_actions = False
+    with pytest.raises(UserError, match=r"the model takes no actions \(family 'toy'\), so its videos do not show"):
         synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
     other = trained(store)
     other.config.clips.image_size = 64
