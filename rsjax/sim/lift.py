@@ -150,22 +150,13 @@ class LiftSim(MujocoSim):
 
     @property
     def object_width(self) -> float:
-        return self.cube_width
+        """Returns the length of the cube's edges in metres."""
+        return 2 * float(self._model.geom_size[self._model.body_geomadr[self._cube_id], 0])
 
     @property
     def object_bodies(self) -> Int32[np.ndarray, " N"]:
         """Returns the body ids of the objects in :meth:`segment` and :meth:`body_poses`."""
         return np.array([self._cube_id], np.int32)
-
-    @property
-    def cube_body(self) -> int:
-        """Returns the cube's body id in :meth:`segment` and :meth:`body_poses`."""
-        return self._cube_id
-
-    @property
-    def cube_width(self) -> float:
-        """Returns the length of the cube's edges in metres."""
-        return 2 * float(self._model.geom_size[self._model.body_geomadr[self._cube_id], 0])
 
 
 def _compute_once(sim: Any) -> None:

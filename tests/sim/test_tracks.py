@@ -100,23 +100,23 @@ def test_a_track_on_the_cube_agrees_with_an_independent_projection(sim: LiftSim,
     """The visible top face: a point of it placed by hand from the cube's pose, projected with the camera's matrix."""
     matrix = camera_matrix(sim)  # the camera stands still
     snapshots, (_, view, bodies) = [m[0] for m in moments], moments[0]
-    offset = np.array([0, 0, sim._model.geom_size[sim._model.body_geomadr[sim.cube_body]][2]])
+    offset = np.array([0, 0, sim._model.geom_size[sim._model.body_geomadr[sim.object_bodies[0]]][2]])
 
     def by_hand(shot: Snapshot, local: np.ndarray) -> np.ndarray:
-        world = shot.positions[sim.cube_body] + shot.rotations[sim.cube_body] @ local
+        world = shot.positions[sim.object_bodies[0]] + shot.rotations[sim.object_bodies[0]] @ local
         x, y, z = matrix @ np.append(world, 1)
         return np.array([x / z, y / z])  # pixels
 
     start = by_hand(snapshots[0], offset)
     pixel = start.astype(int)[None, ::-1]
-    assert bodies[tuple(pixel[0])] == sim.cube_body
+    assert bodies[tuple(pixel[0])] == sim.object_bodies[0]
     tracks, visible = track(pixel, view.depth, bodies, snapshots)
     assert visible[0, 0]
     # the tracked point is the pixel's centre: the same face, beside the face's centre by less than a pixel's diagonal
     shift = pixel[0, ::-1] + 0.5 - start
-    camera, cube = snapshots[0].camera, snapshots[0].rotations[sim.cube_body]
+    camera, cube = snapshots[0].camera, snapshots[0].rotations[sim.object_bodies[0]]
     world = camera.unproject((pixel[0, ::-1] + 0.5) / SIZE, view.depth[tuple(pixel[0])].astype(float))
-    local = cube.T @ (world - snapshots[0].positions[sim.cube_body])
+    local = cube.T @ (world - snapshots[0].positions[sim.object_bodies[0]])
     assert local[2] == pytest.approx(offset[2], abs=1e-3), "depth puts the point on the top face"
     assert np.abs(shift).max() <= 0.5
     for t, shot in enumerate(snapshots):
@@ -126,7 +126,7 @@ def test_a_track_on_the_cube_agrees_with_an_independent_projection(sim: LiftSim,
 
 def test_visible_tracks_lie_on_their_body_and_hidden_ones_do_not(sim: LiftSim, moments) -> None:
     _, view, bodies = moments[0]
-    pixels = object_pixels(bodies, sim.movable, sim.cube_body, 256, np.random.default_rng(0))
+    pixels = object_pixels(bodies, sim.movable, sim.object_bodies, 256, np.random.default_rng(0))
     tracks, visible = track(pixels, view.depth, bodies, [m[0] for m in moments])
     assert visible[:, 0].all()
     np.testing.assert_allclose(tracks[:, 0], (pixels[:, ::-1] + 0.5) / SIZE, atol=1e-5)
@@ -145,7 +145,7 @@ def test_visible_tracks_lie_on_their_body_and_hidden_ones_do_not(sim: LiftSim, m
 
 def test_pictures_are_upright_and_in_colour(sim: LiftSim, moments) -> None:
     _, view, bodies = moments[0]
-    cube = bodies == sim.cube_body
+    cube = bodies == sim.object_bodies[0]
     red, green, blue = view.rgb[cube].mean(0)
     assert red > 2 * max(green, blue), "RGB order"
     assert np.argwhere(sim.movable[bodies] & ~cube)[:, 0].mean() < np.argwhere(cube)[:, 0].mean(), (
