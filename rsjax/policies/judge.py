@@ -163,20 +163,21 @@ def spoilt(
 ) -> UInt8[np.ndarray, "B F H W 3"]:
     """Returns histories that nobody can interpret, each spoilt in one of four ways.
 
+    Blocks and blur leave a border where 8 does not divide the side.
+
     Args:
         others: histories of other videos, one of which may be put on top.
     """
-    size = frames.shape[2]
-    edge = size // 8
-    blocks = frames.reshape(*frames.shape[:2], 8, edge, 8, edge, 3).swapaxes(3, 4)
-    shuffled = blocks.reshape(*frames.shape[:2], 64, edge, edge, 3)[:, :, rng.permutation(64)]
-    shuffled = shuffled.reshape(blocks.shape).swapaxes(3, 4).reshape(frames.shape)
+    edge = frames.shape[2] // 8
+    size, lead = 8 * edge, frames.shape[:2]
+    inner, shuffled, blurred = frames[:, :, :size, :size], frames.copy(), frames.astype(float)
+    blocks = inner.reshape(*lead, 8, edge, 8, edge, 3).swapaxes(3, 4)
+    mixed_up = blocks.reshape(*lead, 64, edge, edge, 3)[:, :, rng.permutation(64)]
+    shuffled[:, :, :size, :size] = mixed_up.reshape(blocks.shape).swapaxes(3, 4).reshape(inner.shape)
+    means = inner.reshape(*lead, 4, size // 4, 4, size // 4, 3).mean((3, 5), keepdims=True)
+    blurred[:, :, :size, :size] = means.repeat(size // 4, 3).repeat(size // 4, 5).reshape(inner.shape)
     mixed = (frames.astype(np.float32) + others) / 2
     noisy = frames + rng.normal(0, rng.uniform(50, 110), frames.shape)
-    blurred = np.broadcast_to(
-        frames.reshape(*frames.shape[:2], 4, size // 4, 4, size // 4, 3).mean((3, 5), keepdims=True),
-        (*frames.shape[:2], 4, size // 4, 4, size // 4, 3),
-    ).reshape(frames.shape)
     kind = rng.integers(4, size=(len(frames), 1, 1, 1, 1))
     out = np.select([kind == 0, kind == 1, kind == 2], [shuffled, mixed, noisy], blurred)
     return np.clip(np.round(out), 0, 255).astype(np.uint8)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config.fields import require_range
-from rsjax.data.clips import readable, spread
+from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.store import Record, Store
 from rsjax.errors import UserError
 from rsjax.files import write_json
@@ -18,7 +18,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
-from rsjax.policies.judge import VALIDATION, Footage, TrainedJudge, load_judge, train_judge
+from rsjax.policies.judge import VALIDATION, Footage, load_judge, train_judge
 from rsjax.policies.judge_validation import validate
 from rsjax.policies.verdicts import Judge
 from rsjax.progress import Progress
@@ -90,19 +90,17 @@ def make_judge(
 
 def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> dict[str, Any]:
     """Validates a judge on clips as they are, as the tokenizer reconstructs them, and as the model generates them."""
-    raw, first = _footage(clips), trained.config.prompt_frames
+    held, first = Clips.stacked(clips, range(len(clips))), trained.config.prompt_frames
+    raw, video, made = Footage(held.rgb, held.success), held.video, []
     result = {"clips": len(clips), "raw": validate(judge, raw, first, spoil=True)}
-    depth = all(clip["depth"] is not None for clip in clips)
-    video = Video(raw.rgb, np.stack([clip["depth"] for clip in clips]) if depth else None)
     if (seen := _reconstructed(trained, raw.rgb)) is not None:
         result["reconstructed"] = validate(judge, Footage(seen, raw.success), first)
-    actions, made = np.stack([clip["actions"] for clip in clips]), []
     size = trained.config.eval.batch_size
     with Progress("judge's videos", len(clips), "videos") as progress:
         for start in range(0, len(clips), size):
             rows = np.minimum(np.arange(start, start + size), len(clips) - 1)  # batches of one shape
             prompt = video[rows].frames(0, first)
-            inputs = (trained.params, trained.assets, prompt, actions[rows])
+            inputs = (trained.params, trained.assets, prompt, held.actions[rows])
             made.append(trained.model.generate(*inputs, index=rows, depth=False).rgb)
             progress.update(min(start + size, len(clips)))
     generated = np.concatenate(made)[: len(clips)]
@@ -115,7 +113,7 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
     records = [clip for _, clip in readable(source, spread(source, settings.clips))]
     if len(records) < 2:
         raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
-    raw = _footage(records)
+    raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
     seen = _reconstructed(trained, raw.rgb[: settings.reconstructed])
     rgb = raw.rgb if seen is None else np.concatenate([raw.rgb, seen])
     success = raw.success if seen is None else np.concatenate([raw.success, raw.success[: len(seen)]])
@@ -125,22 +123,9 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
     return Footage(rgb[~held], success[~held]), Footage(rgb[held], success[held])
 
 
-def _footage(clips: Sequence[Record]) -> Footage:
-    return Footage(np.stack([clip["rgb"] for clip in clips]), np.stack([clip["success"] for clip in clips]))
-
-
 def _reconstructed(trained: TrainedModel, rgb: np.ndarray) -> np.ndarray | None:
     """Returns the tokenizer's reconstructions of videos; None for a family without a tokenizer."""
     if not len(rgb):
         return None
     video = trained.model.reconstruct(trained.assets, Video(rgb))
     return None if video is None else video.rgb
-
-
-def saved_judge(run: Path) -> TrainedJudge:
-    """Returns the judge that :func:`make_judge` saved in a run.
-
-    Raises:
-        UserError: there is none, or its file is damaged.
-    """
-    return load_judge(run / FOLDER)

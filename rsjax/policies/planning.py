@@ -6,7 +6,7 @@ expert reaches from the same start; it is not shown how.
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -18,12 +18,13 @@ from rsjax.config import content_key
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
-from rsjax.files import parse_json, write_file, write_json
+from rsjax.files import content_hash, parse_json, write_file, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.policies.actions import check_takes_actions
 from rsjax.policies.energies import Score, Seen, imagined, judged, lpips_distance, pixel_distance, token_distance
+from rsjax.policies.judge import load_judge
 from rsjax.policies.judge_validation import markdown, summary
-from rsjax.policies.judging import saved_judge
+from rsjax.policies.judging import FOLDER
 from rsjax.policies.keys import judge_key, model_key
 from rsjax.policies.planner import Planner, PlannerConfig
 from rsjax.policies.policy import Policy
@@ -98,10 +99,10 @@ def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UIn
     """Returns the score that a planner minimises.
 
     Raises:
-        UserError: the run has no judge or no tokens, or the weights are missing or damaged.
+        UserError: the run has no judge for its frames or no tokens, or the weights are missing or damaged.
     """
     if settings.energy == "judge":
-        return judged(saved_judge(run))
+        return judged(load_judge(run / FOLDER, len(goal)))
     if settings.energy == "tokens":
         return token_distance(trained, goal)
     return pixel_distance(goal) if settings.energy == "pixels" else lpips_distance(Path(settings.lpips_weights), goal)
@@ -181,9 +182,10 @@ def compare(
     score_of(
         trained, run, settings, np.zeros((config.sim.image_size,) * 2 + (3,), np.uint8)
     )  # fails before episodes do
-    judge = saved_judge(run) if settings.energy == "judge" else None
+    judge = load_judge(run / FOLDER) if settings.energy == "judge" else None
+    lpips = content_hash(Path(settings.lpips_weights)) if settings.energy == "lpips" else ""
     used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
-    key = content_key("plan", settings, config.sim, tuple(ways), used)
+    key = content_key("plan", replace(settings, lpips_weights=lpips), config.sim, tuple(ways), used)
     place, validation = folder(run, key), judge.validation if judge else None
     done = _kept(place / "result.json", key)
     env = LiftEnv(config.sim, settings.max_steps)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from rsjax.clip import Video
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.policies import judging
@@ -87,6 +88,15 @@ def test_every_history_is_spoilt_and_in_several_ways() -> None:
     assert changed.min() > 1 and changed.max() > 10 * changed.min()
 
 
+def test_frames_whose_side_is_no_multiple_of_8_are_spoilt_but_for_a_border() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (40, HISTORY, 21, 21, 3), np.uint8)
+    made = spoilt(frames, frames[::-1], np.random.default_rng(1))
+    changed = made != frames
+    assert changed[:, :, :16, :16].any((1, 2, 3, 4)).all()
+    border = changed[:, :, 16:].any((1, 2, 3, 4)) | changed[:, :, :, 16:].any((1, 2, 3, 4))
+    assert 0.25 < border.mean() < 0.75, "blocks and blur leave it"
+
+
 def test_scores_agree_with_a_count_by_hand() -> None:
     sure = np.array([[0.9, 0.1, 0.0], [0.7, 0.2, 0.1], [0.1, 0.6, 0.3], [0.2, 0.2, 0.6]])
     result = scores(sure, np.array([0, 1, 1, 1]))
@@ -118,10 +128,28 @@ def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.Monk
         "reconstructed": toy.TEST * 5,
         "generated": toy.TEST * 5,
     }
-    loaded = judging.saved_judge(run)
+    loaded = load_judge(run / judging.FOLDER)
     assert loaded.validation == json.loads((run / "judge" / "validation.json").read_text()) and loaded.validation
     assert judging.judge_of(run, "run", 64).temperature == loaded.temperature  # type: ignore[union-attr]
     assert judging.judge_of(tmp_path, "run", 64) is None
+
+
+def test_a_judge_is_validated_on_videos_of_the_clips_tasks_and_depth() -> None:
+    clips = [vars(toy.clip(number, success=True)) for number in range(3)]
+    clips[1]["depth"] = None
+    prompts: list[Video] = []
+
+    def generate(params: Any, assets: Any, prompt: Video, actions: np.ndarray, index: Any, depth: bool) -> Video:
+        prompts.append(prompt)
+        return Video(prompt.rgb.repeat(actions.shape[1], 1))
+
+    model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: None)
+    config = SimpleNamespace(prompt_frames=1, eval=SimpleNamespace(batch_size=2))
+    trained: Any = SimpleNamespace(config=config, model=model, params=None, assets=None)
+    result = judging.validation(trained, lambda frames: np.tile([0.5, 0.3, 0.2], (len(frames), 1)), clips)
+    assert "reconstructed" not in result and np.sum(result["generated"]["confusion"]) == 3 * 5
+    assert prompts[0].tasks is not None and prompts[0].tasks.tolist() == ["drift", "drift"]
+    assert prompts[0].depth is not None and np.isnan(prompts[0].depth).all((1, 2, 3)).tolist() == [False, True]
 
 
 def test_a_success_ends_an_episode_with_a_reward(tmp_path: Path, store_env: Store) -> None:

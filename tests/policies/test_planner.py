@@ -178,6 +178,13 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
         assert other["ways"]["policy a/b"]["success"] == 1
         assert (folder(tmp_path, other["key"]) / "policy a-b-00.mp4").exists()
         assert len(list((tmp_path / "plan").iterdir())) == 2 + number
+    monkeypatch.setattr(planning, "lpips_distance", lambda weights, goal: None)
+    keys = []
+    for name, content in (("a", b"1"), ("b", b"1"), ("a", b"2")):  # weights count by their content
+        (tmp_path / name).write_bytes(content)
+        lpips = replace(one, energy="lpips", lpips_weights=str(tmp_path / name))
+        keys.append(compare(model, tmp_path, lpips)["key"])
+    assert keys[0] == keys[1] != keys[2]
     monkeypatch.setattr(planning, "LiftEnv", lambda *_: FakeLift(None, 0))  # it would fail
     assert compare(model, tmp_path, settings) == result
     assert (place / "result.json").read_text() == saved
