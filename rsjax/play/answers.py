@@ -103,7 +103,7 @@ async def _step(viewer: Viewer, message: Message) -> Message:
         given = await viewer.sourced(branch, source)
     action, clipped = session.run.controls.action(given)
     frame = await session.step(branch.number, action)
-    viewer.sources.acted(branch)
+    viewer.sources.acted(branch, source)
     await viewer.show(branch.number, frame, message["id"])
     node = branch.nodes[frame]
     facts = {"branch": branch.number, "frame": frame, "action": [round(float(x), 6) for x in action]}

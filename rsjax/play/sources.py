@@ -62,10 +62,11 @@ class Sources:
             acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
         return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)
 
-    def acted(self, branch: Branch) -> None:
-        """Says that the last action led into the branch's last frame."""
-        if branch.number in self.acting:
-            self.acting[branch.number].last = branch.nodes[-1]
+    def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
+        """Says that an action of this source, None for a person's, led into the branch's last frame."""
+        acting = self.acting.get(branch.number)
+        if acting is not None and source is not None and source["kind"] == acting.kind:
+            acting.last = branch.nodes[-1]
 
     def _of_clip(self, session: Session, source: dict[str, Any], frame: int) -> Float[np.ndarray, " A"]:
         if "clip" in source:

@@ -1,7 +1,11 @@
 """Driving, branching and coming back, over a real socket with a fake model."""
 
 import io
+import itertools
 import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +60,21 @@ def test_a_clips_own_actions_are_taken_until_it_ends(server: Server, run: PlayRu
         assert page.ask("step", branch=0, source={"kind": "clip"})["error"] == "no_action"
         other = page.ask("step", branch=0, source={"kind": "clip", "clip": 3})
         np.testing.assert_allclose(other["action"], np.clip(run.clip(3)["actions"][1], low, high), atol=1e-6)
+
+
+def test_a_policy_begins_anew_after_a_person_steered(
+    server: Server, run: PlayRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def actor(seed: int) -> Callable[[np.ndarray], np.ndarray]:
+        count = itertools.count(1)
+        return lambda rgb: np.full((1, run.controls.width), next(count) / 10)
+
+    monkeypatch.setitem(run.__dict__, "policy", SimpleNamespace(actor=actor))
+    policy: dict[str, Any] = {"source": {"kind": "policy"}}
+    with server.client() as (page, _):
+        page.ask("start", clip=0)
+        made = [page.ask("step", branch=0, **each) for each in (policy, policy, {"action": [0] * 7}, policy, policy)]
+        assert [each["action"][0] for each in made] == [0.1, 0.2, 0.0, 0.1, 0.2]
 
 
 def test_a_fork_repeats_its_parent_under_the_same_actions_and_differs_with_new_draws(server: Server) -> None:
