@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rsjax.config import SimConfig
-from rsjax.errors import UserError, first_line
+from rsjax.errors import first_line
 from rsjax.play.errors import Refused
 from rsjax.play.simulate import Job, Rendered, Simulate, simulate
 from rsjax.play.tree import Node, Truth
@@ -91,7 +91,7 @@ class Follower:
             self._helper = None
             self._applied = []
             raise Refused("no_truth", "the simulator does not answer; it begins again with the next frame") from error
-        except (UserError, ArithmeticError, ImportError) as error:
+        except Exception as error:  # a simulator's own; the action may have been taken
             self._applied = []
             raise Refused("no_truth", first_line(error)) from error
 

@@ -78,6 +78,12 @@ def test_a_simulator_that_dies_or_diverges_does_not_end_the_dream(server: Server
             page.ask("start", clip=1)
         drive(page, 0, 0.25)
         assert page.until_pushed("truth", 2)[-1]["frame"] == 1
+        drive(page, 0, 0.625)
+        page.until_pushed("truth_off", 1)
+        drive(page, 0, 0.0625)
+        page.until_pushed("truth", 4)
+        truths = [int(rgb(each)[0, 0, 0]) for each in page.until(3, 4)]
+        assert truths[-2:] == [88, 94], "no action is taken twice"
 
 
 def test_one_viewer_more_than_simulators_is_told_so(server: Server) -> None:
