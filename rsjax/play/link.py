@@ -96,15 +96,16 @@ def read_state(session: Session, text: object) -> Saved:
         rows = values["branches"]
         if not isinstance(rows, list) or not 0 < len(rows) <= MOST_BRANCHES:
             raise Refused("bad_state", f"the link has no branches, or more than {MOST_BRANCHES}")
-        branches = [_read_branch(session, row, place) for place, row in enumerate(rows)]
+        made = [_read_actions(session, row) for row in rows]
+        if sum(map(len, made)) >= session.limits["frames"]:
+            raise Refused("bad_state", f"the link has more than {session.limits['frames']} frames")
+        branches = [_read_branch(session, row, *each) for row, each in zip(rows, enumerate(made), strict=True)]
         seed, lanes = whole(values, "seed", 0, MOST_SEED), whole(values, "lanes", 1, 256)
         settings = session.settings.changed(values["settings"], session.limits)
     except Refused as error:
         raise Refused("bad_state", error.message) from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise Refused("bad_state", "the link is damaged") from error
-    if sum(len(branch.steps) for branch in branches) >= session.limits["frames"]:
-        raise Refused("bad_state", f"the link has more than {session.limits['frames']} frames")
     return Saved(start, seed, settings, branches, lanes)
 
 
@@ -144,9 +145,14 @@ def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:
     return facts | {"actions": base64.b64encode(actions.tobytes()).decode()}
 
 
-def _read_branch(session: Session, row: dict[str, Any], place: int) -> SavedBranch:
-    width, limits = session.run.controls.width, session.limits
-    numbers = np.frombuffer(base64.b64decode(row["actions"], validate=True), "<f4").reshape(-1, width)
+def _read_actions(session: Session, row: dict[str, Any]) -> Float32[np.ndarray, "T A"]:
+    """Returns a branch's actions as they were sent, without a check of their numbers."""
+    plain = base64.b64decode(row["actions"], validate=True)
+    return np.frombuffer(plain, "<f4").reshape(-1, session.run.controls.width)
+
+
+def _read_branch(session: Session, row: dict[str, Any], place: int, numbers: Float32[np.ndarray, "T A"]) -> SavedBranch:
+    limits = session.limits
     actions = [session.run.controls.action(action)[0] for action in numbers]
     decodings: list[Decoding] = []
     for values, count in row["how"]:

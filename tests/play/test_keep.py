@@ -14,6 +14,7 @@ import pytest
 
 from rsjax.data.store import open_store
 from rsjax.play import keep
+from rsjax.play.controls import Controls
 from rsjax.play.run_data import PlayRun
 from tests.play.client import Client, Server, serving
 from tests.play.fake import Fakes, hub_of, play_run
@@ -63,9 +64,12 @@ def test_a_link_makes_the_session_again_on_another_server(server: Server, tmp_pa
         assert page.ask("link")["state"] == link["state"]
 
 
+def unpacked(state: str) -> Any:
+    return json.loads(zlib.decompress(base64.urlsafe_b64decode(state + "=" * (-len(state) % 4))))
+
+
 def changed(state: str, **values: Any) -> str:
-    plain = json.loads(zlib.decompress(base64.urlsafe_b64decode(state + "=" * (-len(state) % 4))))
-    return base64.urlsafe_b64encode(zlib.compress(json.dumps(plain | values).encode())).decode()
+    return base64.urlsafe_b64encode(zlib.compress(json.dumps(unpacked(state) | values).encode())).decode()
 
 
 def test_links_that_cannot_be_are_refused(server: Server) -> None:
@@ -74,7 +78,7 @@ def test_links_that_cannot_be_are_refused(server: Server) -> None:
         page.ask("start", clip=3)
         page.drive(2)
         state = page.ask("link")["state"]
-        row = json.loads(zlib.decompress(base64.urlsafe_b64decode(state + "=" * (-len(state) % 4))))["branches"][0]
+        row = unpacked(state)["branches"][0]
         bad = [
             None, "", "%%%", state[:-9], bomb,
             changed(state, version=2), changed(state, run="0" * 16), changed(state, start={"clip": 99}),
@@ -86,6 +90,20 @@ def test_links_that_cannot_be_are_refused(server: Server) -> None:
         for each in bad:
             assert page.ask("load", state=each)["error"] == "bad_state", each
         assert page.drive(1), "what was there is still there"
+
+
+def test_a_link_of_too_many_frames_is_refused_before_its_actions_are_looked_at(
+    server: Server, run: PlayRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with server.client() as (page, welcome):
+        page.ask("start", clip=3)
+        page.drive(1)
+        state, most = page.ask("link")["state"], welcome["limits"]["frames"]
+        many = base64.b64encode(bytes(most * 2 // 3 * 4 * run.controls.width)).decode()
+        monkeypatch.setattr(Controls, "action", None)
+        rows = [unpacked(state)["branches"][0] | {"actions": many}] * 2
+        refused = page.ask("load", state=changed(state, branches=rows))
+        assert refused["error"] == "bad_state" and f"more than {most} frames" in refused["message"]
 
 
 def test_a_branch_is_recorded_with_panes_side_by_side(server: Server, run: PlayRun) -> None:
