@@ -56,12 +56,13 @@ class Connection:
             await self._socket.close(4429, error.message)
             return
         session = seat.viewer.session
-        session.out = self._outbox
-        self._outbox.put(self._hub.welcome(seat, returned))
-        if session.tree is not None:
-            self._outbox.put({"type": "session", "id": 0} | seat.viewer.describe())
-        tasks = [asyncio.create_task(work) for work in (self._read(seat), self._work(seat.viewer), self._send())]
+        tasks: list[asyncio.Task[None]] = []
         try:
+            session.out = self._outbox
+            self._outbox.put(self._hub.welcome(seat, returned))
+            if session.tree is not None:
+                self._outbox.put({"type": "session", "id": 0} | seat.viewer.describe())
+            tasks += [asyncio.create_task(work) for work in (self._read(seat), self._work(seat.viewer), self._send())]
             code, reason = await self._over
         finally:
             for task in tasks:

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -100,9 +101,11 @@ class PlayRun:
 
     @property
     def fps(self) -> float:
-        """Frames per second of the clips."""
-        rate = frame_rate(self.clip(0), self.store.manifest) if self.store and self.clips else None
-        return float(rate or FPS)
+        """Frames per second of the clips, as the first one says."""
+        if self.store is not None:
+            with suppress(Refused):  # it is damaged
+                return frame_rate(self.clip(0), self.store.manifest) or FPS
+        return FPS
 
     @cached_property
     def simulator(self) -> SimConfig | None:

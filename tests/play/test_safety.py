@@ -14,13 +14,15 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+from rsjax.data.codec import Record
+from rsjax.data.store import StoreError
 from rsjax.play.connection import BURST, STRIKES
 from rsjax.play.errors import Refused
 from rsjax.play.guard import is_loopback
 from rsjax.play.messages import TEXT_BYTES, UPLOAD_BYTES, parse
 from rsjax.play.outbox import MOST, UNSENT, Outbox
 from rsjax.play.pictures import read_picture
-from rsjax.play.run_data import PlayRun
+from rsjax.play.run_data import FPS, PlayRun
 from tests.play.client import Client, Picture, Server, serving
 from tests.play.fake import Fakes, hub_of
 
@@ -136,6 +138,26 @@ def test_the_next_session_is_told_so_and_an_idle_one_gives_way(run: PlayRun) -> 
         assert closing(one) == (4408, "nobody used this session for 2 seconds; it is freed")
         with server.client() as (page, _):
             assert page.ask("ping") and other.ask("ping")
+
+
+def test_a_damaged_first_clip_turns_nobody_away(server: Server, run: PlayRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Damaged(list[Record]):
+        def __getitem__(self, number: object) -> Record:  # type: ignore[override]
+            raise StoreError("damaged")
+
+    monkeypatch.setitem(run.__dict__, "source", Damaged([{}]))
+    with server.client() as (page, welcome):
+        assert welcome["run"]["fps"] == FPS and page.ask("start", clip=0)["error"] == "no_clip"
+
+
+def test_a_connection_that_fails_leaves_its_seat(run: PlayRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(hub_of(run, most=1)) as server:
+        with monkeypatch.context() as broken:
+            broken.setattr(server.hub, "welcome", None)
+            with pytest.raises(ConnectionClosed), server.client():
+                pass
+        with server.client() as (_, welcome):
+            assert welcome["type"] == "welcome"
 
 
 def test_a_session_opened_in_another_page_moves_there(server: Server) -> None:
