@@ -142,10 +142,11 @@ class Session:
 
     def drop(self, number: int) -> None:
         """Removes a branch from which none forks."""
-        last = self.grown.branch(number).nodes[-1]
+        branch = self.grown.branch(number)
         self.grown.drop(number)
-        self._memories.forget(last)
-        last.moment = self._lighten(last.moment)
+        if len(branch.nodes) - 1 > int(branch.fork or 0):  # otherwise its last frame is its parent's
+            self._memories.forget(branch.nodes[-1])
+            branch.nodes[-1].moment = self._lighten(branch.nodes[-1].moment)
 
     async def step(self, number: int, action: Float32[np.ndarray, " A"], decoding: Decoding | None = None) -> int:
         """Generates a branch's next frame and returns its number.

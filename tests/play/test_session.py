@@ -77,6 +77,17 @@ def test_a_policy_begins_anew_after_a_person_steered(
         assert [each["action"][0] for each in made] == [0.1, 0.2, 0.0, 0.1, 0.2]
 
 
+def test_a_branch_that_went_nowhere_leaves_its_parent_as_it_was(server: Server, fakes: Fakes) -> None:
+    with server.client() as (page, _):
+        page.ask("start", clip=0)
+        page.drive(LIGHT - 1)
+        page.ask("fork", branch=0, frame=LIGHT - 1)
+        assert page.ask("drop", branch=1)["type"] == "ok"
+        fakes.kinds[True].passes.clear()
+        page.drive(1)
+        assert fakes.kinds[True].passes == [1], "earlier frames were generated again"
+
+
 def test_a_fork_repeats_its_parent_under_the_same_actions_and_differs_with_new_draws(server: Server) -> None:
     with server.client() as (page, _):
         page.ask("start", clip=0)
