@@ -32,7 +32,7 @@ class Options:
     sessions: int = 8
     """Viewers at a time."""
     idle_minutes: float = 10.0
-    """Minutes after which a session that nobody uses is freed."""
+    """Minutes without a message or a new frame after which a session is freed; a page in view sends messages."""
     lanes: int = 1
     """Frames of different sessions that one pass generates: more on a GPU. Other numbers give other last bits."""
     out: Path | None = None

@@ -43,7 +43,7 @@ class Hub:
         run: what is played.
         engine: generates the frames of all.
         most: sessions at a time.
-        idle: seconds after which a session that nobody uses is freed.
+        idle: seconds without a message or a new frame after which a session is freed.
         grace: seconds for which one whose page is gone keeps its place when all are taken.
         truths: the simulators; by default those of the run's clips.
     """

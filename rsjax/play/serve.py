@@ -38,7 +38,7 @@ class ServeSettings:
         host: the address to listen at.
         port: 0: a free one.
         sessions: viewers at a time.
-        idle_minutes: after which a session that nobody uses is freed.
+        idle_minutes: without a message or a new frame, after which a session is freed.
         lanes: frames that one pass generates.
         browser: whether the address is opened in a browser.
     """

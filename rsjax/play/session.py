@@ -66,7 +66,7 @@ class Session:
         name: nobody can guess it.
         out: where messages go; None while no page is connected.
         watched: kinds that are pushed with each new frame.
-        used: when the last message came, in seconds of :func:`time.monotonic`.
+        used: when the last message came or the last frame was made, in seconds of :func:`time.monotonic`.
     """
 
     def __init__(self, run: PlayRun, engine: Engine, memories: Memories) -> None:
@@ -192,7 +192,9 @@ class Session:
             loop.call_soon_threadsafe(self.send, {"type": "status", "text": text, "busy": busy})
 
         work = Work(moment, action, how, self.has_depth, say)
-        return await asyncio.wrap_future(self.engine.submit(work))
+        made = await asyncio.wrap_future(self.engine.submit(work))
+        self.used = time.monotonic()
+        return made
 
     def _lighten(self, moment: Moment) -> Moment:
         return self.engine.branching(self.has_depth).lightened(moment)

@@ -160,6 +160,19 @@ def test_a_connection_that_fails_leaves_its_seat(run: PlayRun, monkeypatch: pyte
             assert welcome["type"] == "welcome"
 
 
+def test_frames_keep_a_session_that_sends_nothing(server: Server, fakes: Fakes) -> None:
+    with server.client() as (page, welcome):
+        page.ask("start", clip=0)
+        session, gate = server.hub._seats[welcome["session"]].viewer.session, fakes.kinds[True].gate
+        gate.clear()
+        before, number = session.used, page.send("step", branch=0, action=[0] * 7)
+        while session.used == before:
+            time.sleep(0.01)
+        asked = session.used
+        gate.set()
+        assert page.wait(number)["type"] == "stepped" and session.used > asked
+
+
 def test_a_session_opened_in_another_page_moves_there(server: Server) -> None:
     with server.client() as (page, welcome), server.client(f"?session={welcome['session']}") as (other, again):
         assert again["returned"] and closing(page)[0] == 4409
