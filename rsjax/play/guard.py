@@ -3,7 +3,6 @@
 import ipaddress
 import secrets
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, QueryParams
 from starlette.types import ASGIApp as App
@@ -54,13 +53,10 @@ class Guard:
 
     def wrong_origin(self, headers: Headers) -> str:
         """Returns why a socket's Origin is refused, "" if it is not; programs that are no browsers send none."""
-        origin = headers.get("origin")
-        if origin is None:
+        origin, host = headers.get("origin"), headers.get("host", "").lower()
+        if origin is None or origin.lower() in (f"http://{host}", f"https://{host}"):
             return ""
-        parts = urlsplit(origin)
-        if parts.scheme not in ("http", "https") or parts.netloc.lower() != headers.get("host", "").lower():
-            return f"pages of {origin!r:.80} cannot connect"
-        return ""
+        return f"pages of {origin!r:.80} cannot connect"
 
     def knows(self, query: QueryParams) -> bool:
         """Returns whether a request has the token."""

@@ -49,7 +49,7 @@ def refused(server: Server, query: str = "", **options: object) -> int:
 def test_pages_of_other_sites_and_other_names_are_refused(server: Server) -> None:
     assert refused(server, origin="http://evil.example") == 4403
     assert refused(server, origin=f"http://127.0.0.1:{server.port + 1}") == 4403
-    assert refused(server, origin="null") == 4403
+    assert refused(server, origin="null") == refused(server, origin="http://[") == 4403
     raw, own = socket.create_connection(("127.0.0.1", server.port)), Origin("http://evil.example")
     with connect("ws://evil.example/ws", sock=raw, origin=own) as page:  # its name was made to point here (rebinding)
         assert closing(Client(page))[0] == 4403
