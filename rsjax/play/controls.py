@@ -3,6 +3,7 @@
 Axes: D numbers of a control, k controls of a frame's action, A = k·D numbers.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -88,11 +89,11 @@ class Controls:
         return np.tile(np.array(numbers, np.float32), self.repeat)
 
 
-def controls_of_run(config: Config, normalization: Normalization, names: tuple[str, ...] = ()) -> Controls:
+def controls_of_run(config: Config, normalization: Normalization, names: Sequence[str] = ()) -> Controls:
     """Returns the controls of a run: those of its simulator, or the dimensions of a recording's actions.
 
     Args:
-        names: of the dimensions of a recording.
+        names: of the dimensions of a recording, as "gripper (held)"; "(held)" where nobody named it.
     """
     if not config.data.key:
         return Controls(_LIFT if config.sim.env == "lift" else _METAWORLD, config.sim.control_steps)
@@ -100,7 +101,9 @@ def controls_of_run(config: Config, normalization: Normalization, names: tuple[s
     mean = normalization.action_mean
     each = []
     for number, (least, most) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
-        name = names[number] if number < len(names) else f"action {number}"
+        name = names[number] if number < len(names) else ""
+        if not name or name.startswith("("):
+            name = f"action {number} {name}".strip()
         rest = 0.0 if least < 0 < most else float(mean[number])
         each.append(Control(name, name, least, most, rest, "axis", "as recorded", None))
     return Controls(tuple(each), 1)

@@ -97,7 +97,8 @@ class PlayRun:
 
     @cached_property
     def controls(self) -> Controls:
-        return controls_of_run(self.data.config, self.trained.assets.normalization)
+        names = self.store.manifest.get("action_dimensions") if self.store else None
+        return controls_of_run(self.data.config, self.trained.assets.normalization, names or ())
 
     @property
     def fps(self) -> float:

@@ -4,6 +4,7 @@ import io
 import itertools
 import threading
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rsjax.config import DataConfig
 from rsjax.play.run_data import PlayRun
 from tests.play.client import Client, Picture, Server
 from tests.play.fake import LIGHT, Fakes
@@ -86,6 +88,15 @@ def test_a_branch_that_went_nowhere_leaves_its_parent_as_it_was(server: Server, 
         fakes.kinds[True].passes.clear()
         page.drive(1)
         assert fakes.kinds[True].passes == [1], "earlier frames were generated again"
+
+
+def test_sliders_of_recordings_have_the_names_of_their_actions(run: PlayRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run.store is not None
+    config, shape = run.data.config, asdict(run.data.config.clips)
+    monkeypatch.setitem(run.data.__dict__, "config", replace(config, data=DataConfig(store="a", key="a", **shape)))
+    monkeypatch.setitem(run.store.manifest, "action_dimensions", ["x (delta)", "(held)"])
+    labels = [each.label for each in replace(run).controls.each]
+    assert labels[:3] == ["x (delta)", "action 1 (held)", "action 2"]
 
 
 def test_a_fork_repeats_its_parent_under_the_same_actions_and_differs_with_new_draws(server: Server) -> None:
