@@ -25,14 +25,14 @@ class Place(NamedTuple):
 
 def picture(kind: str, place: Place, rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
     """Returns the message of an RGB picture as WebP, lossless if it is small."""
-    return _message(kind, place, WEBP, rgb.shape, _webp(rgb), 0.0)
+    return _message(kind, place, WEBP, rgb.shape, webp(rgb), 0.0)
 
 
 def depth_picture(kind: str, place: Place, depth: Float32[np.ndarray, "H W"], near: float, far: float) -> bytes:
     """Returns the message of a depth map as a grey picture: 0 is ``near``, 255 is ``far``, linear in metres."""
     share = np.clip((np.nan_to_num(depth, nan=far) - near) / (far - near), 0, 1)
     grey = np.round(255 * share).astype(np.uint8)
-    return _message(kind, place, WEBP, grey.shape, _webp(np.repeat(grey[..., None], 3, -1)), far)
+    return _message(kind, place, WEBP, grey.shape, webp(np.repeat(grey[..., None], 3, -1)), far)
 
 
 def uncertainty(place: Place, entropy: Float[np.ndarray, " S"], bits: int) -> bytes:
@@ -44,15 +44,11 @@ def uncertainty(place: Place, entropy: Float[np.ndarray, " S"], bits: int) -> by
 
 def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
     """Returns a picture as WebP, lossless if it is small."""
-    return _webp(rgb)
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, "WEBP", lossless=len(rgb) <= LOSSLESS, quality=80, method=0)
+    return buffer.getvalue()
 
 
 def _message(kind: str, place: Place, form: int, shape: tuple[int, ...], payload: bytes, scale: float) -> bytes:
     numbers = (VERSION, KINDS[kind], place.branch, place.frame, place.id, form, 0, shape[1], shape[0], 0, scale)
     return HEADER.pack(*numbers) + payload
-
-
-def _webp(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", lossless=len(image) <= LOSSLESS, quality=80, method=0)
-    return buffer.getvalue()
