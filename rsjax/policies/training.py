@@ -12,7 +12,7 @@ from rsjax.config import LoopConfig, content_key
 from rsjax.config.policy import PolicyConfig
 from rsjax.data.loader import Loader, batches
 from rsjax.errors import UserError
-from rsjax.files import read_json, write_json
+from rsjax.files import making, read_json, write_json
 from rsjax.policies.demos import Demos
 from rsjax.policies.diffusion_policy import DiffusionPolicy, Range, Windows
 from rsjax.policies.keys import arrays_key
@@ -44,22 +44,26 @@ def train_policy(
         start: a policy to go on from, with its range of controls.
 
     Raises:
-        UserError: the directory holds a training on other data or of other settings.
+        UserError: the directory holds a training on other data or of other settings, or one that kept other stops.
+        FileError: another process trains there.
     """
     model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
     span = start.range if start else demos.range
     loop = replace(config.train, seed=seed)
     before = start.key if start else False
     key = content_key(replace(config, train=loop), *map(_content, demos.records[:1]), len(demos), str(span), before)
-    _check(directory, {"key": key, "data": arrays_key([(each["rgb"], each["actions"]) for each in demos.records])})
-    if (directory / "policy.json").exists():
-        return load_policy(directory)
-    for stop in (*sorted(set(stops)), loop.steps):
-        at = directory / f"at-{stop}"
-        if stop < loop.steps and (at / "policy.json").exists():
-            continue
-        policy = Policy(model, _fit(model, loop, demos, span, directory, name, stop, start), span)
-        policy.save(directory if stop >= loop.steps else at)
+    mark = {"key": key, "data": arrays_key([(each["rgb"], each["actions"]) for each in demos.records])}
+    with making(directory, wait=False):
+        _check(directory, mark)
+        places = {stop: directory / f"at-{stop}" for stop in sorted(set(stops)) if stop < loop.steps}
+        missing = {stop: place for stop, place in places.items() if not (place / "policy.json").exists()}
+        if (directory / "policy.json").exists():
+            if missing:
+                raise _other_stops(directory, min(missing))
+            return load_policy(directory)
+        for stop, place in (missing | {loop.steps: directory}).items():
+            policy = Policy(model, _fit(model, loop, demos, span, directory, name, stop, start), span)
+            policy.save(place)
     return policy
 
 
@@ -81,7 +85,17 @@ def _fit(
     )  # a copy, as steps donate theirs
     monitor = Monitor(("samples", loop.batch_size))
     options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "monitor": monitor}
-    return fit(model, loop, loader, directory, **options).weights
+    state = fit(model, loop, loader, directory, **options)
+    if stop < loop.steps and state.step > stop:  # it was interrupted later on, when it kept other stops
+        raise _other_stops(directory, stop)
+    return state.weights
+
+
+def _other_stops(directory: Path, stop: int) -> UserError:
+    return UserError(
+        f"{directory}: this training is beyond step {stop}, where it did not keep the policy: it kept it at other "
+        f"steps; choose another --out, or ask for those"
+    )
 
 
 def _batch(arrays: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import Estimate, wilson
-from rsjax.files import read_json, write_file, write_json
+from rsjax.files import making, read_json, write_file, write_json
 from rsjax.policies.policy import Policy
 from rsjax.policies.rollouts import FIRST_SEED, FirstFrame, Simulated, World, run_all
 from rsjax.policies.simulator import Episode, LiftEnv
@@ -87,26 +87,28 @@ def try_policy(
 
     Raises:
         UserError: the result in ``folder`` is of other trials, another policy, or another world or judge.
+        FileError: another process tries policies there.
     """
     file = folder / "success.json"
-    kept = _kept(file, [len(starts), trials.max_steps, trials.together], content_key(policy.key, world.key))
-    begins = len(kept["success"])
-    with Progress(f"{name}: trials", len(starts), "episodes", begins) as progress:
+    with making(folder, wait=False):
+        kept = _kept(file, [len(starts), trials.max_steps, trials.together], content_key(policy.key, world.key))
+        begins = len(kept["success"])
+        with Progress(f"{name}: trials", len(starts), "episodes", begins) as progress:
 
-        def keep(number: int, episode: Episode) -> None:
-            kept["success"].append(bool(episode.success.any()))
-            kept["uninterpretable"].append(bool(episode.uninterpretable))
-            kept["clipped"] += episode.clipped
-            if begins + number < trials.videos:
-                write_mp4(folder / f"episode-{begins + number:02d}.mp4", episode.rgb, FPS, 4)
-            see(begins + number, episode)
+            def keep(number: int, episode: Episode) -> None:
+                kept["success"].append(bool(episode.success.any()))
+                kept["uninterpretable"].append(bool(episode.uninterpretable))
+                kept["clipped"] += episode.clipped
+                if begins + number < trials.videos:
+                    write_mp4(folder / f"episode-{begins + number:02d}.mp4", episode.rgb, FPS, 4)
+                see(begins + number, episode)
 
-        def report(done: int) -> None:
-            write_json(file, kept)
-            progress.update(begins + done, success=sum(kept["success"]))
+            def report(done: int) -> None:
+                write_json(file, kept)
+                progress.update(begins + done, success=sum(kept["success"]))
 
-        # Draws depend on an episode's group, which begins at a multiple of ``together``.
-        run_all(world, lambda first: policy.actor(begins + first), starts[begins:], trials.max_steps, keep, report)
+            # Draws depend on an episode's group, which begins at a multiple of ``together``.
+            run_all(world, lambda first: policy.actor(begins + first), starts[begins:], trials.max_steps, keep, report)
     success, spoilt = ([bool(one) for one in kept[name]] for name in ("success", "uninterpretable"))
     return Result(success, int(kept["clipped"]), spoilt)
 

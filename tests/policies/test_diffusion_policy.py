@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,15 +18,18 @@ from rsjax.config.policy import PolicyConfig, policy_preset, public, toy
 from rsjax.data.merge import into_parts, merge, split
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
+from rsjax.files import FileError, making
 from rsjax.policies import training
 from rsjax.policies.ddpm import add_noise, cosine_schedule
 from rsjax.policies.demos import Demos, load_demos
 from rsjax.policies.diffusion_policy import DiffusionPolicy, Range, Windows, scaled
 from rsjax.policies.policy import Actor, Policy, load_policy
 from rsjax.policies.training import train_policy
+from rsjax.policies.trials import Trials, try_policy
 from rsjax.policies.unet1d import Conv, Double, spatial_softmax, step_embedding
 from rsjax.trainable import StepContext
 from tests.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, demos, picture
+from tests.policies.worlds import simulated
 
 CONTEXT = StepContext(jnp.int32(0), None, None)
 
@@ -162,6 +166,23 @@ def test_training_stopped_and_resumed_is_the_same(policy: tuple[Policy, Path], t
     mark = tmp_path / "straight" / "training.json"
     mark.write_text(json.dumps({"key": json.loads(mark.read_text())["key"]}))
     assert train_policy(toy(), demos(), tmp_path / "straight").key == whole.key  # an older mark will do
+
+
+def test_a_training_that_kept_other_stops_is_named(policy: tuple[Policy, Path], tmp_path: Path) -> None:
+    cut = Path(shutil.copytree(policy[1], tmp_path / "cut"))
+    (cut / "policy.json").unlink()
+    for directory in (policy[1], cut):  # finished, or interrupted after its last step
+        with pytest.raises(UserError, match=r"this training is beyond step 1, .* choose another --out"):
+            train_policy(toy(), demos(), directory, stops=(1, 2))
+
+
+def test_one_process_trains_and_tries_a_policy_at_a_time(policy: tuple[Policy, Path], tmp_path: Path) -> None:
+    for folder, act in (
+        (policy[1], lambda: train_policy(toy(), demos(), policy[1], stops=(2,))),
+        (tmp_path / "tries", lambda: try_policy(policy[0], simulated(1), [0], Trials(1), tmp_path / "tries", "tries")),
+    ):
+        with making(folder, wait=False), pytest.raises(FileError, match=f"{folder.name}: process .* is making it"):
+            act()
 
 
 def test_going_on_from_a_policy_starts_with_its_weights(
