@@ -1,5 +1,6 @@
 """Shows the contents of a store of clips or tokens. ``python -m experiments.inspect STORE``"""
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
+from rsjax.config.fields import require_range
 
 PROG = "python -m experiments.inspect"
 
@@ -31,6 +33,9 @@ class Options:
     """Open the clips with RGB, depth and tracks in the Rerun viewer (pip install -e '.[rerun]')."""
     rerun_file: Path | None = None
     """Write the clips to this file instead; `rerun FILE` opens it."""
+
+    def __post_init__(self) -> None:
+        require_range(self, "inspect", 1, math.inf, "records", "clips")
 
 
 @main_errors()

@@ -82,7 +82,7 @@ def write_report(path: Path, report: Report) -> None:
 
     Raises:
         ValueError: a log without numbers.
-        OSError: the disk is full or the directory is not writable.
+        FileError: the disk is full or the directory is not writable.
     """
     environment = template_environment()
     environment.filters["duration"] = duration

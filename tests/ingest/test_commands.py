@@ -241,6 +241,8 @@ def test_a_damaged_store_is_inspected_and_the_status_says_so(command: Command, t
         (inspect, [], "missing STORE"),
         (inspect, ["nowhere", "--sheet", "sheet.xyz"], "name a .png"),
         (inspect, ["nowhere"], "nowhere: not there; give a store"),
+        (inspect, ["nowhere", "--records", "-1"], "inspect.records is -1; it must be at least 1"),
+        (inspect, ["nowhere", "--clips", "0"], "inspect.clips is 0; it must be at least 1"),
         (ingest, ["sim", "tests"], "tests: no store (it has no manifest.json); give a store, or make one"),
         (doctor, [], "usage: python -m experiments.doctor STORE, or python -m experiments.doctor SOURCE PATH"),
         (store, [], "usage"),
