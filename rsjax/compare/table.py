@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -215,7 +216,10 @@ def _change(change: Difference) -> dict[str, Any]:
     if change.interval:
         named = {"difference": change.interval.value, "difference_low": change.interval.low}
         row |= named | {"difference_high": change.interval.high}
-    return row | ({"t": change.welch.t, "df": change.welch.df, "p": change.welch.p} if change.welch else {})
+    if change.welch is None:
+        return row
+    t = change.welch.t if math.isfinite(change.welch.t) else None  # infinite where no seed varies, which JSON is not
+    return row | {"t": t, "df": change.welch.df, "p": change.welch.p}
 
 
 def as_json(comparison: Comparison) -> dict[str, Any]:

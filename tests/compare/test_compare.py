@@ -93,6 +93,13 @@ def test_unlike_evaluations_are_refused_by_field(make: Make, changes: dict, says
         read_groups([make("a", plain), make("b", replace(plain, **merged))], None)
 
 
+def test_seeds_that_do_not_vary_leave_a_json_file_that_can_be_read(make: Make) -> None:
+    groups = [make(name, *(toy.result(gain, noise=0.0) for _ in range(2))) for name, gain in (("a", 0.0), ("b", 1.0))]
+    found = compare(read_groups(groups, "paper"), ["psnr"])
+    (row,) = [row for row in json.loads(json.dumps(as_json(found), allow_nan=False))["scores"] if row["entry"] == "b"]
+    assert (row["t"], row["p"]) == (None, 0)
+
+
 def test_results_that_do_not_say_their_rate_compare_with_any(make: Make) -> None:
     new = toy.result(0.0)
     old = replace(new, data={k: v for k, v in new.data.items() if k != "fps"}, settings={"localiser_steps": 800})
