@@ -30,6 +30,7 @@ def checked_actions(
     high: Float[np.ndarray, "*B A"],
     out_of_range: OutOfRange,
     unit: str,
+    ignored: Bool[np.ndarray, " B"] | None = None,
 ) -> tuple[Float32[np.ndarray, "*B A"], Bool[np.ndarray, "*B A"]]:
     """Returns actions as float32 within their range, and which of their numbers were clipped to it.
 
@@ -39,6 +40,7 @@ def checked_actions(
         high: the greatest values.
         out_of_range: "clip" moves numbers into the range and counts them, "refuse" raises.
         unit: what the numbers are, for messages.
+        ignored: rows that do not matter: in their place, zeros or the number of their range that is next to it.
 
     Raises:
         ActionError: another shape or type, a value that is not finite, or, with "refuse", one out of range.
@@ -51,6 +53,8 @@ def checked_actions(
         ) from error
     if given.shape != low.shape:
         raise ActionError(f"actions have shape {given.shape}; expected {low.shape}, {unit}")
+    if ignored is not None:
+        given = np.where(ignored[:, None], np.clip(0, low, high), given)
     if not np.isfinite(given).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(given))[0])
         raise ActionError(f"actions[{', '.join(map(str, where))}] is {given[where]}; expected finite numbers, {unit}")

@@ -131,18 +131,19 @@ class Episodes:
         self._clip[which] = [start.clip for start in starts]
         return _observation(seen)
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: Any, ignored: Bool[np.ndarray, " B"] | None = None) -> Step:
         """Generates the next frame of every episode.
 
         Args:
             actions: (B, A) in the recording's units; (A,) for a single episode.
+            ignored: episodes whose actions do not matter.
 
         Raises:
             ActionError: they have another shape or a value that is not finite, or are refused as out of range.
         """
         shape = (*self._lead, *self._low.shape)
         low, high = np.broadcast_to(self._low, shape), np.broadcast_to(self._high, shape)
-        done, outside = checked_actions(actions, low, high, self._settings.out_of_range, self._unit)
+        done, outside = checked_actions(actions, low, high, self._settings.out_of_range, self._unit, ignored)
         count = len(self._steps)
         video = self._imagination.step(done.reshape(count, -1))
         self._clipped += outside.reshape(count, -1).sum(1)

@@ -62,11 +62,13 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             actions: (num_envs, A), in the recording's units.
 
         Raises:
-            ActionError: they have another shape or a value that is not finite, or are refused as out of range.
+            ActionError: they have another shape, or in an episode that goes on a value that is not finite or is refused
+                as out of range.
         """
         if not self._rng:
             raise gymnasium.error.ResetNeeded("reset the environments before their first step")
-        made, again = self._episodes.step(actions), self._over
+        again = self._over
+        made = self._episodes.step(actions, again)
         seen, info, success, over = made.seen, made.info, made.success, made.over
         if again.any():
             first = self._episodes.restart(again, [self._rng[i] for i in np.flatnonzero(again)], {})

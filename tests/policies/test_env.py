@@ -106,6 +106,7 @@ def test_a_vector_of_environments_restarts_each_as_one_alone_would(model: Traine
     seen, _ = many.reset(seed=4)
     made = [(seen, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
     for number in range(steps):
+        rows[number, made[-1][2] | made[-1][3]] = np.nan  # of episodes that begin anew, whose actions do not matter
         seen, reward, terminated, truncated, info = many.step(rows[number])
         assert info["_label"].all()
         made.append((seen, reward, terminated, truncated))
