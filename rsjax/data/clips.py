@@ -137,3 +137,8 @@ def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
         return float(fps) * (len(frames) - 1) / (frames[-1] - frames[0])
     steps = (manifest.get("config") or {}).get("control_steps") or origin.get("control_steps")
     return float(control) / steps if control and steps else None
+
+
+def keeps_rate(clip: Record, manifest: Mapping[str, Any], fps: float) -> bool:
+    """Returns whether a clip has so many frames per second, give or take two frames: windows round to recorded ones."""
+    return abs((frame_rate(clip, manifest) or 0.0) - fps) * (len(clip["rgb"]) - 1) <= 2 * fps

@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from rsjax.data.clips import frame_rate, readable
+from rsjax.config.fields import require_range
+from rsjax.data.clips import frame_rate, keeps_rate, readable
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
@@ -38,7 +39,7 @@ class LeRobotOptions:
         state: ``observation.state``, which most policies ask for and clips do not have. zeros: two zeros;
             command: the action that led into the frame; none: no such column.
         codec: of the videos; LeRobot's own default is av1.
-        crf: constant rate factor of the codec: lower is larger and sharper (LeRobot: 30).
+        crf: constant rate factor of the codec, 0 to 63 (av1) or 51 (h264): lower is larger and sharper (LeRobot: 30).
         fps: frames per second; 0: as the clips say.
         robot: ``robot_type`` in ``meta/info.json``.
     """
@@ -51,6 +52,9 @@ class LeRobotOptions:
     fps: float = 0.0
     robot: str = "unknown"
 
+    def __post_init__(self) -> None:
+        require_range(self, "export", 0, 63 if self.codec == "av1" else 51, "crf")
+
 
 def export_lerobot(
     store: Store,
@@ -61,7 +65,7 @@ def export_lerobot(
     """Writes a LeRobotDataset to ``out``, which is there when it is whole.
 
     Args:
-        store: of clips, all of one size; those that cannot be read are left out with a note.
+        store: of clips, all of one size and rate; those that cannot be read are left out with a note.
         out: a directory that does not exist.
         report: called with (episodes done, episodes in all).
 
@@ -69,7 +73,7 @@ def export_lerobot(
         The content of its ``meta/info.json``.
 
     Raises:
-        UserError: ``out`` exists, the store has no clips, or their frame rate is unknown.
+        UserError: ``out`` exists, the store has no clips, or their frame rates are unknown or differ.
         FileError: the disk is full or refuses.
     """
     if out.exists():
@@ -97,6 +101,12 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
             episode = _episode(clip, layout.features, options.state)
             if episode.rgb.shape[1:] != (layout.video.size, layout.video.size, 3):
                 raise StoreError(f"{store.path}: has clips of several sizes; export them from stores of their own")
+            if not options.fps and not keeps_rate(clip, store.manifest, layout.video.fps):
+                rate = frame_rate(clip, store.manifest)
+                raise StoreError(
+                    f"{store.path}: has clips of {layout.video.fps:g} and {rate or 0:g} frames a second (0: unknown); "
+                    f"export them from stores of their own, or give --fps"
+                )
             layout.add(episode)
             report(layout.episodes, total)
         if layout is not None and layout.episodes > begins:

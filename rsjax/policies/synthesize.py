@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from rsjax.config import content_key
 from rsjax.data.build import write_clips
-from rsjax.data.clips import Clips, frame_rate, readable
+from rsjax.data.clips import Clips, frame_rate, keeps_rate, readable
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import MANIFEST, Store
 from rsjax.errors import UserError
@@ -209,15 +209,19 @@ def choose_clips(store: Store, options: Synthesis) -> list[int]:
     """Returns the numbers of the clips to begin with, in an order that depends on the seed; at most ``demos``.
 
     Raises:
-        UserError: there is none.
+        UserError: there is none, or without ``options.fps`` they have several frame rates.
     """
     source = store.source(options.split)
     labelled = chooses(store, options.only)
     order = np.random.default_rng(options.seed).permutation(len(source)).tolist()
-    chosen = []
+    chosen: list[int] = []
+    fps: float | None = None
     for number, clip in readable(source, order):
         if not labelled or clip["success"][-1]:
             chosen.append(number)
+            fps = fps or frame_rate(clip, store.manifest)
+            if fps and not options.fps and not keeps_rate(clip, store.manifest, fps):
+                raise UserError(f"{store.path}: its clips have several frame rates, such as {fps:g} Hz; give --fps")
         if len(chosen) == options.demos:
             break
     if not chosen:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rsjax
+from rsjax.data.merge import merge
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.export import lerobot_layouts
@@ -185,5 +186,12 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
         export_lerobot(toy_store(tmp_path / "still", fps=None), tmp_path / "a")
     with pytest.raises(UserError, match="33 × 33 pixels"):
         export_lerobot(toy_store(tmp_path / "odd", size=33), tmp_path / "b")
+    for fields in ({"crf": 64}, {"crf": 52, "codec": "h264"}, {"crf": -3}):
+        with pytest.raises(UserError, match=r"export.crf is .*; it must be 0 … "):
+            LeRobotOptions(**fields)  # type: ignore[arg-type]
+    fast, slow = toy_store(tmp_path / "fast"), toy_store(tmp_path / "slow", fps=2.0)
+    merge([fast.path, slow.path], tmp_path / "both")
+    with pytest.raises(StoreError, match=r"has clips of 5 and 2 frames a second .* or give --fps"):
+        export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "d")
     with pytest.raises(StoreError, match="no split 'val'"):
         export_lerobot(toy_store(tmp_path / "store"), tmp_path / "c", LeRobotOptions(split="val"))  # type: ignore[arg-type]

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 import rsjax
 from rsjax.clip import Video
+from rsjax.data.merge import merge
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.policies import synthesize as module
 from rsjax.policies.demos import load_demos
-from rsjax.policies.synthesize import Synthesis, perturb, synthesize
+from rsjax.policies.synthesize import Synthesis, choose_clips, perturb, synthesize
 from tests.ingest.formats.reading import read_all
 from tests.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, picture
 from tests.policies.worlds import judge
@@ -142,5 +143,10 @@ def test_clips_without_a_frame_rate_need_one_before_anything_is_generated(tmp_pa
     assert not model.calls
     synthesize(model, still, tmp_path / "out", Synthesis(2, fps=12.5), LIMITS)
     assert read_all("lerobot", tmp_path / "out" / "lerobot-v3.0")[0].fps == 12.5
+    slow, fast = (demo_store(tmp_path / f"{fps:g} Hz", fps=fps) for fps in (2.0, 5.0))
+    both = merge([slow.path, fast.path], tmp_path / "both")
+    with pytest.raises(UserError, match="both: its clips have several frame rates, such as . Hz; give --fps"):
+        choose_clips(both, Synthesis(8))
+    assert len(choose_clips(both, Synthesis(8, fps=5))) == 6
     with pytest.raises(UserError, match="--fps -1: frames per second"):
         Synthesis(fps=-1)
