@@ -89,13 +89,14 @@ def split(options: Split) -> list[Any]:
 def tokenize(options: Tokenize) -> list[Any]:
     """Returns the store of tokens, which lies beside the clips."""
     tune_process()
+    from rsjax.data.normalization import Normalization
     from rsjax.data.store import open_store
-    from rsjax.models import create_model
-    from rsjax.pipeline.trained import load_assets, load_config
+    from rsjax.models.base import Assets, create_model
+    from rsjax.pipeline.trained import load_config, load_tokenizer
 
-    config = load_config(options.run)
-    place = (open_store(options.store), load_assets(config, options.run), options.store / "tokens")
-    prepared = create_model(config).prepare(*place, config.train.max_damaged)
+    config, clips = load_config(options.run), open_store(options.store)
+    assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # in the range of these clips
+    prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.train.max_damaged)
     if prepared is None:
         raise ConfigError(f"{options.run}: a model of family {config.model.family!r} has no tokens")
     return [prepared]

@@ -1,14 +1,18 @@
 """The tokens of a store of clips, of which some are damaged."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from experiments import store as command
+from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError
+from rsjax.pipeline.run import Run
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
 from tests.pipeline import toy
 from tests.pipeline.damage import damage
@@ -64,3 +68,18 @@ def test_training_clips_have_tokens_of_moved_copies_in_a_set_of_their_own(tmp_pa
         assert abs(move).max() <= 3
         np.testing.assert_array_equal(record["rgb_shifted"][number], codec.encode_rgb(moved(clip["rgb"], *move)))
         np.testing.assert_array_equal(record["depth_shifted"][number], codec.encode_depth(moved(clip["depth"], *move)))
+
+
+def test_the_command_makes_the_tokens_that_training_on_the_store_would(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the depth range of these clips, not in that of the run's own."""
+    clips, run = toy.store(tmp_path / "clips"), Run(toy.config(), tmp_path / "run", tmp_path)
+    toy.save_tokenizer(run)
+    run.prepare(overwrite=False)
+    (run.directory / "tokens").mkdir()
+    replace(Normalization.create(clips), depth_range=(5.0, 9.0)).save(run.directory / "tokens")
+    monkeypatch.setattr(command, "tune_process", lambda: None)
+    (made,) = command.tokenize(command.Tokenize(clips.path, run.directory))
+    depth = toy.codec(clips).encode_depth(clips.source("test")[0]["depth"])
+    np.testing.assert_array_equal(made.source("test")[0]["depth"], depth)
