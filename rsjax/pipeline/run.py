@@ -10,11 +10,12 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rsjax.config import Config, ConfigError, content_key, from_dict, sampling_settings, to_dict
+from rsjax.config import Config, ConfigError, EvalConfig, content_key, from_dict, sampling_settings, to_dict
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
@@ -58,7 +59,7 @@ class Run:
     @property
     def clips(self) -> Path:
         """The path of the store of clips, which all runs on the same episodes share."""
-        return Path(self.config.data.store or self.data_directory / f"{self.config.sim.env}-{self.keys()['collect']}")
+        return Path(self.config.data.store or self.data_directory / f"{self.config.sim.env}-{self._collect_key}")
 
     def open_clips(self) -> Store:
         """Opens the store of clips.
@@ -99,14 +100,13 @@ class Run:
 
     def keys(self) -> dict[str, str]:
         """Returns each stage's content key, a hash of its settings and the previous stage's key."""
-        cfg = self.config
-        key = content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
+        cfg, key = self.config, self._collect_key
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
             "tokens": cfg.model.token_shifts,
             "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
-            "evaluation": (sampling_settings(cfg.model), cfg.eval),
+            "evaluation": (sampling_settings(cfg.model), _by_content(cfg.eval)),
             "report": (),
         }
         for stage, parts in settings.items():
@@ -114,6 +114,11 @@ class Run:
                 continue
             key = keys[stage] = content_key(RECIPE, stage, key, *parts)
         return keys
+
+    @property
+    def _collect_key(self) -> str:
+        cfg = self.config
+        return content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
 
     @property
     def lock_file(self) -> Path:
@@ -145,19 +150,36 @@ class Run:
             RunError: it contains a trained stage of another configuration; the message names the differing fields.
         """
         for stage in (stage for stage in TRAINED if stage in self.stages):
-            if self.mark(stage).get("key", self.keys()[stage]) != self.keys()[stage]:
+            aside = self.directory / f"{stage}.old"
+            shutil.rmtree(aside, ignore_errors=True)  # of a command that was killed here
+            if self._key_of_content(stage) not in (None, self.keys()[stage]):
                 if not overwrite:
                     raise RunError(
                         f"{self.directory} holds a {stage.replace('_', ' ')} of another configuration "
                         f"({self._differences(stage)}); choose another --run-dir, or train it again with --overwrite"
                     )
-                shutil.rmtree(self.directory / stage)
+                os.replace(self.directory / stage, aside)  # at once: half a stage might be resumed
+                shutil.rmtree(aside)
         write_json(self.directory / "config.json", to_dict(self.config))
+
+    def _key_of_content(self, stage: str) -> str | None:
+        """Returns the key of the trained stage in the directory: of its mark, or where that is lost of config.json."""
+        if key := self.mark(stage).get("key"):
+            return str(key)
+        if not (self.directory / stage / "checkpoints").exists():
+            return None
+        try:
+            return replace(self, config=self._saved_config()).keys().get(stage, "")
+        except (ConfigError, FileError, TypeError):
+            return ""
+
+    def _saved_config(self) -> Config:
+        return from_dict(Config, read_json(self.directory / "config.json"))
 
     def _differences(self, stage: str) -> str:
         """Describes the fields that differ from the saved stage's, except those without effect on results."""
         try:
-            saved = from_dict(Config, read_json(self.directory / "config.json"))
+            saved = self._saved_config()
         except ConfigError as error:
             return f"of another version: {error}"
         except (FileError, TypeError):
@@ -216,6 +238,21 @@ class Run:
     def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
         content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
         write_json(self.directory / stage / MARK, content)
+
+
+def _by_content(settings: EvalConfig) -> EvalConfig:
+    """Returns the settings with files of weights by their content; those that cannot be read stay paths."""
+    try:
+        return _hashed(settings)
+    except UserError:
+        return settings  # whoever evaluates says what is wrong
+
+
+@cache  # hashing large files takes seconds
+def _hashed(settings: EvalConfig) -> EvalConfig:
+    from rsjax.evaluation.results import by_content  # here, since it loads jax
+
+    return by_content(settings)
 
 
 def _section(config: Config, part: str) -> tuple[Any, str]:

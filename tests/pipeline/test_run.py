@@ -6,7 +6,15 @@ from typing import Any
 
 import pytest
 
-from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, presets, to_dict
+from rsjax.config import (
+    ComponentConfig,
+    Config,
+    CurriculumStageConfig,
+    content_key,
+    presets,
+    sampling_settings,
+    to_dict,
+)
 from rsjax.pipeline import run as module
 from rsjax.pipeline.run import STAGES, TRAINED, Run, RunError
 from tests.models.toy_family import ToyConfig
@@ -216,3 +224,59 @@ def test_a_mark_of_older_code_is_refused_too(tmp_path: Path, monkeypatch: pytest
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(RunError, match="config.json is missing or damaged"):
         run.prepare(overwrite=False)
+
+
+@pytest.mark.parametrize("mark", [None, "{"])
+def test_checkpoints_without_a_mark_are_of_the_configuration_beside_them(tmp_path: Path, mark: str | None) -> None:
+    run = Run(DEBUG, tmp_path, tmp_path)
+    run.prepare(overwrite=False)
+    make(run, "tokenizer")
+    (tmp_path / "tokenizer" / "checkpoints").mkdir()
+    path = tmp_path / "tokenizer" / module.MARK
+    path.unlink() if mark is None else path.write_text(mark)
+    run.prepare(overwrite=False)
+    other = Run(changed("tokenizer_train.seed", 9), tmp_path, tmp_path)
+    with pytest.raises(RunError, match=r"tokenizer_train.seed is 0 there, 9 here"):
+        other.prepare(overwrite=False)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(RunError, match="config.json is missing or damaged"):
+        run.prepare(overwrite=False)
+
+
+def test_killed_while_it_overwrites_it_leaves_nothing_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, other = (Run(config, tmp_path, tmp_path) for config in (DEBUG, changed("tokenizer.channels", 32)))
+    run.prepare(overwrite=False)
+    make(run, "tokenizer")
+
+    def killed(path: Path, ignore_errors: bool = False) -> None:
+        if path.exists():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.shutil, "rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            other.prepare(overwrite=True)
+    assert not (tmp_path / "tokenizer").exists()
+    other.prepare(overwrite=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_files_of_weights_enter_the_key_by_their_content(tmp_path: Path) -> None:
+    def key(name: str) -> str:
+        module._hashed.cache_clear()  # as in another process
+        return keys(changed("eval.fvd_weights", str(tmp_path / name)))["evaluation"]
+
+    (tmp_path / "one").write_bytes(b"1")
+    (tmp_path / "two").write_bytes(b"1")
+    first = key("one")
+    assert key("two") == first != key("missing")
+    (tmp_path / "one").write_bytes(b"2")
+    assert first != key("one") != keys(DEBUG)["evaluation"]
+
+
+def test_without_files_of_weights_the_key_is_that_of_the_settings() -> None:
+    before = keys(DEBUG)["world_model"]
+    settings = (sampling_settings(DEBUG.model), DEBUG.eval)
+    assert keys(DEBUG)["evaluation"] == content_key(module.RECIPE, "evaluation", before, *settings)
