@@ -44,7 +44,7 @@ class Clip:
 def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> Iterator[Clip]:
     """Yields the clips of a skipped step's batch, scored one by one with the random draws of that step.
 
-    The parameters are those of the newest checkpoint, at that step or near it.
+    The parameters are those of the newest checkpoint, at that step or near it; before the first, the initial ones.
 
     Raises:
         UserError: the step was not skipped, or its data or the checkpoints are missing.
@@ -69,7 +69,7 @@ def _newest(setup: Setup, directory: Path) -> TrainState:
     loop = replace(setup.loop, sharding="jit", fsdp=1)
     sharding = Sharding.create(loop)
     with closing(Checkpoints(directory / "checkpoints", read_only=True)) as checkpoints:
-        if checkpoints.latest() is None:
+        if checkpoints.latest() is None and not (directory / "weights").exists():
             return sharding.init(setup.model, loop, setup.start)
         return checkpoints.restore(sharding.template(setup.model, loop))[0]
 

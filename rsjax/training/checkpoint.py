@@ -17,7 +17,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import FileError, disk_guard, placeholder
+from rsjax.files import FileError, disk_guard, placeholder, replace_directory
 from rsjax.progress import note
 from rsjax.training.checksums import find_fault, read_metric, write_checksums
 from rsjax.training.distributed import agree, is_lead, on_lead
@@ -206,16 +206,19 @@ class Checkpoints:
 
 
 def save_weights(path: Path, weights: PyTree) -> None:
-    """Writes parameters alone, atomically.
+    """Writes parameters alone; those that are there are replaced when the new ones are whole.
 
     Of several processes one calls this; arrays on a mesh of all processes have to be gathered first.
 
     Raises:
         FileError: the disk is full.
     """
-    with disk_guard(path), _checkpointer() as checkpointer:
+    new = path.absolute().with_name(f"{path.name}.new")  # orbax would delete the old ones first
+    with disk_guard(path):
         _need_space(path.parent, weights)
-        checkpointer.save(path.absolute(), _writable(weights), force=True)
+        with _checkpointer() as checkpointer:
+            checkpointer.save(new, _writable(weights), force=True)
+        replace_directory(new, path.absolute())
 
 
 def load_weights(path: Path, like: Tree) -> Tree:

@@ -1,6 +1,8 @@
 """A clip without a finite loss, from training around it to finding it again."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,3 +45,11 @@ def test_the_clip_that_left_a_step_out_is_found(trained: Run) -> None:
 def test_a_step_that_was_not_left_out_is_refused(trained: Run) -> None:
     with pytest.raises(UserError, match="step 99 was not skipped .skipped: "):
         next(replay(trained, "world_model", 99))
+
+
+def test_without_its_checkpoints_a_trained_stage_is_not_replayed(trained: Run, tmp_path: Path) -> None:
+    run = replace(trained, directory=shutil.copytree(trained.directory, tmp_path / "run", symlinks=True))
+    shutil.rmtree(run.directory / "world_model" / "checkpoints")
+    step = read_skipped(run.directory / "world_model")[0]["step"]
+    with pytest.raises(UserError, match="no checkpoint can be read .there is none."):
+        next(replay(run, "world_model", step))

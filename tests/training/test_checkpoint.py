@@ -102,6 +102,26 @@ def test_weights_alone_are_restored_and_may_be_overwritten(tmp_path: Path) -> No
         jax.tree.map(np.testing.assert_array_equal, load_weights(path, like), weights)
 
 
+def test_weights_stay_until_those_that_replace_them_are_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new = (Regression().init(jax.random.key(seed)) for seed in (1, 2))
+    save_weights(tmp_path / "weights", old)
+    save = module.ocp.StandardCheckpointer.save
+
+    def interrupted(self: Any, *arguments: Any, **options: Any) -> None:
+        save(self, *arguments, **options)
+        self.wait_until_finished()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.ocp.StandardCheckpointer, "save", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            save_weights(tmp_path / "weights", new)
+    jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "weights", old), old)
+    save_weights(tmp_path / "weights", new)
+    jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "weights", old), new)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights"]
+
+
 def test_weights_that_are_missing_other_or_damaged_are_named(tmp_path: Path) -> None:
     path, like = tmp_path / "weights", Regression().init(jax.random.key(0))
     with pytest.raises(CheckpointError, match=rf"{path}: no such weights; train first"):
