@@ -104,7 +104,7 @@ def _collecting(run: Run) -> str:
 
 def _record_start(run: Run, command: str) -> None:
     changed = " and ".join(record_start(run, command))
-    if changed and not all(map(run.finished, TRAINED)):
+    if changed and not all(run.finished(name) for name in TRAINED if name in run.stages):
         note(f"since the last start {changed} changed (run.json); results may differ from those of one unbroken run")
 
 

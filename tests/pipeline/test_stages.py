@@ -17,6 +17,7 @@ from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load_tokenizer
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.training.state import TrainState, create_state
+from tests.models.toy_family import ToyConfig
 from tests.pipeline import toy
 
 WHOLE = TokenizerTrainConfig(steps=2, perceptual_weight=1.0, adversarial_weight=0.1)
@@ -78,3 +79,12 @@ def test_weights_from_elsewhere_bring_the_reminder_of_their_tokens(
     monkeypatch.setattr(RoboScape, "pretrained_shapes", lambda *_: {})
     stages.train_world_model(run, resume=True)
     assert capsys.readouterr().out.count("the tokens of this run's tokenizer") == reminded
+
+
+def test_changed_code_is_noted_for_a_family_without_a_tokenizer_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run(replace(toy.config(), model=ToyConfig()), tmp_path / "run", tmp_path / "data")
+    monkeypatch.setattr(stages, "record_start", lambda run, command: ["the code"])
+    stages._record_start(run, "")
+    assert "since the last start the code changed" in capsys.readouterr().out
