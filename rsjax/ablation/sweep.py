@@ -31,10 +31,11 @@ from rsjax.ablation.table import (
     tabulate,
 )
 from rsjax.config import require
+from rsjax.data.token_sets import OWN
 from rsjax.errors import UserError
 from rsjax.files import FileError, disk_guard, holder, lock, write_atomically, write_json
 from rsjax.pipeline import stages
-from rsjax.pipeline.run import Run
+from rsjax.pipeline.run import Run, link
 from rsjax.progress import note, stage
 
 SHARED = ("tokenizer", "tokens", "world_model")  # each needs those before it
@@ -162,20 +163,24 @@ def _make(maker: Run, run: Run, name: str) -> None:
 def link_stage(source: Run, run: Run, name: str) -> None:
     """Puts a finished stage of one run into another, where it appears whole. Its checkpoints stay behind.
 
-    The stage's output never changes and is linked; logs and marks are copied.
+    The stage's output never changes and is linked, also the tokens that it keeps itself (``OWN``); logs and marks are
+    copied.
     """
     if run.finished(name):
         return
     target, temporary = run.directory / name, run.directory / f"{name}.linking"
-    output, checkpoints = source.output(name), shutil.ignore_patterns("checkpoints")
+    folder, output = source.directory / name, source.output(name)
+    ignored = shutil.ignore_patterns("checkpoints", ".*.lock")
 
     def copy(path: str, to: str) -> None:
-        if output not in Path(path).parents or not _hard_link(path, to):
+        if {output, folder / OWN}.isdisjoint(Path(path).parents) or not _hard_link(path, to):
             shutil.copy2(path, to)
 
     with disk_guard(temporary):
         shutil.rmtree(temporary, ignore_errors=True)
-        shutil.copytree(source.directory / name, temporary, symlinks=True, ignore=checkpoints, copy_function=copy)
+        shutil.copytree(folder, temporary, symlinks=True, ignore=ignored, copy_function=copy)
+        if output.is_symlink() and (own := output.resolve()).is_relative_to(folder.resolve()):
+            link(target.absolute() / own.relative_to(folder.resolve()), temporary / output.name)
         shutil.rmtree(target, ignore_errors=True)
         temporary.rename(target)
 

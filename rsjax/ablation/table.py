@@ -96,16 +96,17 @@ def read_result(run: Run) -> Result:
 
 
 def read_metrics(run: Run) -> dict[str, float] | None:
-    """Returns a run's metrics and the end of its loss terms; None where it is not finished."""
+    """Returns a run's metrics and the end of its loss terms; None where it is not finished or a file is damaged."""
     if not run.finished("report"):
         return None
     try:
         saved = read_json(run.directory / "metrics.json")
+        log = read_log(run.directory / "world_model")
     except FileError:
         return None
     numbers = {name: float(value) for name, value in saved.items() if isinstance(value, int | float)}
     terms = tuple(create_model(run.config).loss_weights)
-    return numbers | final_terms(read_log(run.directory / "world_model"), terms)
+    return numbers | final_terms(log, terms)
 
 
 def read_reasons(run: Run) -> dict[str, str]:

@@ -6,6 +6,7 @@ from rsjax.config import TokenizerConfig, content_key
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
+OWN = "own"  # likewise in the directory of a run's stage, where the store of clips is write-protected
 
 
 def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:

@@ -21,7 +21,7 @@ from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.quarantine import Quarantine
 from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError, open_store, write_store
-from rsjax.data.token_sets import FOLDER, tokenizer_key, tokens_key
+from rsjax.data.token_sets import FOLDER, OWN, tokenizer_key, tokens_key
 from rsjax.files import lock_file, making
 from rsjax.progress import Progress, note
 from rsjax.sim.expert import difficulty
@@ -94,7 +94,7 @@ def prepare_store(
     if _is_made(beside, key, clips):
         return _listed(beside, clips, max_damaged, place)
     if not _writable(beside):
-        out = place.resolve() / "own" / tokenizer
+        out = place.resolve() / OWN / tokenizer
     with making(out, wait=True):
         if not _is_made(out, key, clips):
             _write(out, clips, encode, more, {"key": key, "tokenizer": weights, "shifts": more_key})

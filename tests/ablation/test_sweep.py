@@ -14,10 +14,11 @@ from experiments import ablation
 from rsjax.ablation import sweep
 from rsjax.ablation.grid import Choice, Grid
 from rsjax.ablation.table import read_result
+from rsjax.data.token_sets import OWN
 from rsjax.errors import Preempted, UserError
 from rsjax.files import lock
 from rsjax.pipeline import stages
-from rsjax.pipeline.run import STAGES, Run
+from rsjax.pipeline.run import STAGES, Run, link
 from tests.ablation import process, toy
 from tests.models.toy_family import ToyConfig
 
@@ -163,6 +164,27 @@ def test_lost_numbers_are_counted_again_from_what_is_there(tmp_path: Path) -> No
     assert states(tmp_path, grid) == ["interrupted", "finished"]
     sweep_in(tmp_path, grid)
     assert metrics.read_bytes() == before
+
+
+def test_a_damaged_log_leaves_its_cell_out_of_the_table(tmp_path: Path) -> None:
+    grid = toy.grid("model.loss.gamma=4,5")
+    sweep_in(tmp_path, grid)
+    (runs(tmp_path, grid)[0].directory / "world_model" / "log.jsonl").write_text('{"step"\n{"step": 2, "rgb": 2.0}\n')
+    rows = sweep.write_tables(tmp_path / "out", tmp_path / "data")
+    assert [row.results[0].state for row in rows] == ["interrupted", "finished"]
+
+
+def test_tokens_that_a_run_keeps_itself_are_linked_and_the_cell_reads_its_own(tmp_path: Path) -> None:
+    maker, cell = (Run(toy.DEBUG, tmp_path / name, tmp_path / "data") for name in ("shared", "cell"))
+    with maker.stage("tokens") as folder:
+        (folder / OWN / "key").mkdir(parents=True)
+        (folder / OWN / "key" / "tokens").write_text("many")
+        (folder / OWN / ".key.lock").touch()
+        link((folder / OWN / "key").absolute(), maker.output("tokens"))
+    sweep.link_stage(maker, cell, "tokens")
+    assert cell.output("tokens").resolve() == (cell.directory / "tokens" / OWN / "key").resolve()
+    assert (cell.output("tokens") / "tokens").stat().st_nlink == 2
+    assert [path.name for path in (cell.directory / "tokens" / OWN).iterdir()] == ["key"]
 
 
 def test_a_cell_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> None:
