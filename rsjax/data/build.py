@@ -5,6 +5,8 @@ Axes: T frames, S×S pixels, A action dimensions, N₀ tracks.
 
 import dataclasses
 import hashlib
+import json
+import math
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordWriter
+from jaxtyping import Bool
 
 from rsjax.clip import UNKNOWN, Clip, words_of
 from rsjax.data.codec import Record, encode
@@ -89,6 +92,8 @@ def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: fl
         total = total.merged(rows) if total and rows else rows
     near_far = [value for name in names["train"] for value in episodes[name].depth]
     depth_range = [min(near_far), max(near_far)] if near_far else None
+    if depth_range and depth_range[0] == depth_range[1]:
+        raise StoreError(f"{path}: depth is {depth_range[0]:g} everywhere in the train clips; leave it out")
     successes = sum(episode.successes for episode in episodes.values())
     meta = {
         "key": f"{digest.hexdigest()[:12]}-{share}",
@@ -150,12 +155,9 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
     if clip.get("tracks") is not None:
         tracks = _array(clip, "tracks", where, f"numbers (N, {count}, 2)", np.float32, (None, count, 2))
         visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])
-    success = np.asarray(clip.get("success", False), bool)
-    if success.shape not in ((), (count,)):
-        raise StoreError(f"{where}: success has the shape {success.shape}, should be one value or ({count},)")
-    origin = {"source": "write_store", "episode": number} | dict(clip.get("provenance") or {})
+    origin = {"source": "write_store", "episode": number} | _provenance(clip, where)
     words = {name: words_of(clip.get(name)) or words_of(origin.get(name)) or UNKNOWN for name in _LABELS}
-    timing = {"fps": float(clip["fps"]), "frames": list(range(count))} if clip.get("fps") else {}
+    timing = {} if clip.get("fps") is None else {"fps": _rate(clip["fps"], where), "frames": list(range(count))}
     unit = {"depth_unit": "metres" if depth is not None else ""}
     return {
         "rgb": rgb,
@@ -163,10 +165,41 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         "actions": actions,
         "tracks": tracks,
         "visible": visible,
-        "success": np.broadcast_to(success, (count,)).copy(),
+        "success": _success(clip, where, count),
         "task": words_of(clip.get("task")) or UNKNOWN,
         "provenance": origin | words | timing | unit | {"episode": str(clip.get("episode", origin["episode"]))},
     }
+
+
+def _success(clip: Mapping[str, Any], where: str, count: int) -> Bool[np.ndarray, " T"]:
+    success = np.asarray(False if clip.get("success") is None else clip["success"])
+    if success.shape not in ((), (count,)):
+        raise StoreError(f"{where}: success has the shape {success.shape}, should be one value or ({count},)")
+    if success.dtype.kind not in "biuf" or not np.isin(success, (0, 1)).all():
+        raise StoreError(f"{where}: success is {clip['success']!r:.80}, should be True or False")
+    return np.broadcast_to(success.astype(bool), (count,)).copy()
+
+
+def _rate(fps: Any, where: str) -> float:
+    """Returns frames per second."""
+    try:
+        rate = float(fps)
+    except (TypeError, ValueError):
+        rate = math.nan
+    if not 0 < rate < math.inf:
+        raise StoreError(f"{where}: fps is {fps!r:.80}; it is frames per second, above 0: leave it out if unknown")
+    return rate
+
+
+def _provenance(clip: Mapping[str, Any], where: str) -> dict[str, Any]:
+    origin = {} if clip.get("provenance") is None else clip["provenance"]
+    try:
+        if not isinstance(origin, Mapping):
+            raise TypeError(f"it is a {type(origin).__name__}")
+        json.dumps(dict(origin))
+    except (TypeError, ValueError) as error:
+        raise StoreError(f"{where}: provenance is no dict of JSON-ready values ({error})") from error
+    return dict(origin)
 
 
 def _array(
@@ -193,4 +226,5 @@ def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int,
     """Checks that a clip's arrays have the shapes of the first clip's, which are noted."""
     for name, shape in shapes.items():
         if first.setdefault(name, shape) != shape:
-            raise StoreError(f"{where}: {name} has the shape {shape}, that of the first clip {first[name]}")
+            hint = f"; without tracks a clip gets {TRACKS} that are never visible" if name == "tracks" else ""
+            raise StoreError(f"{where}: {name} has the shape {shape}, that of the first clip {first[name]}{hint}")

@@ -109,6 +109,17 @@ WRONG = [
     ({"depth": np.ones((FRAMES, 8, 8))}, r"depth is float64 \(4, 8, 8\), should be metres \(4, 64, 64\)"),
     ({"tracks": np.zeros((5, FRAMES, 2))}, r"has no visible; give bool \(5, 4\)"),
     ({"success": [True, False]}, r"success has the shape \(2,\)"),
+    ({"success": "no"}, "success is 'no', should be True or False"),
+    ({"success": [0, 1, 2, 1]}, r"success is \[0, 1, 2, 1\], should be True or False"),
+    ({"fps": "5Hz"}, "fps is '5Hz'; it is frames per second, above 0"),
+    ({"fps": -5}, "fps is -5; it is"),
+    ({"fps": float("nan")}, "fps is nan; it is"),
+    ({"provenance": {"seed": np.int64(3)}}, "provenance is no dict of JSON-ready values .*int64"),
+    ({"provenance": "x"}, r"provenance is no dict of JSON-ready values \(it is a str\)"),
+    (
+        {"tracks": np.zeros((5, FRAMES, 2)), "visible": np.ones((5, FRAMES), bool)},
+        r"tracks has the shape \(5, 4, 2\), .* \(256, 4, 2\); without tracks a clip gets 256 that are never visible",
+    ),
     ({"tsak": "push"}, "no field 'tsak'; did you mean 'task'"),
     ({"actions": np.zeros((FRAMES, 4))}, r"actions has the shape \(4, 4\), that of the first clip \(4, 3\)"),
 ]
@@ -119,6 +130,13 @@ def test_a_wrong_clip_is_named(tmp_path: Path, changes: dict[str, Any], message:
     with pytest.raises(StoreError, match=f"clip 2: {message}"):
         rsjax.write_store(tmp_path / "mine", [clip(), clip(), clip(**changes)])
     assert not list(tmp_path.iterdir())
+
+
+def test_depth_without_a_range_is_refused(tmp_path: Path) -> None:
+    flat = np.ones((FRAMES, SIZE, SIZE))
+    with pytest.raises(StoreError, match="mine: depth is 1 everywhere in the train clips; leave it out"):
+        rsjax.write_store(tmp_path / "mine", [clip(0, depth=flat), clip(1, depth=flat)])
+    assert not (tmp_path / "mine").exists()
 
 
 def test_what_is_no_store_is_not_replaced_and_the_callers_errors_stay_its_own(tmp_path: Path) -> None:
