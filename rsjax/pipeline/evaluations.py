@@ -24,7 +24,7 @@ from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result, result_of, write_result
-from rsjax.files import FileError, disk_guard, lock
+from rsjax.files import FileError, disk_guard, lock, safe_id
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
@@ -94,7 +94,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     held_out = open_store(request.data) if request.data else _held_out(run, store, protocol)
     for split in _splits(held_out, protocol.splits):
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
-        name = ",".join([*parts, *([f"data={held_out.manifest.get('key')}"] if request.data else [])])
+        key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # the store may be a stranger's
+        name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
         if request.second_takes:
             name, chosen = f"{name},second-takes", _with_second_takes(chosen, config.sim.workers)

@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -150,6 +151,25 @@ def test_other_weights_of_a_metric_at_the_same_path_are_evaluated_anew(
     (tmp_path / "moved").write_bytes(b"2")
     assert evaluated("moved") != first
     assert len(MADE) == 1
+
+
+def test_results_of_other_stores_stay_apart_and_in_the_run(run: Run, folder: Path, tmp_path: Path) -> None:
+    def evaluated(name: str, key: str | None) -> Path:
+        path = shutil.copytree(run.clips, tmp_path / name)
+        manifest = json.loads((path / "manifest.json").read_text())
+        write_json(path / "manifest.json", manifest | {"key": key})
+        (made,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, data=path))
+        return made
+
+    made = {
+        evaluated("a", "x/../../../elsewhere"),
+        evaluated("b", None),
+        evaluated("c", None),
+        evaluated("d", "abc-0.1"),
+    }
+    assert len(made) == 4
+    assert all(each.resolve().parent == run.directory / "evaluations" for each in made)
+    assert f"{folder.name},data=abc-0.1" in {each.name for each in made}
 
 
 def test_overwriting_begins_without_the_batches_of_an_interrupted_evaluation(run: Run, folder: Path) -> None:
