@@ -134,6 +134,10 @@ class LoopConfig:
             f"restarts of a training loop are {self.restarts}; they are steps above 0, in their order",
         )
         require(
+            max(self.restarts, default=-1) < self.steps,
+            f"restarts of a training loop are {self.restarts}; they lie before its end, steps = {self.steps}",
+        )
+        require(
             self.batch_size % self.accumulate == 0,
             f"batch_size {self.batch_size} does not divide into accumulate = {self.accumulate} parts; change one",
         )

@@ -146,6 +146,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
         ("model.mask", {"corruption_decay": -math.inf}, "model.mask.corruption_decay is -inf; it must be a finite"),
         ("train", {"ema": math.nan}, "ema of a training loop is nan; it is 0 … 1"),
+        ("train", {"steps": 20, "restarts": (50,)}, "are (50,); they lie before its end, steps = 20"),
         ("train", {"max_damaged": 2.0}, "max_damaged of a training loop is 2.0"),
         ("train", {"log_every": 2**63}, "train.log_every is 9223372036854775808; it must fit in 64 bits"),
         ("", {"train": c.LoopConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),
