@@ -3,12 +3,18 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from experiments.cli import main_errors, parse_options
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, require
 from rsjax.ingest.formats import FORMATS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rsjax.ingest.doctor import Diagnosis
 
 PROG = "python -m experiments.doctor"
 
@@ -51,14 +57,12 @@ def main() -> None:
             f"sources: {', '.join(FORMATS)}"
         )
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
-    from rich.box import SIMPLE_HEAD
+    require(options.lines >= 0, f"--lines is {options.lines}; it is how many findings to print, 0 for all")
     from rich.console import Console
-    from rich.table import Table
 
-    from rsjax.ingest.checks import KINDS, Thresholds
+    from rsjax.ingest.checks import Thresholds
     from rsjax.ingest.doctor import diagnose, open_any
     from rsjax.ingest.options import source_options
-    from rsjax.ingest.selection import write_selection
     from rsjax.processes import count_workers
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
@@ -67,36 +71,55 @@ def main() -> None:
         limits = Thresholds(options.frames, options.gap, options.unusual)
         show = lambda done: status.update(f"checking episodes: {done}")  # noqa: E731
         diagnosis = diagnose(source, limits, options.ignore, show, count_workers(options.workers))
-    findings, counts, most = diagnosis.findings, diagnosis.counts(), options.lines or sys.maxsize
+    _print_findings(diagnosis, options.lines or sys.maxsize, console)
+    _print_counts(diagnosis, console)
+    if options.fix is not None:
+        console.print(_fix(diagnosis, options.fix, f"{source.name} {options.path or options.what}"))
+    if diagnosis.findings:
+        raise SystemExit(1)
+
+
+def _print_findings(diagnosis: "Diagnosis", most: int, console: "Console") -> None:
+    findings = diagnosis.findings
     for finding in findings[:most]:
         console.print(f"{finding.episode}: {finding.kind}: {finding.detail}")
     if len(findings) > most:
         console.print(f"… and {len(findings) - most} more; --lines 0 prints all")
     for name, notes in diagnosis.mended[: max(0, most - len(findings))]:
         console.print(f"{name}: mended: {notes}")
-    if findings:
+
+
+def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from rsjax.ingest.checks import KINDS
+
+    if diagnosis.findings:
         table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
-        for kind, count in counts.items():
+        for kind, count in diagnosis.counts().items():
             table.add_row(kind, str(count), KINDS[kind])
         console.print(table, soft_wrap=False)
     reasons, total = diagnosis.reasons(), len(diagnosis.refs)
     bad = sum(name in reasons for name, _ in diagnosis.refs)
-    common = diagnosis.usual()
-    for kind in common:
+    for kind in diagnosis.usual():
         console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")
     console.print(f"{total} episodes: {total - bad} without a finding, {bad} with")
     if diagnosis.mended:
         console.print(f"mended by the reader, which is no finding: {len(diagnosis.mended)}")
-    if options.fix is not None:
-        about = f"{source.name} {options.path or options.what}"
-        kept, out = write_selection(options.fix, about, diagnosis.refs, reasons)
-        line = f"{options.fix}: keeps {kept}, leaves out {out}"
-        if not kept:
-            cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
-            line += f"; nothing is left to ingest: {cure}, and write it again"
-        console.print(line)
-    if findings:
-        raise SystemExit(1)
+
+
+def _fix(diagnosis: "Diagnosis", path: Path, about: str) -> str:
+    """Writes the list of the episodes without a finding and returns a line that says so."""
+    from rsjax.ingest.selection import write_selection
+
+    kept, out = write_selection(path, about, diagnosis.refs, diagnosis.reasons())
+    line = f"{path}: keeps {kept}, leaves out {out}"
+    if kept:
+        return line
+    common = diagnosis.usual()
+    cure = f"--ignore {' '.join(common)}" if common else "mend what is wrong"
+    return f"{line}; nothing is left to ingest: {cure}, and write it again"
 
 
 if __name__ == "__main__":
