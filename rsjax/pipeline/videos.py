@@ -78,12 +78,7 @@ def write_videos(
     trained = load(run)
     config = relocated(trained.config, store) if store else trained.config
     source = Run(config, run, data).open_clips().source(request.split)
-    clips = request.clips or tuple(range(min(4, len(source))))
-    for flag, numbers in (("--clips", clips), ("--actions-from", (request.actions_from or 0,))):
-        for number in numbers:
-            if not 0 <= number < len(source):
-                last = len(source) - 1
-                raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
+    clips = chosen_clips(request, source)
     if not FPS[0] <= fps <= FPS[1] or not 1 <= scale <= MOST_SCALE:
         limits = f"{FPS[0]} to {FPS[1]} and 1 to {MOST_SCALE}"
         raise UserError(f"--fps is {fps} and --scale is {scale}; they can be {limits}")
@@ -101,6 +96,24 @@ def write_videos(
         frames = made.rgb[0] if alone else _side_by_side(clip, made, number)
         (write_mp4 if kind == "mp4" else write_gif)(path, frames, fps, scale if alone else 1)
         yield path
+
+
+def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:
+    """Returns the numbers of the clips to generate.
+
+    Raises:
+        UserError: the split does not have them, or not the one whose actions are wanted.
+    """
+    if not len(source):
+        raise UserError(f"the {request.split} split has no clips; choose another with --split")
+    clips = request.clips or tuple(range(min(4, len(source))))
+    others = () if request.actions_from is None else (request.actions_from,)
+    for flag, numbers in (("--clips", clips), ("--actions-from", others)):
+        for number in numbers:
+            if not 0 <= number < len(source):
+                last = len(source) - 1
+                raise UserError(f"{flag}: no clip {number} in the {request.split} split, which has 0 … {last}")
+    return clips
 
 
 def _foreign_actions(request: Request, source: Source, config: Config) -> Float[np.ndarray, "T A"] | None:

@@ -9,7 +9,10 @@ import pytest
 from PIL import Image, ImageSequence
 
 from rsjax.config import presets
+from rsjax.data.store import Source
+from rsjax.errors import UserError
 from rsjax.models.base import create_model
+from rsjax.pipeline.videos import Request, chosen_clips
 from rsjax.training.checkpoint import save_weights
 from tests.pipeline import toy
 from tests.pipeline.conftest import Commands
@@ -101,3 +104,9 @@ def test_weights_of_another_architecture_are_refused(run: Path, command: Command
 def test_a_damaged_configuration_is_named(run: Path, command: Commands) -> None:
     (run / "config.json").write_text('{"name": ')
     assert f"{run / 'config.json'}: not JSON" in command.refused(PROGRAM, run)
+
+
+def test_a_split_without_clips_is_named() -> None:
+    request = Request("test", (), None, None, None, {})
+    with pytest.raises(UserError, match="^the test split has no clips; choose another with --split$"):
+        chosen_clips(request, Source(Path("store"), "test", []))
