@@ -44,11 +44,6 @@ def encode_clip(clip: Clip) -> Record:
     return {field.name: getattr(clip, field.name) for field in dataclasses.fields(Clip)}
 
 
-def decode_clip(record: Record) -> Clip:
-    """Inverts :func:`encode_clip`."""
-    return Clip(**record)
-
-
 class Source:
     """Random access to the records of one split: ``len(source)``, ``source[i]``. Can be sent to other processes.
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from rsjax.clip import Clip
 from rsjax.data.codec import Record
-from rsjax.data.store import decode_clip
 from rsjax.ingest.actions import ActionConfig
 from rsjax.ingest.annotate import Annotated
 from rsjax.ingest.annotators.categories import CategoryConfig
@@ -43,7 +42,7 @@ def test_pictures_depth_and_actions_are_those_of_the_windows_frames() -> None:
     assert summary["windows"] == {"kept": 5} and len(kept) == 5
     for number, record in enumerate(kept):
         frames = np.array([0, 5, 10, 15]) + 5 * number
-        clip = decode_clip(record)
+        clip = Clip(**record)
         assert record["provenance"]["frames"] == frames.tolist()
         assert clip.rgb.shape == (4, 8, 8, 3)
         np.testing.assert_array_equal(clip.rgb[:, 0, 0, 1], frames)
@@ -269,4 +268,4 @@ def test_what_does_not_fit_is_named(config: ClipConfig, annotations: dict[str, A
 
 def test_a_record_is_a_clip() -> None:
     kept, _ = clips(episode("a", depth=True))
-    assert isinstance(decode_clip(kept[0]), Clip) and Path(kept[0]["provenance"]["episode"]).name == "a"
+    assert isinstance(Clip(**kept[0]), Clip) and Path(kept[0]["provenance"]["episode"]).name == "a"

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.data.store import Store, StoreError, decode_clip, open_store
+from rsjax.clip import Clip
+from rsjax.data.store import Store, StoreError, open_store
 from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.annotators.protocols import AnnotationError
 from rsjax.ingest.clips import ClipConfig
@@ -59,7 +60,7 @@ def test_which_windows_are_left_out_is_kept(tmp_path: Path) -> None:
 def test_a_store_has_statistics_and_labels_that_training_reads(mixed: tuple[IngestSummary, Store]) -> None:
     _, store = mixed
     source = store.source("train")
-    clips = [decode_clip(source[i]) for i in range(len(source))]
+    clips = [Clip(**source[i]) for i in range(len(source))]
     rows = np.concatenate([clip.actions[1:] for clip in clips])
     np.testing.assert_allclose(store.manifest["action_mean"], rows.mean(0), rtol=1e-5)
     np.testing.assert_allclose(store.manifest["action_std"], rows.std(0), rtol=1e-5)
@@ -130,7 +131,7 @@ def test_all_steps_leave_what_clips_read(tmp_path: Path) -> None:
     summary = ingested(plan, keep_clips=True)
     assert summary is not None and summary.done == 2
     assert list(summary.steps) == ["shots", "motion", "tracks", "semantics", "clips"]
-    clip = decode_clip(EpisodeWork(plan, next(plan.source.episodes())).records("clips", 5)[0])
+    clip = Clip(**EpisodeWork(plan, next(plan.source.episodes())).records("clips", 5)[0])
     assert clip.visible[:, 0].all() and clip.tracks.shape == (6, 4, 2)
     assert clip.provenance["segment"] == "reach" and "motion" in clip.provenance
 

@@ -10,7 +10,7 @@ import pytest
 
 from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
-from rsjax.data.store import complete_key, decode_clip, encode, encode_clip, open_store
+from rsjax.data.store import complete_key, encode, encode_clip, open_store
 from rsjax.files import FileError, making
 from rsjax.processes import WorkerDied
 from rsjax.sim import collect as collect_module
@@ -116,7 +116,7 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
     store = open_store(out)
     train, test = store.source("train"), store.source("test")
     assert (len(train), len(test)) == (3, 1)
-    clips = [decode_clip(r) for r in [*(train[i] for i in range(3)), test[0]]]
+    clips = [Clip(**r) for r in [*(train[i] for i in range(3)), test[0]]]
     assert [c.provenance["episode"] for c in clips] == [0, 1, 2, 3]
     assert [c.task == "marked" for c in clips] == [i == episode for i in range(4)]
     untouched = next(i for i in range(4) if i != episode)

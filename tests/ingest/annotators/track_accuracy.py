@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from experiments.cli import main_errors
 from rsjax.clip import Clip
 from rsjax.data.depth_color import Scale, color_to_depth, depth_to_color
-from rsjax.data.store import decode_clip, open_store
+from rsjax.data.store import open_store
 from rsjax.ingest.annotators.tracks import Follower, LucasKanade
 
 
@@ -104,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser.parse_args(argv)
     store = open_store(options.store)
     source = store.source(options.split)
-    clips = [decode_clip(source[i]) for i in range(len(source))]
+    clips = [Clip(**source[i]) for i in range(len(source))]
     steps = [step for clip in clips for step in single_steps(clip)]
     print(f"{len(clips)} clips of {clips[0].rgb.shape[1]} × {clips[0].rgb.shape[2]} pixels")
     print("whole clips, all points:", track_accuracy(clips, LucasKanade().follow))
