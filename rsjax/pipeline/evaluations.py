@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -117,14 +118,20 @@ def evaluate_into(
 ) -> None:
     """Evaluates into a folder unless its result is up to date. Several processes share the work."""
     key = _key(trained, store, held_out)
+    parts, skipped = _parts(folder, key), f"{folder}: up to date, skipped (--overwrite evaluates again)"
+    alone = partial(lock, folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here")
     if not overwrite and _key_of(folder) == key:
         if is_lead():
-            note(f"{folder}: up to date, skipped (--overwrite evaluates again)")
+            note(skipped)
         barrier("evaluation")
         return
-    parts = _parts(folder, key)
+
+    def clear() -> None:
+        with alone():
+            shutil.rmtree(parts, ignore_errors=True)
+
     if overwrite:  # batches of an interrupted evaluation may be another version's
-        on_lead("old batches", lambda: shutil.rmtree(parts, ignore_errors=True))
+        on_lead("old batches", clear)
     if jax.process_count() > 1:
         with disk_guard(parts):
             plan = evaluation.plan(trained, store, held_out, parts)
@@ -132,8 +139,12 @@ def evaluate_into(
         barrier("generation")
 
     def finish() -> None:
-        with lock(folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here"):
-            _evaluate(folder, name, key, trained, run, store, held_out)
+        with alone():
+            if overwrite or _key_of(folder) != key:
+                _evaluate(folder, name, key, trained, run, store, held_out)
+            else:  # the process that was waited for made it
+                note(skipped)
+                shutil.rmtree(parts, ignore_errors=True)
 
     on_lead("evaluation", finish)
 

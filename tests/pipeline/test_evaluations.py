@@ -1,3 +1,4 @@
+import contextlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -178,6 +179,33 @@ def test_overwriting_begins_without_the_batches_of_an_interrupted_evaluation(run
     MADE.clear()
     evaluated(run, overwrite=True)  # the stand-in makes this folder, which must not be there
     assert [left] == MADE
+
+
+def test_who_waited_for_the_lock_takes_what_the_other_process_made(
+    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, whole, left = folder / "result.json", (folder / "result.json").read_bytes(), folder / "parts-of-another"
+    made.unlink()
+    left.mkdir()
+    real, seen = evaluations.lock, []
+
+    @contextlib.contextmanager
+    def waiting(*args: Any, **options: Any) -> Iterator[bool]:
+        seen.append(left.exists())  # --overwrite deletes in the lock alone
+        with real(*args, **options) as taken:
+            made.write_bytes(whole)
+            yield taken
+
+    monkeypatch.setattr(evaluations, "lock", waiting)
+    monkeypatch.setattr(evaluations, "_parts", lambda folder, key: left)
+    MADE.clear()
+    assert evaluated(run) == [folder]
+    assert not MADE
+    assert seen == [True]
+    left.mkdir()
+    evaluated(run, overwrite=True)
+    assert [left] == MADE
+    assert seen == [True, True, False]
 
 
 def test_the_evaluation_stage_writes_such_a_file_too(run: Run) -> None:
