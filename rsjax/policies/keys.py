@@ -1,24 +1,19 @@
 """Keys of what results depend on: equal in any process exactly when weights, settings and judges are equal."""
 
-import hashlib
 from typing import Any
 
 import jax
 import numpy as np
 
 from rsjax.config import content_key
+from rsjax.evaluation.results import fingerprint
 from rsjax.models.trained import TrainedModel
 from rsjax.policies.verdicts import Judge
 
 
 def arrays_key(*trees: Any) -> str:
     """Returns 16 hex digits that change with any name, type, shape or number of these trees of arrays."""
-    digest = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(trees):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()[:16]
+    return fingerprint(jax.tree.map(np.ascontiguousarray, trees), " ")
 
 
 def model_key(trained: TrainedModel) -> str:
