@@ -29,6 +29,7 @@ from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
 from rsjax.evaluation.scoring import Scored, mean_curves, mean_scores, sample_scores, score_all, summarised, with_best
 from rsjax.evaluation.shown import extremes, shown_arrays
 from rsjax.files import write_atomically
+from rsjax.ingest.annotators.protocols import DepthEstimator
 from rsjax.models.base import Assets
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
@@ -162,6 +163,28 @@ def evaluate(
         held_out = HeldOut.read(store, "test", wanted, trained.config.clips)
     generation = plan(trained, store, held_out, folder)
     generation.make()
+    repetitions, first = _repetitions(generation, store, held_out, estimator)
+    scored = mean_scores([scored for scored, _ in repetitions])
+    scores = summarised(scored)
+    scores["clips"] = float(len(held_out.clips.rgb))
+    if (share := held_out.store.manifest.get("success_share")) is not None:
+        scores["success_share"] = float(share)
+    return Evaluation(
+        scores,
+        scored.reasons,
+        shown_arrays(held_out.clips, first, scored.per_clip()["psnr"], settings.report_clips),
+        {name: values.tolist() for name, values in scored.per_clip().items()},
+        mean_curves([curves for _, curves in repetitions]),
+        [summarised(each, interval=False) for each, _ in repetitions],
+        held_out.ids(),
+        _kept(first, scored.per_clip()["psnr_repeat_first"]),
+    )
+
+
+def _repetitions(
+    generation: Generation, store: Store, held_out: HeldOut, estimator: DepthEstimator | None
+) -> tuple[list[tuple[Scored, Curves]], dict[str, Scene]]:
+    """Returns the scores of each repetition, and the scenes of the first one."""
     trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
     takes_actions = trained.config.model.takes_actions
     locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
@@ -173,21 +196,7 @@ def evaluate(
         scored = with_best(score_all(scenes, protocol, takes_actions), scenes[""], generation.samples(run), protocol)
         repetitions.append((scored, frame_curves(scenes)))
         first = first or scenes
-    scored = mean_scores([scored for scored, _ in repetitions])
-    scores = summarised(scored)
-    scores["clips"] = float(len(clips.rgb))
-    if (share := held_out.store.manifest.get("success_share")) is not None:
-        scores["success_share"] = float(share)
-    return Evaluation(
-        scores,
-        scored.reasons,
-        shown_arrays(clips, first, scored.per_clip()["psnr"], settings.report_clips),
-        {name: values.tolist() for name, values in scored.per_clip().items()},
-        mean_curves([curves for _, curves in repetitions]),
-        [summarised(each, interval=False) for each, _ in repetitions],
-        held_out.ids(),
-        _kept(first, scored.per_clip()["psnr_repeat_first"]),
-    )
+    return repetitions, first
 
 
 def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | None = None) -> Generation:

@@ -96,17 +96,17 @@ def improve(
         if not made:
             note("the judge called no imagined episode a success: this round learns from the old demonstrations")
         rows.append(row)
-        results: dict[str, Any] = {
-            "settings": asdict(settings),
-            "trials": asdict(trials),
-            "judge": summary(model.validation),
-        }
-        results |= {"before": before.success, "clipped": before.clipped, "rounds": rows}
+        about = {"settings": asdict(settings), "trials": asdict(trials), "judge": summary(model.validation)}
+        results = about | {"before": before.success, "clipped": before.clipped, "rounds": rows}
         results["differences"] = differences(results)
-        write_json(out / "results.json", results)
-        write_file(out / "results.md", table(results).encode())
-        write_file(out / "success.png", success_curves(_series(results), "rounds"))
+        _write(out, results)
     return results
+
+
+def _write(out: Path, results: dict[str, Any]) -> None:
+    write_json(out / "results.json", results)
+    write_file(out / "results.md", table(results).encode())
+    write_file(out / "success.png", success_curves(_series(results), "rounds"))
 
 
 def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:

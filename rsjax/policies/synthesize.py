@@ -92,13 +92,7 @@ def synthesize(
     inputs = (model_key(trained), judge_key(judge), arrays_key(limits))
     settings = {name: value for name, value in asdict(options).items() if name != "fps" or value}  # keys from before it
     key = content_key(4, *inputs, str(store.manifest.get("key")), str(settings))
-    if (out / MARK).exists():
-        mark = read_json(out / MARK, cure=f"delete {out}")
-        if mark.get("key") != key:
-            raise UserError(
-                f"{out}: holds demonstrations of other settings, another model or judge, or an older version of rsjax; "
-                f"choose another --out, or delete it"
-            )
+    if (mark := _finished(out, key)) is not None:
         return mark
     partial = out / "partial"
     with disk_guard(out), making(out, wait=False):
@@ -109,12 +103,24 @@ def synthesize(
         clips = write_clips(out / CLIPS, _records(partial / key, options.demos), test_share=0.0)
         for version in VERSIONS:
             place = out / f"lerobot-{version}"
-            if place.exists():  # of an attempt that ended before its mark
-                shutil.rmtree(place)
+            shutil.rmtree(place, ignore_errors=True)  # of an attempt that ended before its mark
             export_lerobot(clips, place, LeRobotOptions(version))
         mark = {"key": key, **asdict(options), **_summary(clips, judge)}
         write_json(out / MARK, mark)
         shutil.rmtree(partial)
+    return mark
+
+
+def _finished(out: Path, key: str) -> dict[str, Any] | None:
+    """Returns what a finished call left; None if there was none; raises UserError if its inputs were others."""
+    if not (out / MARK).exists():
+        return None
+    mark = read_json(out / MARK, cure=f"delete {out}")
+    if mark.get("key") != key:
+        raise UserError(
+            f"{out}: holds demonstrations of other settings, another model or judge, or an older version of rsjax; "
+            f"choose another --out, or delete it"
+        )
     return mark
 
 
