@@ -122,15 +122,11 @@ def by_content(settings: EvalConfig) -> EvalConfig:
     return replace(settings, **hashes, depth_estimator=depth_estimator.by_content(settings))
 
 
-def fingerprint(params: Any, end: str = "") -> str:
-    """Returns a hash of parameters' names, types, shapes and values: 16 hex digits.
-
-    Args:
-        end: follows each shape: a space in the keys of policies, so that these stay what they were.
-    """
+def fingerprint(params: Any) -> str:
+    """Returns a hash of parameters' names, types, shapes and values: 16 hex digits."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         array = np.asarray(leaf)
-        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}{end}".encode())
+        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]

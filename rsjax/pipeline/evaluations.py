@@ -2,24 +2,19 @@
 
 import json
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
-from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
-import numpy as np
 
 import rsjax
-from rsjax.clip import Video
-from rsjax.config import Config, EvalConfig, SimConfig, content_key, to_dict
+from rsjax.config import Config, EvalConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
-from rsjax.data.codec import Record
-from rsjax.data.store import Store, StoreError, open_store
-from rsjax.errors import UserError
+from rsjax.data.store import Store, open_store
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
@@ -27,22 +22,18 @@ from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, lock, safe_id
 from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.held_out import chosen_splits, held_out_store, with_second_takes
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.pipeline.run import RECIPE, Run
 from rsjax.pipeline.trained import load, load_config
 from rsjax.pipeline.videos import resampled
-from rsjax.progress import Progress, note
+from rsjax.progress import note
 from rsjax.sim import second_takes
-from rsjax.sim.collect import Report, collect, collection_key
-from rsjax.sim.unseen import collect_unseen, unseen_splits
 from rsjax.training.distributed import barrier, is_lead, on_lead
 
 FOLDER = "evaluations"
 NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "loss_clips", "batch_size", "report_clips")
-LONGER_SEED = 1_000_000  # added to a run's seed, for longer episodes that are none of its own
-LONGER_TRAIN = 2  # episodes of their train split, which nothing uses
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -92,14 +83,14 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
-    held_out = open_store(request.data) if request.data else _held_out(run, store, protocol)
-    for split in _splits(held_out, protocol.splits):
+    held_out = open_store(request.data) if request.data else held_out_store(run, store, protocol)
+    for split in chosen_splits(held_out, protocol.splits):
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
         key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # the store may be a stranger's
         name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
         if request.second_takes:
-            name, chosen = f"{name},second-takes", _with_second_takes(chosen, config.sim.workers)
+            name, chosen = f"{name},second-takes", with_second_takes(chosen, config.sim.workers)
         folder = directory / FOLDER / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
@@ -239,75 +230,3 @@ def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
             f"a model of family {trained.config.model.family!r} has no {missing}, which {protocol.name} fixes; left out"
         )
     return resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})
-
-
-def _splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
-    """Returns the store's splits of these names; those that end in ``*`` stand for all that begin so."""
-    if lacking := _lacking(store.splits, wanted):
-        raise StoreError(
-            f"{store.path}: no split {lacking[0]!r}; it has {', '.join(store.splits)}: choose with --split, or name "
-            f"another store with --data"
-        )
-    return [split for split in store.splits if any(fnmatchcase(split, pattern) for pattern in wanted)]
-
-
-def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
-    """Returns the wanted names or patterns that fit none of the splits."""
-    return [pattern for pattern in wanted if not any(fnmatchcase(split, pattern) for split in splits)]
-
-
-def _held_out(run: Run, store: Store, protocol: Protocol) -> Store:
-    """Returns the run's store, or one of longer episodes or unseen scenes, which are simulated if need be."""
-    sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
-    if run.config.data.key:
-        return store
-    if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
-        count = min(protocol.clips, sim.test_episodes)
-        return _simulated(
-            f"scenes never seen, {count} episodes of each kind",
-            lambda report: collect_unseen(sim, store, count, report),
-        )
-    if needed <= sim.frames or _lacking(store.splits, protocol.splits):
-        return store
-    longer = longer_episodes(sim, needed, protocol.clips)
-    path = run.data_directory / f"{sim.env}-{collection_key(longer)}"
-
-    def make(report: Report) -> Store:
-        collect(longer, path, report)
-        return open_store(path)
-
-    return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
-
-
-def _with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
-    """Returns the clips with second takes of all of them, which are simulated if need be."""
-    protocol, clips = held_out.protocol, held_out.clips
-    if protocol.reference != "recorded":
-        raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
-
-    def make(report: Report) -> list[Record]:
-        return second_takes.collect_second_takes(held_out.store, held_out.split, clips.index.tolist(), workers, report)
-
-    takes = _simulated(f"second takes of {len(clips.rgb)} clips", make)
-    return replace(held_out, second_takes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
-
-
-def _simulated(what: str, make: Callable[[Report], T]) -> T:
-    """Returns clips that the lead process makes, unless they exist, and the others then find."""
-    with Progress(f"simulating {what}", 0, "episodes") as progress:
-
-        def report(done: int, total: int) -> None:
-            progress.total = total
-            progress.update(done)
-
-        def work() -> None:
-            make(report)
-
-        on_lead("simulation", work)
-        return make(report)
-
-
-def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:
-    """Returns the configuration of held-out episodes that are longer than a run's: of another seed, all for testing."""
-    seed = (sim.seed + LONGER_SEED) % 2**32
-    return replace(sim, frames=frames, seed=seed, episodes=clips + LONGER_TRAIN, test_episodes=clips)

