@@ -66,7 +66,7 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
 
             - ``rgb``: uint8 (T, S, S, 3), RGB, upright;
             - ``actions``: (T, A), where row t led from frame t-1 into frame t, and row 0 is zeros;
-            - ``depth``, if it is known: z-depth in metres, (T, S, S), above 0 and not the same everywhere;
+            - ``depth``, if it is known: z-depth in metres, (T, S, S), above 0;
             - ``tracks`` and ``visible``, if they are known: (N, T, 2), x and y from 0 to 1 across the image, and
               (N, T), bool; of all clips or of none;
             - ``success``: bool, or one for each frame; ``fps``: frames per second, above 0;

@@ -92,8 +92,6 @@ def _write(path: Path, spooled: Source, episodes: dict[str, _Episode], share: fl
         total = total.merged(rows) if total and rows else rows
     near_far = [value for name in names["train"] for value in episodes[name].depth]
     depth_range = [min(near_far), max(near_far)] if near_far else None
-    if depth_range and depth_range[0] == depth_range[1]:
-        raise StoreError(f"{path}: depth is {depth_range[0]:g} everywhere in the train clips; leave it out")
     successes = sum(episode.successes for episode in episodes.values())
     meta = {
         "key": f"{digest.hexdigest()[:12]}-{share}",

@@ -39,8 +39,12 @@ class Normalization:
         """Reads the normalization of a store's manifest.
 
         Raises:
-            StoreError: the manifest has no statistics.
+            StoreError: the manifest has no statistics, or depth is the same everywhere, which no colour map shows.
         """
+        near_far = store.manifest.get("depth_range")
+        if isinstance(near_far, list) and len(near_far) == 2 and near_far[0] == near_far[1]:
+            cure = "make the store again without depth"
+            raise StoreError(f"{store.path}: depth is {near_far[0]} everywhere in the train clips; {cure}")
         try:
             return cls._of(store.manifest)
         except (KeyError, TypeError, ValueError) as error:

@@ -132,11 +132,11 @@ def test_a_wrong_clip_is_named(tmp_path: Path, changes: dict[str, Any], message:
     assert not list(tmp_path.iterdir())
 
 
-def test_depth_without_a_range_is_refused(tmp_path: Path) -> None:
+def test_depth_without_a_range_is_refused_by_who_needs_one(tmp_path: Path) -> None:
     flat = np.ones((FRAMES, SIZE, SIZE))
-    with pytest.raises(StoreError, match="mine: depth is 1 everywhere in the train clips; leave it out"):
-        rsjax.write_store(tmp_path / "mine", [clip(0, depth=flat), clip(1, depth=flat)])
-    assert not (tmp_path / "mine").exists()
+    store = rsjax.write_store(tmp_path / "mine", [clip(0, depth=flat), clip(1, depth=flat)])
+    with pytest.raises(StoreError, match="mine: depth is 1.0 everywhere in the train clips; make the store again"):
+        Normalization.create(store)
 
 
 def test_what_is_no_store_is_not_replaced_and_the_callers_errors_stay_its_own(tmp_path: Path) -> None:
