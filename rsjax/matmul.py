@@ -3,11 +3,25 @@
 CPUs use their bf16 units only for bf16 × bf16 → float32. The default gradient of such a product does not: its
 cotangents are float32, and its weight gradient contracts the first axes of both operands, for which XLA has no fast
 kernel. So the gradient is hand-written: it casts cotangents too, and transposes the activations in memory.
+
+A CPU without bf16 units multiplies in float32 instead, which is as fast there and saves the casts.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from rsjax.runtime import has_bf16_units
+
+
+def bf16_pays() -> bool:
+    """Says whether bf16 operands make products faster: on accelerators, and on CPUs with units for them."""
+    return jax.default_backend() != "cpu" or has_bf16_units()
+
+
+def matmul(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:
+    """Returns x·w by :func:`matmul_bf16` where bf16 pays, and in float32 elsewhere."""
+    return matmul_bf16(x, w) if bf16_pays() else x @ w
 
 
 @jax.custom_vjp

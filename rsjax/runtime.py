@@ -11,6 +11,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -29,10 +31,13 @@ patient = threading.Event()  # set while SIGTERM may take longer, because steps 
 
 CACHE_DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
 CACHE_SIZE = 4 * 2**30  # bytes of compiled programs that are kept
+BF16_UNITS = {"avx512_bf16", "amx_bf16", "bf16"}  # as x86 and Arm processors name them
+YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"  # the operations that XLA hands to this library
+KNOW_IT = ("0.10.", "0.11.", "0.12.")  # versions of jaxlib; an unknown flag would end the process
 
 
 def tune_process() -> None:
-    """Keeps compiled programs from one start to the next, and restarts the program once for huge pages.
+    """Chooses XLA's flags, keeps compiled programs from start to start, and restarts once for huge pages.
 
     Compiled programs are kept in ``~/.cache/rsjax``, or where the user's ``JAX_COMPILATION_CACHE_DIR`` says; if that is
     empty, nowhere.
@@ -41,6 +46,7 @@ def tune_process() -> None:
     touching it 4 KiB at a time takes a third of a small model's step. glibc reads its tunables only when a process
     starts, hence the restart. Does not restart if the user has set this tunable, or off Linux.
     """
+    set_xla_flags()
     if CACHE_DIRECTORY not in os.environ and (cache := _cache_directory()):
         os.environ |= {CACHE_DIRECTORY: str(cache), "JAX_COMPILATION_CACHE_MAX_SIZE": str(CACHE_SIZE)}
     tunables = os.environ.get("GLIBC_TUNABLES", "")
@@ -50,6 +56,33 @@ def tune_process() -> None:
         sys.stdout.flush()
     tuned = os.environ | {"GLIBC_TUNABLES": f"{tunables}:{HUGE_PAGES}".lstrip(":")}
     os.execve(sys.executable, sys.orig_argv, tuned)
+
+
+def set_xla_flags() -> None:
+    """Keeps matrix products and convolutions from YNNPACK on x86 processors without bf16 units.
+
+    There XLA's own products of bf16 operands are twice as fast, and so are convolutions (``docs/performance.md``). Sums
+    and maxima stay with YNNPACK. Changes nothing if the user has set this flag.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if platform.machine() != "x86_64" or has_bf16_units() or YNNPACK in flags:
+        return
+    if version("jaxlib").startswith(KNOW_IT):
+        os.environ["XLA_FLAGS"] = f"{flags} {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE".strip()
+
+
+def has_bf16_units() -> bool:
+    """Says whether the processor multiplies bf16 in hardware; False where this is not known (off Linux)."""
+    return not BF16_UNITS.isdisjoint(_processor().split())
+
+
+@cache
+def _processor() -> str:
+    """Returns the names of the processor's instruction sets; off Linux only that of its architecture."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+    return platform.machine()
 
 
 def answer_while_importing() -> None:
@@ -75,11 +108,7 @@ def _cache_directory() -> Path | None:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
         return None
-    processor = platform.machine()
-    with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor = next((line for line in lines if line.startswith(("flags", "Features"))), processor)
-    return home / "rsjax" / f"xla-{hashlib.sha256(processor.encode()).hexdigest()[:8]}"
+    return home / "rsjax" / f"xla-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
 
 
 @contextmanager

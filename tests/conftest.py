@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from rsjax.runtime import set_xla_flags
+
 # The tests compile thousands of small programs and run each a few times: compiling is most of their time. Without
 # LLVM's optimisations it takes half, without the fusion emitters (which write more code) a quarter less again. How fast
 # programs run is for benchmarks.
@@ -19,6 +21,8 @@ FLAGS = {"--xla_backend_optimization_level": "0", "--xla_cpu_use_fusion_emitters
 for flag, value in FLAGS.items():
     if flag not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}={value}".strip()
+
+set_xla_flags()  # as every command does
 
 # What one process compiles, the others (pytest's workers, the commands that tests start) load. The directory lasts as
 # long as the session: name one in JAX_COMPILATION_CACHE_DIR to keep it. Reading it changes no result: a program is the
@@ -44,6 +48,12 @@ settings.load_profile("any-speed")
 
 # Directories whose tests take longest. They come first, so that no worker is left with one of them at the end.
 LONGEST = ("reliability", "pipeline", "ablation", "models", "training")
+
+
+@pytest.fixture
+def bf16_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Takes the bf16 products on processors without units for them too."""
+    monkeypatch.setattr("rsjax.matmul.has_bf16_units", lambda: True)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

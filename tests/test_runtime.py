@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.runtime import HUGE_PAGES, tune_process
+from rsjax import runtime
+from rsjax.runtime import HUGE_PAGES, YNNPACK, set_xla_flags, tune_process
 
 ROOT = Path(__file__).parents[1]
 # Prints its tunables and arguments, and appends its process id to a file at each start.
@@ -62,3 +63,26 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
     tune_process()
     chosen = os.environ["JAX_COMPILATION_CACHE_DIR"]
     assert chosen == set_by_user if set_by_user is not None else chosen.startswith(str(tmp_path / "rsjax" / "xla-"))
+
+
+@pytest.mark.parametrize(
+    ("processor", "machine", "jaxlib", "before", "after"),
+    [
+        ("flags : fma avx512f", "x86_64", "0.10.2", "", f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
+        ("flags : fma avx512f", "x86_64", "0.10.2", "--a=1", f"--a=1 {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
+        ("flags : fma avx512f", "x86_64", "0.10.2", f"{YNNPACK}=X", f"{YNNPACK}=X"),
+        ("flags : fma avx512f avx512_bf16", "x86_64", "0.10.2", "", ""),
+        ("Features : asimd", "aarch64", "0.10.2", "", ""),
+        ("flags : fma avx512f", "x86_64", "0.99.0", "", ""),  # which may not know the flag
+    ],
+    ids=["none", "added", "chosen by the user", "bf16 units", "Arm", "a later jaxlib"],
+)
+def test_ynnpack_multiplies_only_where_it_is_not_slower(
+    monkeypatch: pytest.MonkeyPatch, processor: str, machine: str, jaxlib: str, before: str, after: str
+) -> None:
+    monkeypatch.setattr(runtime, "_processor", lambda: processor)
+    monkeypatch.setattr(runtime.platform, "machine", lambda: machine)
+    monkeypatch.setattr(runtime, "version", lambda _: jaxlib)
+    monkeypatch.setenv("XLA_FLAGS", before)
+    set_xla_flags()
+    assert os.environ["XLA_FLAGS"] == after

@@ -140,6 +140,7 @@ def facts(config: Config, batch: int) -> dict[str, Any]:
         "platform": device.platform,
         "cores": len(os.sched_getaffinity(0)),
         "jax": jax.__version__,
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }
 

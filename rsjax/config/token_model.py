@@ -134,7 +134,8 @@ class TransformerConfig:
     embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 as in the public code (torch's default)
     position_std: float = 0.0  # position and mask embeddings ~ N(0, std²); 0 as in the public code
     # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
-    # more, of attention within frames. Parameters, norms and softmaxes stay float32.
+    # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units multiply
+    # linear layers in float32 all the same, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,

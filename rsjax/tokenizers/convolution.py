@@ -1,9 +1,9 @@
 """Convolutions with bf16 operands and float32 accumulation, as matrix products on CPUs.
 
-XLA's CPU backend convolves in float32 whatever its operands are, without the bf16 units and, for small images, on one
-core. So each row of a 3×3 kernel becomes one product over the whole image: three neighbouring cells of a row lie side
-by side in memory, and the image's rows are shifted by taking another part of the same array. Large images are cut into
-strips, so that these copies stay in the processor's cache.
+XLA's CPU backend convolves in float32 whatever its operands are, without bf16 units and, for small images, on one core.
+So, on processors that have such units, each row of a 3×3 kernel becomes one product over the whole image: three
+neighbouring cells of a row lie side by side in memory, and the image's rows are shifted by taking another part of the
+same array. Large images are cut into strips, so that these copies stay in the processor's cache.
 
 Axes: B images, h×w cells, C channels in, D channels out, i×j cells of a kernel, N = B·h·w.
 """
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.matmul import matmul_bf16, transposed_in_memory
+from rsjax.matmul import bf16_pays, matmul_bf16, transposed_in_memory
 
 LEAST = 64  # channels, in and out, from which the products save more time than their copies of the image cost
 STRIP = 2**20  # numbers of an unfolded strip: 2 MiB
@@ -59,7 +59,8 @@ def convolve(
     around = padding == "SAME" or all(tuple(each) == (size // 2, size // 2) for each in padding)
     square = kernel.shape[1] == size and size % 2 == 1
     plain = {*window_strides, *(settings.get("lhs_dilation") or ()), *(settings.get("rhs_dilation") or ())} == {1}
-    if not (around and square and plain) or min(kernel.shape[2:]) < LEAST or kernel.shape[2] != x.shape[-1]:
+    wide = min(kernel.shape[2:]) >= LEAST and kernel.shape[2] == x.shape[-1]
+    if not (around and square and plain and wide and bf16_pays()):
         return jax.lax.conv_general_dilated(x, kernel, window_strides, padding, **settings)
     if size == 1:
         return matmul_bf16(x.reshape(-1, x.shape[-1]), kernel[0, 0]).reshape(*x.shape[:-1], -1)

@@ -27,6 +27,7 @@ def test_their_products_are_all_that_the_model_counts(name: str) -> None:
     assert counted == 3 * forward_flops(arch, config.clips.frames)
 
 
+@pytest.mark.usefixtures("bf16_units")
 @pytest.mark.parametrize(
     "changes",
     [{}, {"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}, {"compute_dtype": "bfloat16"}],

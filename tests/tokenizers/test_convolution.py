@@ -46,6 +46,7 @@ def test_output_and_gradients_are_those_of_the_rounded_operands(
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.usefixtures("bf16_units")
 @pytest.mark.parametrize("kernel", [1, 3])
 def test_a_layer_of_many_channels_takes_products_and_keeps_its_parameters(
     monkeypatch: pytest.MonkeyPatch, kernel: int
@@ -71,6 +72,7 @@ def test_a_layer_of_many_channels_takes_products_and_keeps_its_parameters(
             assert 0 < difference < 0.03 * max(1.0, float(jnp.max(jnp.abs(wanted))))
 
 
+@pytest.mark.usefixtures("bf16_units")
 @pytest.mark.parametrize(
     "settings",
     [{"rhs_dilation": (2, 2)}, {"lhs_dilation": (2, 2)}, {"feature_group_count": 2}, {"window_strides": (2, 2)}, {}],
@@ -86,6 +88,7 @@ def test_whatever_its_settings_it_is_the_convolution_of_jax(
     np.testing.assert_allclose(convolve(x, kernel, **(whole | settings)), expected, atol=0.1)
 
 
+@pytest.mark.usefixtures("bf16_units")
 @pytest.mark.parametrize("settings", [{"kernel": 3, "stride": 2, "padding": ((1, 1), (1, 1))}, {"kernel": 2}])
 def test_what_changes_the_size_or_has_an_even_kernel_stays_exact(
     monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
@@ -93,5 +96,14 @@ def test_what_changes_the_size_or_has_an_even_kernel_stays_exact(
     monkeypatch.setattr(convolution, "LEAST", 1)
     x = jax.random.normal(jax.random.key(0), (1, 6, 6, 4))
     exact, half = conv(5, dtype="float32", **settings), conv(5, dtype="bfloat16", **settings)
+    variables = exact.init(jax.random.key(1), x)
+    np.testing.assert_array_equal(exact.apply(variables, x), half.apply(variables, x))
+
+
+def test_a_processor_without_bf16_units_convolves_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(convolution, "LEAST", 1)
+    monkeypatch.setattr(convolution, "bf16_pays", lambda: False)
+    x = jax.random.normal(jax.random.key(0), (1, 6, 6, 4))
+    exact, half = conv(5, 3, "float32"), conv(5, 3, "bfloat16")
     variables = exact.init(jax.random.key(1), x)
     np.testing.assert_array_equal(exact.apply(variables, x), half.apply(variables, x))

@@ -14,7 +14,7 @@ from flax import struct
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.matmul import matmul_bf16
+from rsjax.matmul import matmul
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.frame_attention import attend_in_frames
 
@@ -38,7 +38,10 @@ class KeyValues:
 
 
 class Dense(nn.Module):
-    """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32."""
+    """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32.
+
+    On a CPU without bf16 units it multiplies in float32 all the same.
+    """
 
     features: int
     bf16: bool = False
@@ -49,7 +52,7 @@ class Dense(nn.Module):
     def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
         if self.bf16:
-            out = matmul_bf16(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
+            out = matmul(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
         else:
             out = x @ kernel
         out = checkpoint_name(out, PRODUCT)

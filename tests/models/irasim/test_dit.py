@@ -66,6 +66,7 @@ def test_export_returns_the_public_file(variant: str) -> None:
         np.testing.assert_allclose(exported[name], x, atol=1e-7, err_msg=name)
 
 
+@pytest.mark.usefixtures("bf16_units")
 def test_bf16_rounds_and_remat_changes_nothing() -> None:
     config, params = model("frame")
     latents, t, actions, _ = inputs(VARIANTS["frame"])

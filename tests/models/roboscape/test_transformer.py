@@ -265,6 +265,7 @@ def test_what_a_cache_held_of_a_frame_is_replaced() -> None:
         np.testing.assert_allclose(logits[name], whole[name][:, rest], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.usefixtures("bf16_units")
 def test_bfloat16_computes_nearly_the_same_and_gives_float32() -> None:
     params, inputs = jax.jit(Transformer(DUAL).init_params)(jax.random.key(0)), random_inputs(DUAL)
     exact, rough = forward(DUAL, params, inputs), forward(replace(DUAL, compute_dtype="bfloat16"), params, inputs)
