@@ -83,10 +83,10 @@ class Row:
 
 def read_result(run: Run) -> Result:
     """Reads a cell's state and metrics; damaged files count as unfinished, and nothing is changed."""
+    if (metrics := read_metrics(run)) is not None:  # though another evaluation of it may be under way
+        return Result(run, "finished", "", metrics, read_reasons(run))
     if is_held(run.lock_file):
         return Result(run, "running", f"in {holder(run.lock_file)}", {})
-    if (metrics := read_metrics(run)) is not None:
-        return Result(run, "finished", "", metrics, read_reasons(run))
     with suppress(FileError):
         return Result(run, "failed", str(read_json(run.directory / ERROR).get("error")), {})
     if (run.directory / "config.json").exists():

@@ -194,6 +194,8 @@ def test_a_cell_that_another_process_works_on_is_left_to_it(tmp_path: Path) -> N
         assert sweep_in(tmp_path, grid) == ["running", "finished"]
         assert states(tmp_path, grid) == ["running", "finished"]
     assert states(tmp_path, grid) == ["missing", "finished"]
+    with lock(runs(tmp_path, grid)[1].lock_file):  # as for another evaluation of it
+        assert states(tmp_path, grid) == ["missing", "finished"]
 
 
 def test_only_the_chosen_cells_run_and_the_table_names_all(tmp_path: Path) -> None:
