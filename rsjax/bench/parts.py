@@ -61,6 +61,15 @@ def matmul(dtype: str, budget: float) -> Numbers:
     }
 
 
+def train_adamw(config: Config, batch: int, budget: float) -> Numbers:
+    """Measures the training step with AdamW, PyTorch's optimizer in the baseline, if the preset has another one."""
+    if config.train.optimizer.kind == "adamw":
+        return {}
+    optimizer = dataclasses.replace(config.train.optimizer, kind="adamw")
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, optimizer=optimizer))
+    return {"train_step_s_adamw": train(config, batch, budget)["train_step_s"]}
+
+
 def train(config: Config, batch: int, budget: float) -> Numbers:
     """Measures the world model's training step on one device, and its compilation without caches."""
     model = create_model(config)

@@ -194,6 +194,22 @@ def test_torch_is_compared_on_one_device_and_with_a_single_branch_only(
     assert ratios(numbers, dual) == ({"train_speedup_over_torch_float32": 3.0} if compared else {})
 
 
+def test_torchs_adamw_is_compared_with_our_step_with_adamw(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = []
+
+    def train(config: Config, batch: int, budget: float) -> dict[str, float]:
+        kinds.append(config.train.optimizer.kind)
+        return {"train_step_s": 2.0}
+
+    monkeypatch.setattr(parts, "train", train)
+    config = toy()
+    assert parts.train_adamw(config, 1, 0.0) == {} and not kinds
+    measured = parts.train_adamw(with_values(config, {"train.optimizer.kind": "muon"}), 1, 0.0)
+    assert measured == {"train_step_s_adamw": 2.0} and kinds == ["adamw"]
+    numbers = {"torch_device": "cpu", "platform": "cpu", "torch_train_step_s_float32": 6.0, "train_step_s": 4.0}
+    assert ratios(numbers | measured, False) == {"train_speedup_over_torch_float32": 3.0}
+
+
 @pytest.mark.parametrize(
     ("request_", "line"),
     [
