@@ -4,7 +4,8 @@ A frame's scores are the largest arrays of a training step. They are not kept: t
 queries, keys and each row's log-sum. Both passes treat frames one by one, so that a frame's scores stay in the
 processor's cache, and unroll the loop over them, so that XLA runs several frames at the same time. Every product
 contracts the last axis of its first operand, the only form for which XLA's CPU backend has fast bf16 kernels. So the
-gradients of keys and values transpose their small operands in memory, never the scores.
+gradients of keys and values transpose their small operands in memory, never the scores. A CPU without bf16 units
+multiplies in float32 instead, without these copies.
 
 Axes: N frames (or sequences), S cells (q of the queries, k of the keys), h heads, e head width.
 """
@@ -17,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.matmul import transposed_in_memory
+from rsjax.matmul import bf16_pays, transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
 SCORES = 2**24  # of the frames that run at the same time: 64 MiB
@@ -27,7 +28,7 @@ SCORES = 2**24  # of the frames that run at the same time: 64 MiB
 def attend_in_frames(
     q: Float[Array, "N S h e"], k: Float[Array, "N S h e"], v: Float[Array, "N S h e"], causal: bool = False
 ) -> Float[Array, "N S h e"]:
-    """Returns softmax(q·kᵀ/√e)·v: operands rounded to bf16, accumulation and softmax float32; float32 in and out.
+    """Returns softmax(q·kᵀ/√e)·v; operands rounded to bf16 where that pays, all else float32; float32 in and out.
 
     Args:
         causal: whether a query sees its own key and those before it alone.
@@ -36,7 +37,7 @@ def attend_in_frames(
 
 
 def _forward(q: Array, k: Array, v: Array, causal: bool) -> tuple[Array, tuple[Array, ...]]:
-    q, k, v = (_head_major(x).astype(jnp.bfloat16) for x in (q * q.shape[-1] ** -0.5, k, v))
+    q, k, v = (_rounded(_head_major(x)) for x in (q * q.shape[-1] ** -0.5, k, v))
     out, log_total = _each_frame(partial(_frame, causal), q, k, v)
     return _head_major(out), (q, k, v, out, log_total)
 
@@ -46,7 +47,7 @@ def _backward(causal: bool, saved: tuple[Array, ...], cotangent: Array) -> tuple
     g = _head_major(cotangent)
     along = jnp.sum(g * out, axis=-1, keepdims=True)  # Σ_k p·dp of each row
     gradient = partial(_frame_gradient, causal)
-    dq, dk_t, dv_t = _each_frame(gradient, q, k, v, g.astype(jnp.bfloat16), along, log_total)
+    dq, dk_t, dv_t = _each_frame(gradient, q, k, v, _rounded(g), along, log_total)
     return (
         _head_major(dq) * q.shape[-1] ** -0.5,  # the saved queries hold this factor already
         dk_t.transpose(0, 3, 1, 2),
@@ -64,7 +65,7 @@ def _frame(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
     """Returns one frame's output (h, S, e), and the log-sum of each row of its scores (h, S, 1)."""
     scores = _scores(q, k, causal)
     top = jnp.max(scores, axis=-1, keepdims=True)
-    weights = jnp.exp(scores - top).astype(jnp.bfloat16)
+    weights = _rounded(jnp.exp(scores - top))
     total = jnp.sum(weights, axis=-1, keepdims=True, dtype=jnp.float32)
     return _product("hqk,hke->hqe", weights, v) / total, top + jnp.log(total)
 
@@ -73,19 +74,29 @@ def _frame_gradient(
     causal: bool, q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
     """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
-    weights = jnp.exp(_scores(q, k, causal) - log_total).astype(jnp.bfloat16)
+    weights = _rounded(jnp.exp(_scores(q, k, causal) - log_total))
     of_weights = _product("hqe,hke->hqk", g, v)
-    of_scores = (weights * (of_weights - along)).astype(jnp.bfloat16)
+    of_scores = _rounded(weights * (of_weights - along))
     return (
         _product("hqk,hke->hqe", of_scores, k),
-        _product("heq,hqk->hek", transposed_in_memory(q), of_scores),
-        _product("heq,hqk->hek", transposed_in_memory(g), weights),
+        _product("heq,hqk->hek", _turned(q), of_scores),
+        _product("heq,hqk->hek", _turned(g), weights),
     )
 
 
 def _scores(q: Array, k: Array, causal: bool) -> Array:
     scores = _product("hqe,hke->hqk", q, k)
     return jnp.where(jnp.tri(len(q[0]), dtype=bool), scores, -jnp.inf) if causal else scores
+
+
+def _rounded(x: Array) -> Array:
+    """Returns an operand of a product: in bf16 where that pays."""
+    return x.astype(jnp.bfloat16) if bf16_pays() else x
+
+
+def _turned(x: Array) -> Array:
+    """Swaps the last two axes."""
+    return transposed_in_memory(x) if bf16_pays() else x.swapaxes(-1, -2)
 
 
 def _head_major(x: Array) -> Array:
