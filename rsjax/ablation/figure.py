@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rsjax.ablation.table import Row, best, shown_columns
+from rsjax.ablation.table import Row, best
 from rsjax.evaluation.registry import ABSENT, Metric
 
 PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
@@ -17,13 +17,13 @@ MAX_LINES = 150  # viewers refuse taller pictures
 LEGEND = "circles: seeds; bar: mean ± sample standard deviation; orange: best mean, which may be chance"
 
 
-def draw(rows: Sequence[Row], title: str) -> bytes:
+def draw(rows: Sequence[Row], columns: Sequence[Metric], title: str) -> bytes:
     """Returns the picture as PNG. Circles are seeds, bars the mean ± sample deviation; the best mean is orange."""
-    columns, shown = shown_columns(rows), rows[:MAX_LINES]
+    shown = rows[:MAX_LINES]
     left = 0.075 * max(len(row.label) for row in shown)
     size = (left + PANEL * max(1, len(columns)), 1.5 + LINE * len(shown))
     figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12)
+    figure.suptitle(textwrap.fill(title, int(12 * size[0])), x=0.01, ha="left", fontsize=12)
     figure.supxlabel(LEGEND, fontsize=8, color=FAINT, x=0.01, ha="left")
     if columns:
         panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]

@@ -28,6 +28,7 @@ from rsjax.ablation.table import (
     as_markdown,
     read_metrics,
     read_result,
+    shown_columns,
     tabulate,
 )
 from rsjax.config import require
@@ -211,7 +212,8 @@ def write_tables(out: Path, data: Path) -> list[Row]:
         write_atomically(out / "table.md", as_markdown(rows).encode())
         write_atomically(out / "table.csv", as_csv(rows).encode())
         write_json(out / "table.json", as_json(rows))
-        write_atomically(out / "table.png", draw(rows, f"{next(iter(runs)).config.name}: {out.name}"))
+        title = f"{next(iter(runs)).config.name}: {out.name}"
+        write_atomically(out / "table.png", draw(rows, shown_columns(rows), title))
     return rows
 
 

@@ -23,7 +23,7 @@ class EvalConfig:
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
-    localiser_steps: int = 800  # of the network that reads from frames where cube and gripper are
+    localiser_steps: int = 500  # of the network that reads from frames where cube and gripper are
     # Without these files, which are not part of this project, the metrics are null.
     lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips
     lpips_vgg_weights: str = ""

@@ -26,6 +26,7 @@ from rsjax.progress import Progress
 OBJECTS = ("cube", "gripper")
 BATCH = 64  # frames of a step
 MOVE = 8  # frames are moved by up to an eighth of their width
+SPREAD = 0.03  # of the Gaussian that the softmax is to be around an object, in widths of the frame
 
 
 def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, " B"]] | None:
@@ -43,22 +44,44 @@ def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, 
 
 
 class Network(nn.Module):
-    """Convolutions, and for each object the mean place under a softmax over the cells, with a linear correction."""
+    """A U-Net; each object is at the mean place under a softmax over its cells, each cell with a correction."""
 
     @nn.compact
-    def __call__(self, rgb: Array) -> tuple[Float[Array, "B 2 2"], Float[Array, " B"]]:
-        """Returns places, and the logit of "lifted"."""
-        x = rgb.astype(jnp.float32) / 127.5 - 1
-        for width, stride in ((24, 2), (32, 2), (32, 1), (32, 1), (32, 1)):
-            x = nn.relu(nn.GroupNorm(8)(nn.Conv(width, (3, 3), (stride, stride))(x)))
-        b, h, w, _ = x.shape
-        heat = jax.nn.softmax(nn.Conv(len(OBJECTS), (1, 1))(x).reshape(b, h * w, -1), axis=1)
-        rows, columns = jnp.divmod(jnp.arange(h * w), w)
-        cells = jnp.stack([(columns + 0.5) / w, (rows + 0.5) / h], -1)
-        around = jnp.einsum("bno,bnc->boc", heat, x.reshape(b, h * w, -1)).reshape(b, -1)  # features at the objects
-        xy = jnp.einsum("bno,nc->boc", heat, cells) + 0.1 * nn.Dense(4)(around).reshape(b, 2, 2)
-        seen = jnp.concatenate([around, xy.reshape(b, -1)], -1)
-        return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(seen)))[:, 0]
+    def __call__(self, rgb: Array) -> tuple[Float[Array, "B 2 2"], Float[Array, " B"], Float[Array, "B n 2"]]:
+        """Returns places, the logit of "lifted", and the softmax's log-probabilities of the n cells of 2×2 pixels."""
+        fine = _layer(nn.Conv(16, (4, 4), (2, 2))(rgb.astype(jnp.float32) / 127.5 - 1))
+        fine = _layer(nn.Conv(16, (3, 3))(fine))
+        middle = _layer(nn.Conv(32, (3, 3), (2, 2))(fine))
+        middle = _layer(nn.Conv(32, (3, 3))(middle))
+        coarse = _layer(nn.Conv(64, (3, 3), (2, 2))(middle))
+        coarse = _layer(nn.Conv(64, (3, 3))(coarse))
+        middle = _layer(nn.Conv(32, (3, 3))(middle) + _enlarged(nn.Conv(32, (1, 1))(coarse), middle))
+        fine = _layer(nn.Conv(16, (3, 3))(fine) + _enlarged(nn.Conv(16, (1, 1))(middle), fine))
+        fine = _layer(nn.Conv(16, (3, 3))(fine))
+
+        b, h, w, _ = fine.shape
+        log_p = jax.nn.log_softmax(nn.Conv(len(OBJECTS), (1, 1))(fine).reshape(b, h * w, -1), axis=1)
+        corrections = nn.Conv(2 * len(OBJECTS), (1, 1), kernel_init=nn.initializers.zeros)(fine)
+        at = _centres(h, w)[:, None] + 0.05 * corrections.reshape(b, h * w, -1, 2)
+        xy = jnp.einsum("bno,bnoc->boc", jnp.exp(log_p), at)
+        features = jnp.concatenate([fine, _enlarged(middle, fine)], -1).reshape(b, h * w, -1)
+        around = jnp.einsum("bno,bnc->boc", jnp.exp(log_p), features)  # features at the objects
+        seen = jnp.concatenate([around.reshape(b, -1), xy.reshape(b, -1)], -1)
+        return xy, nn.Dense(1)(nn.relu(nn.Dense(32)(seen)))[:, 0], log_p
+
+
+def _layer(x: Array) -> Array:
+    return nn.relu(nn.GroupNorm(8)(x))
+
+
+def _enlarged(x: Array, like: Array) -> Array:
+    """Repeats each cell 2×2 times, up to the size of ``like``."""
+    return x.repeat(2, axis=1).repeat(2, axis=2)[:, : like.shape[1], : like.shape[2]]
+
+
+def _centres(h: int, w: int) -> Float[Array, "n 2"]:
+    rows, columns = jnp.divmod(jnp.arange(h * w), w)
+    return jnp.stack([(columns + 0.5) / w, (rows + 0.5) / h], -1)
 
 
 @dataclass(frozen=True)
@@ -97,9 +120,12 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
 
 def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
     def loss(params: Any, frames: Array, xy: Array, lifted: Array) -> Array:
-        places, logit = _apply(params, frames)
+        places, logit, log_p = _apply(params, frames)
+        apart = _centres(-(-frames.shape[1] // 2), -(-frames.shape[2] // 2))[:, None] - xy[:, None]  # B n 2 2
+        near = jax.nn.softmax(-jnp.square(apart).sum(-1) / (2 * SPREAD**2), axis=1)
         # Absolute errors: a hidden cube has a large one, which must not rule the others.
-        return 10 * jnp.abs(places - xy).mean() + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()
+        error = 10 * jnp.abs(places - xy).mean() - 0.3 * (near * log_p).sum(1).mean()
+        return error + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()
 
     @jax.jit
     def step(params: Any, state: Any, frames: Array, xy: Array, lifted: Array) -> tuple[Any, Any]:
@@ -124,5 +150,5 @@ def varied(
 
 
 @jax.jit
-def _apply(params: Any, frames: Array) -> tuple[Array, Array]:
-    return cast(tuple[Array, Array], Network().apply(params, frames))
+def _apply(params: Any, frames: Array) -> tuple[Array, Array, Array]:
+    return cast(tuple[Array, Array, Array], Network().apply(params, frames))

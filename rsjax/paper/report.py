@@ -246,10 +246,11 @@ def _missing(result: Result) -> str:
 
 def _figure(outcome: Outcome) -> bytes | None:
     """Draws the arms' scores with every seed; None before any arm has one."""
-    names = {column.name for column in _columns(outcome)}
+    columns = _columns(outcome)
+    names = {column.name for column in columns}
     shown = [(arm, {name: value for name, value in arm.spreads.items() if name in names}) for arm in outcome.arms]
     rows = [Row({"": arm.name}, arm.finished, spreads) for arm, spreads in shown if spreads]
-    return draw(rows, f"{outcome.claim.place}: {outcome.claim.title}") if rows else None
+    return draw(rows, columns, f"{outcome.claim.place}: {outcome.claim.title}") if rows else None
 
 
 def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:

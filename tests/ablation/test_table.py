@@ -141,7 +141,7 @@ def test_the_picture_has_a_panel_per_metric_and_grows_with_the_rows() -> None:
     whole, part = rows_of(full(np.random.default_rng(4))), rows_of({0: {"psnr": 1.0}})
     sizes = []
     for rows in (whole, part, whole[:2], rows_of({})):
-        with Image.open(io.BytesIO(draw(rows, "a grid"))) as image:
+        with Image.open(io.BytesIO(draw(rows, shown_columns(rows), "a grid"))) as image:
             sizes.append(image.size)
     assert sizes[0][0] > sizes[1][0]
     assert sizes[0][1] > sizes[2][1]

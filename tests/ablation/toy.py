@@ -75,4 +75,4 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
     monkeypatch.setattr(stages, "train_tokenizer", lambda run, resume: leave(run, "tokenizer"))
     monkeypatch.setattr(stages, "prepare", lambda run: leave(run, "tokens"))
     monkeypatch.setattr(stages, "train_world_model", lambda run, resume: leave(run, "world_model"))
-    monkeypatch.setattr(sweep, "draw", lambda rows, title: b"")
+    monkeypatch.setattr(sweep, "draw", lambda rows, columns, title: b"")

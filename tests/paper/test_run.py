@@ -330,6 +330,19 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
     assert "(figures/toy-clip.webp)" in (tmp_path / "out" / "report.md").read_text()
 
 
+def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables of grids leave some of them out, such as Physics-IQ's."""
+    drawn: list[str] = []
+
+    def draw(rows: Any, columns: Any, title: str) -> bytes:
+        drawn.extend(column.name for column in columns)
+        return b""
+
+    monkeypatch.setattr(page, "draw", draw)
+    run(toy.plan(toy.claim()), tmp_path)
+    assert set(drawn) == {"psnr"}
+
+
 def test_mistakes_are_one_line(command: Commands) -> None:
     assert "not a duration" in command.refused("experiments.paper", "--budget", "long")
     assert "unknown preset" in command.refused("experiments.paper", "--preset", "tinny")

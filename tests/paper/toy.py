@@ -61,4 +61,4 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path, gain: float = 0.5
         (run.directory / "metrics.json").write_text(json.dumps(result.metrics | {"reasons": result.reasons}))
 
     monkeypatch.setattr(stages, "run_all", scored)
-    monkeypatch.setattr(report, "draw", lambda rows, title: b"")
+    monkeypatch.setattr(report, "draw", lambda rows, columns, title: b"")
