@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 from rsjax.clip import Video
 from rsjax.config import TopKConfig
 from rsjax.devices import divide
+from rsjax.models.apart import apart, together
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.models.roboscape.attention import KeyValues
@@ -82,8 +83,10 @@ def sample(
     network, later = LLaMA(arch), actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
     end = layout.length(layout.context + actions.shape[1])
 
+    parts = apart(params, arch.config.blocks, arch.config.unroll)
+
     def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:
-        out: Any = network.apply({"params": params}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
+        out: Any = network.apply({"params": together(parts)}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
         logits, new = out
         return new, logits[:, 0]
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
+from rsjax.models.apart import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Cache, Transformer, empty_cache
 from rsjax.trainable import Params
@@ -86,4 +87,4 @@ def _apply(
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
     inputs = (grids, mask.reshape(shape), actions, start, cache)
-    return Transformer(arch).apply({"params": params}, *inputs, drop, no_depth, previous)
+    return Transformer(arch).apply({"params": together(params)}, *inputs, drop, no_depth, previous)

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
+from rsjax.models.apart import apart
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.decode import Cells, Decoder, Means
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache, repeat_cache
@@ -212,6 +213,7 @@ def _rollout(
     keys: Array,
 ) -> Decoded:
     past = prompt["rgb"].shape[1]
+    params = apart(params, arch.blocks, arch.unroll)
     apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     tokens = _tokens(prompt, actions)
@@ -228,7 +230,7 @@ def _resume(
 ) -> Decoded:
     (clips, past), n = prompt.actions.shape[:2], len(actions)
     no_depth = None if prompt.no_depth is None else jnp.broadcast_to(prompt.no_depth, n)
-    apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
+    apply = partial(apply_guided, arch, sample, apart(params, arch.blocks, arch.unroll), no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
     return _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, past, frames)
