@@ -30,7 +30,7 @@ from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.gelu import gelu
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.transformer import Cache
+from rsjax.models.roboscape.transformer import Cache, StackedCache
 from rsjax.models.roboscape.window import cache_slots
 from rsjax.tokenizers.convolution import convolve
 from rsjax.tokenizers.flops import products as count_products
@@ -194,12 +194,12 @@ def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
     return run
 
 
-def full_cache(model: RoboScape, batch: int) -> Cache:
+def full_cache(model: RoboScape, batch: int) -> StackedCache:
     """Returns a cache of a full window."""
     return guided_cache(model.architecture, model.config.sample, batch, cache_slots(model.architecture, 1))
 
 
-def pass_flops(arch: Architecture, cache: Cache) -> int:
+def pass_flops(arch: Architecture, cache: StackedCache) -> int:
     """Returns the operations of a pass over one frame that reads the cache and itself."""
     _, clips, _, _, slots, _ = cache["rgb"].k.shape
     return clips * forward_flops(arch, slots + 1) // (slots + 1)

@@ -15,9 +15,9 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_pa
 
 def test_stacking_what_was_taken_apart_changes_nothing() -> None:
     params = random_params(DUAL)
-    parts = apart(params, DUAL.blocks, unroll=DUAL.blocks)
-    assert len(parts["blocks"]) == DUAL.blocks
-    jax.tree.map(np.testing.assert_array_equal, together(parts), params)
+    parts = apart(params["blocks"], DUAL.blocks, unroll=DUAL.blocks)
+    assert len(parts) == DUAL.blocks
+    jax.tree.map(np.testing.assert_array_equal, together(parts), params["blocks"])
 
 
 def test_a_scan_that_is_not_fully_unrolled_keeps_its_stacks() -> None:

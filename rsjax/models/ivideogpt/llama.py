@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import ClipShape, IVideoGPTConfig
+from rsjax.models.apart import together
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.roboscape.attention import Dense, KeyValues, attend_cells, attend_parts, put_frames, rotate
 from rsjax.trainable import Params
@@ -125,7 +126,8 @@ class LLaMA(nn.Module):
         Args:
             actions: of the later frames, in order; not read by a model without actions.
             first: position of the first token; may be traced.
-            cache: from :func:`empty_cache` or an earlier call; tokens before ``first`` are read from it.
+            cache: from :func:`empty_cache` or an earlier call, perhaps taken apart (:mod:`rsjax.models.apart`); tokens
+                before ``first`` are read from it.
             keys: of the dropout of each clip; None: no dropout.
 
         Returns:
@@ -150,7 +152,7 @@ class LLaMA(nn.Module):
             unroll=min(cfg.unroll, cfg.blocks),
         )
         new: Any
-        x, new = blocks(cfg, name="blocks")(x, (cache, jnp.arange(cfg.blocks)), first, keys)
+        x, new = blocks(cfg, name="blocks")(x, (together(cache), jnp.arange(cfg.blocks)), first, keys)
         x = nn.RMSNorm(epsilon=1e-6, name="norm")(x[:, skip:])
         head = Dense(layout.vocabulary, cfg.compute_dtype == "bfloat16", False, NORMAL, name="lm_head")
         return head(x), None if cache is None else put_frames(cache, new, first, ring=False)

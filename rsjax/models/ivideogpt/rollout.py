@@ -83,10 +83,12 @@ def sample(
     network, later = LLaMA(arch), actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
     end = layout.length(layout.context + actions.shape[1])
 
-    parts = apart(params, arch.config.blocks, arch.config.unroll)
+    blocks, unroll = arch.config.blocks, arch.config.unroll
+    parts = apart(params["blocks"], blocks, unroll)
 
     def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:
-        out: Any = network.apply({"params": together(parts)}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
+        whole = params | {"blocks": together(parts)}
+        out: Any = network.apply({"params": whole}, tokens, actions, first, cache, skip=tokens.shape[1] - 1)
         logits, new = out
         return new, logits[:, 0]
 
@@ -107,7 +109,7 @@ def sample(
         return forward(cache, pair, places[-1]), jnp.concatenate([pair[None, :, 1], drawn, last[None]])
 
     # One position more, since the last frame is also followed by a slot.
-    cache = empty_cache(arch, clips, end + 1)
+    cache = apart(empty_cache(arch, clips, end + 1), blocks, unroll)
     slot = jnp.full((clips, 1), layout.slot, given.dtype)
     start = forward(cache, jnp.concatenate([given, slot], axis=1), 0)
     slots = begin + layout.per_frame * jnp.arange(later)

@@ -15,6 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.matmul import matmul
+from rsjax.models.apart import block_part
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.frame_attention import attend_in_frames
 
@@ -135,14 +136,19 @@ def frames_held(slots: int, last: Int[Array, ""] | int) -> Int[Array, " slots"]:
     return last - (last - jnp.arange(slots)) % slots
 
 
-def put_frames(cache: KeyValues, new: KeyValues, start: Any, ring: bool) -> KeyValues:
+def put_frames(cache: Any, new: Any, start: Any, ring: bool) -> Any:
     """Returns a cache into which new frames from ``start`` on are written; both have a leading axis over blocks.
 
     Args:
+        cache: a tree of :class:`KeyValues`, or :func:`rsjax.models.apart.apart` of it.
+        new: a tree alike.
         ring: whether positions beyond the number of slots wrap around.
     """
 
-    def put(old: Float[Array, "L B S h N e"], fresh: Float[Array, "L B S h T e"]) -> Float[Array, "L B S h N e"]:
+    if isinstance(cache, list):
+        return [put_frames(old, block_part(new, i), start, ring) for i, old in enumerate(cache)]
+
+    def put(old: Float[Array, "*L B S h N e"], fresh: Float[Array, "*L B S h T e"]) -> Float[Array, "*L B S h N e"]:
         fresh = fresh.astype(old.dtype)
         if not ring:
             return jax.lax.dynamic_update_slice_in_dim(old, fresh, start, axis=-2)

@@ -15,7 +15,7 @@ from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.apart import together
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.transformer import Cache, Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Cache, StackedCache, Transformer, empty_cache
 from rsjax.trainable import Params
 
 
@@ -53,12 +53,12 @@ def apply_guided(
     return logits, cache
 
 
-def guided_cache(arch: Architecture, sample: SampleConfig, batch: int, slots: int) -> Cache:
+def guided_cache(arch: Architecture, sample: SampleConfig, batch: int, slots: int) -> StackedCache:
     """Returns an empty cache for :func:`apply_guided`."""
     return empty_cache(arch, _copies(sample) * batch, slots, jnp.dtype(sample.cache_dtype))
 
 
-def repeat_cache(sample: SampleConfig, cache: Cache, clips: int) -> Cache:
+def repeat_cache(sample: SampleConfig, cache: StackedCache, clips: int) -> StackedCache:
     """Returns the cache of one clip repeated for ``clips`` clips."""
 
     def repeat(x: Float[Array, "L c S h N e"]) -> Float[Array, "L cB S h N e"]:
@@ -87,4 +87,5 @@ def _apply(
     shape = (*mask.shape[:2], arch.grid, arch.grid)
     grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
     inputs = (grids, mask.reshape(shape), actions, start, cache)
-    return Transformer(arch).apply({"params": together(params)}, *inputs, drop, no_depth, previous)
+    whole = params | {"blocks": together(params["blocks"])}
+    return Transformer(arch).apply({"params": whole}, *inputs, drop, no_depth, previous)

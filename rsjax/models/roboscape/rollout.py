@@ -27,7 +27,7 @@ from rsjax.models.apart import apart
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.decode import Cells, Decoder, Means
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache, repeat_cache
-from rsjax.models.roboscape.transformer import Cache
+from rsjax.models.roboscape.transformer import Cache, StackedCache
 from rsjax.models.roboscape.window import cache_slots, room, stride, window_actions, window_start
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
@@ -42,7 +42,7 @@ class Prompt:
 
     tokens: Tokens
     actions: Float[Array, "B P A"]
-    cache: Cache  # of all frames but the last, whose commit is fused with the next frame's first step
+    cache: StackedCache  # of all frames but the last, whose commit is fused with the next frame's first step
     no_depth: Bool[Array, " B"] | None  # as for :func:`rollout`
     # Settings that the cache depends on and a rollout must share; the stride is resolved.
     guided: bool = struct.field(pytree_node=False)
@@ -213,8 +213,7 @@ def _rollout(
     keys: Array,
 ) -> Decoded:
     past = prompt["rgb"].shape[1]
-    params = apart(params, arch.blocks, arch.unroll)
-    apply = partial(apply_guided, arch, sample, params, no_depth=no_depth)
+    apply = partial(apply_guided, arch, sample, _apart(arch, params), no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     tokens = _tokens(prompt, actions)
     if cached:
@@ -230,7 +229,7 @@ def _resume(
 ) -> Decoded:
     (clips, past), n = prompt.actions.shape[:2], len(actions)
     no_depth = None if prompt.no_depth is None else jnp.broadcast_to(prompt.no_depth, n)
-    apply = partial(apply_guided, arch, sample, apart(params, arch.blocks, arch.unroll), no_depth=no_depth)
+    apply = partial(apply_guided, arch, sample, _apart(arch, params), no_depth=no_depth)
     decoder = Decoder(arch, sample, apply, actions, keys, no_depth)
     cache = prompt.cache if clips == n else repeat_cache(sample, prompt.cache, n)
     return _decode_cached(decoder, _tokens(prompt.tokens, actions), cache, past, frames)
@@ -253,10 +252,14 @@ def _encode(
 _encode_jit = jax.jit(_encode, static_argnums=(0, 1))
 
 
-def _decode_cached(decoder: Decoder, tokens: Cells, cache: Cache, past: int, frames: Array) -> Decoded:
+def _apart(arch: Architecture, params: Params) -> Params:
+    return params | {"blocks": apart(params["blocks"], arch.blocks, arch.unroll)}
+
+
+def _decode_cached(decoder: Decoder, tokens: Cells, cache: StackedCache, past: int, frames: Array) -> Decoded:
     """Decodes frames ``past`` to ``frames`` - 1, window by window, with the cache of the first of these windows."""
     arch, sample, length = decoder.arch, decoder.sample, decoder.actions.shape[1]
-    made = (tokens, _means(decoder, tokens), cache)
+    made = (tokens, _means(decoder, tokens), apart(cache, arch.blocks, arch.unroll))
     if arch.positions == "rotary" or length <= arch.frames:
         return _decoded(decoder, *jax.lax.fori_loop(past, frames, partial(decoder.cached, 0), made)[:2])
     by, first = stride(arch, sample), window_start(arch, sample, past)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from rsjax.models.apart import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
 from rsjax.models.roboscape.blocks import DualBlock
@@ -20,7 +21,8 @@ from rsjax.models.roboscape.gelu import gelu
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
-Cache = dict[str, KeyValues]
+StackedCache = dict[str, KeyValues]  # by branch
+Cache = StackedCache | list[StackedCache]  # of all blocks; of each, taken apart (rsjax.models.apart)
 
 MUP_WIDTH = 256  # the public code's base width
 
@@ -121,9 +123,9 @@ class Transformer(nn.Module):
             unroll=min(cfg.unroll, cfg.blocks),
         )
         new: Any
-        x, new = blocks(cfg, name="blocks")(x, cache, start)
+        x, new = blocks(cfg, name="blocks")(x, together(cache), start)
         if cache is not None:
-            cache = {branch: put_frames(old, new[branch], start, rotary) for branch, old in cache.items()}
+            cache = put_frames(cache, new, start, rotary)
         return {branch: self._head(branch, features) for branch, features in x.items()}, cache
 
     def _action(self, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None) -> Float[Array, "B T 1 C"]:
@@ -171,7 +173,7 @@ def _rematerialised(config: Architecture) -> Any:
     return nn.remat(DualBlock, prevent_cse=config.unroll > 1, policy=keep)
 
 
-def empty_cache(config: Architecture, batch: int, frames: int, dtype: Any = jnp.float32) -> Cache:
+def empty_cache(config: Architecture, batch: int, frames: int, dtype: Any = jnp.float32) -> StackedCache:
     """Returns a cache of ``frames`` slots for every block and branch: zeros, never read before they are written."""
     shape = (config.blocks, batch, config.grid**2, config.heads, frames, config.head_width)
     zeros = jnp.zeros(shape, dtype)
