@@ -9,7 +9,7 @@ import pytest
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
-from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
 CANDIDATES, PROMPT, FRAMES = 3, 3, 8
 
@@ -49,10 +49,10 @@ def test_a_shared_prompt_is_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     model, sample, seen = replace(RGB, grid=1, frames=FRAMES), SampleConfig(steps=2), count_model(monkeypatch)
     tokens = {"rgb": np.zeros((1, PROMPT, 1, 1), np.int32)}
     with jax.disable_jit():
-        prompt = encode_prompt(model, sample, {}, tokens, np.zeros((1, PROMPT, 3), np.float32))
+        prompt = encode_prompt(model, sample, NO_PARAMS, tokens, np.zeros((1, PROMPT, 3), np.float32))
         assert seen.pop("frames") == PROMPT - 1
         plans = np.zeros((CANDIDATES, FRAMES - PROMPT, 3), np.float32)
-        rollout_from(model, sample, {}, prompt, plans, KEY)
+        rollout_from(model, sample, NO_PARAMS, prompt, plans, KEY)
     assert seen["frames"] == CANDIDATES * (FRAMES - PROMPT) * 3
 
 

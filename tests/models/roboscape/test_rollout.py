@@ -12,7 +12,7 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import lfq
-from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
 
 @pytest.mark.parametrize(
@@ -147,6 +147,6 @@ def test_a_rollout_costs_the_frame_passes_that_it_should(
     with jax.disable_jit():
         for cached in (True, False):
             seen.clear()
-            rollout(model, SampleConfig(steps=steps), {}, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
+            rollout(model, SampleConfig(steps=steps), NO_PARAMS, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
             costs.append(seen["frames"])
     assert costs == [cached_passes, steps * (frames - 1) * frames]

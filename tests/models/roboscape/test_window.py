@@ -15,7 +15,7 @@ from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.window import room, window_actions, window_start
-from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, count_model, given, random_params
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
 Positions = Literal["learned", "rotary"]
 ROTARY = replace(RGB, positions="rotary")
@@ -106,7 +106,7 @@ def test_a_longer_rollout_is_no_larger_a_program(
     for frames in (16, 48, 96):
         seen.clear()
         tokens, actions = given(model, 1, frames)
-        program = jax.make_jaxpr(lambda t, a: rollout(model, SampleConfig(), {}, t, a, KEY))(tokens, actions)
+        program = jax.make_jaxpr(lambda t, a: rollout(model, SampleConfig(), NO_PARAMS, t, a, KEY))(tokens, actions)
         calls[frames], sizes[frames] = seen["calls"], str(program).count("\n")
     assert calls == {16: 2, 48: beyond, 96: beyond}
     assert sizes[48] == sizes[96]
@@ -130,5 +130,5 @@ def test_a_jump_costs_the_frames_that_are_encoded_anew(
     model, seen = replace(RGB, frames=16, grid=1, positions=positions), count_model(monkeypatch)
     with jax.disable_jit():
         tokens = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}
-        rollout(model, SampleConfig(), {}, tokens, np.zeros((1, 48, 3), np.float32), KEY)
+        rollout(model, SampleConfig(), NO_PARAMS, tokens, np.zeros((1, 48, 3), np.float32), KEY)
     assert seen["frames"] == passes
