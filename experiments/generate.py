@@ -50,6 +50,8 @@ class Options:
     """Draw from the k most probable codes of each vocabulary; 0: from all."""
     mean_codes: bool | None = None
     """Decode pictures from mean codes instead of the most probable ones; no effect at temperatures above 0."""
+    read_means: bool | None = None
+    """Let later frames read the mean codes too; no effect without --mean-codes."""
     guidance: float | None = None
     """Strength of guidance; 1: none. By actions it needs model.action_dropout, by text model.text.dropout or a file."""
     window_stride: int | None = None

@@ -102,7 +102,7 @@ def tiny() -> Config:
             # In so few steps corruption and visible prefixes cost more than they gain (docs/results/miniature.md).
             mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
             # A second step changes nothing in the pictures (docs/results/miniature.md) and takes half as long again.
-            sample=SampleConfig(steps=1, mean_codes=True),
+            sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
         ),
         train=LoopConfig(
             steps=2000,

@@ -70,6 +70,12 @@ def mean_codes(logits: Float[Array, "*batch n V"], code_bits: int) -> Float[Arra
     return expected.reshape(*expected.shape[:-2], code_bits)
 
 
+def code_shares(codes: Float[Array, "*batch D"], vocabularies: int) -> Float[Array, "*batch n V"]:
+    """Returns each sub-token's probability if a code's bits are independent and have these means in [-1, 1]."""
+    bits = codes.reshape(*codes.shape[:-1], vocabularies, 1, -1)
+    return jnp.prod((1 + bits * vocabulary_codes(codes.shape[-1], vocabularies)) / 2, axis=-1)
+
+
 def commitment_loss(latents: Float[Array, "*batch D"]) -> Scalar:
     """Returns mean((x - sg(q))²), float32, which keeps the latents near their codes."""
     latents = latents.astype(jnp.float32)

@@ -54,16 +54,17 @@ class Decoder:
                 writes for t is overwritten later.
         """
         tokens, means, cache = carry
-        pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in tokens.items()}
+        read = means if self.sample.reads_means else tokens
+        pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in read.items()}
         actions = window_actions(self.arch, self.actions, base, t - 1, 2)
-        before = {name: grid[:, t - 2] for name, grid in tokens.items()}
+        before = {name: grid[:, t - 2] for name, grid in read.items()}
         frame, cache = self.decode_pair(pair, before, actions, t - base, self._step_keys(t), cache)
         return _put(tokens, frame.tokens, t), _put(means, frame.means, t), cache
 
     def decode_pair(
         self,
-        pair: Cells,
-        before: Cells,
+        pair: Cells | Means,
+        before: Cells | Means,
         actions: Float[Array, "B 2 A"],
         position: Array | int,
         keys: Key[Array, "B steps"],
@@ -72,25 +73,25 @@ class Decoder:
         """Decodes the second of two frames: one pass over both, which commits the first one, then passes over it alone.
 
         Args:
-            pair: tokens of both; the second one's have no effect.
-            before: (B, S) tokens of the frame before both, for ``read_previous``; not read if the first is its window's
-                first.
+            pair: what is read of both: tokens, or mean codes if ``sample.reads_means``; the second's have no effect.
+            before: likewise of the frame before both, without T, for ``read_previous``; not read if the first is its
+                window's first.
             actions: into both, as the window has them.
             position: the second one's in the window.
             cache: of the frames before the first one.
         """
-        b, _, cells = pair["rgb"].shape
+        b, _, cells = pair["rgb"].shape[:3]
         mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
         previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
         logits, cache = self.apply(pair, mask, actions, position - 1, cache, previous=previous)
         entropy = jnp.zeros((b, cells)) if self.entropy else None
-        given = {name: grid[:, 1] for name, grid in pair.items()}
-        frame = Frame(given, mask[:, 1], entropy, no_means(self.arch, self.sample, b))
+        undecided = {name: jnp.zeros((b, cells), jnp.int32) for name in pair}
+        frame = Frame(undecided, mask[:, 1], entropy, no_means(self.arch, self.sample, b))
         frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
         previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
         def step(i: Array, frame: Frame) -> Frame:
-            one = {name: grid[:, None] for name, grid in frame.tokens.items()}
+            one = {name: grid[:, None] for name, grid in self._read(frame).items()}
             logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], position, cache, previous=previous)
             return self._unmask(keys[:, i], i, frame, {name: x[:, 0] for name, x in logits.items()})
 
@@ -102,9 +103,10 @@ class Decoder:
         length = self.arch.frames - stride(self.arch, self.sample) - 1
         if length == 0:
             return carry
-        kept = {name: jax.lax.dynamic_slice_in_dim(grid, base, length, axis=1) for name, grid in tokens.items()}
+        read = means if self.sample.reads_means else tokens
+        kept = {name: jax.lax.dynamic_slice_in_dim(grid, base, length, axis=1) for name, grid in read.items()}
         actions = window_actions(self.arch, self.actions, base, base, length)
-        _, cache = self.apply(kept, jnp.zeros(kept["rgb"].shape, bool), actions, 0, cache)
+        _, cache = self.apply(kept, jnp.zeros(kept["rgb"].shape[:3], bool), actions, 0, cache)
         return tokens, means, cache
 
     def uncached(self, t: Array, carry: tuple[Cells, Means]) -> tuple[Cells, Means]:
@@ -119,7 +121,7 @@ class Decoder:
         frame = Frame(given, jnp.ones((b, cells), bool), None, no_means(self.arch, self.sample, b))
 
         def step(i: Array, frame: Frame) -> Frame:
-            grids = _put(tokens, frame.tokens, t)
+            grids = _put(means if self.sample.reads_means else tokens, self._read(frame), t)
             seen = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, base, length, axis=1), grids)
             here = jnp.arange(length)[None, :, None] == t - base
             logits, _ = self.apply(seen, here & frame.mask[:, None], actions, 0, None)
@@ -130,6 +132,9 @@ class Decoder:
 
         frame = jax.lax.fori_loop(0, self.sample.steps, step, frame)
         return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
+
+    def _read(self, frame: Frame) -> dict[str, Array]:
+        return frame.means if self.sample.reads_means else frame.tokens
 
     def _step_keys(self, t: Array) -> Key[Array, "B steps"]:
         return jax.vmap(lambda key: step_keys(self.sample, key, t))(self.keys)

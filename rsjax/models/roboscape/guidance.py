@@ -9,13 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.apart import together
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.transformer import Cache, StackedCache, Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, Transformer, empty_cache
 from rsjax.trainable import Params
 
 
@@ -23,13 +23,13 @@ def apply_guided(
     arch: Architecture,
     sample: SampleConfig,
     params: Params,
-    tokens: dict[str, Int[Array, "B T S"]],
+    tokens: dict[str, Cells],
     mask: Bool[Array, "B T S"],
     actions: Float[Array, "B T A"],
     start: Any,
     cache: Cache | None,
     no_depth: Bool[Array, " B"] | None = None,
-    previous: dict[str, Int[Array, "B T S"]] | None = None,
+    previous: dict[str, Cells] | None = None,
     strength: Float[Array, " B"] | None = None,
 ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
     """Returns logits without + g·(with - without the actions), g = ``sample.guidance``, and the cache.
@@ -85,7 +85,7 @@ def _apply(
     previous: Any,
 ) -> Any:
     shape = (*mask.shape[:2], arch.grid, arch.grid)
-    grids = {name: cells.reshape(shape) for name, cells in tokens.items()}
+    grids = {name: cells.reshape(*shape, *cells.shape[3:]) for name, cells in tokens.items()}
     inputs = (grids, mask.reshape(shape), actions, start, cache)
     whole = params | {"blocks": together(params["blocks"])}
     return Transformer(arch).apply({"params": whole}, *inputs, drop, no_depth, previous)

@@ -23,6 +23,7 @@ from rsjax.models.roboscape.decode import Decoder, no_means, step_keys
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.transformer import Cache
 from rsjax.models.roboscape.window import cache_slots, stride
+from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
 
@@ -58,7 +59,7 @@ class State:
         frame: the next frame's number in its clip.
         key: decides each clip's draws.
         entropy: of the last frame's RGB tokens in nats; None unless the network says so.
-        means: of the last frame, by branch, if it has been decoded; empty unless ``sample.shows_means``.
+        means: mean codes of the last K frames by branch; empty unless ``sample.shows_means``.
     """
 
     tokens: dict[str, Int[Array, "B K S"]]
@@ -69,7 +70,7 @@ class State:
     frame: Int[Array, " B"]
     key: Key[Array, " B"]
     entropy: Float[Array, "B S"] | None = None
-    means: dict[str, Float[Array, "B S D"]] = struct.field(default_factory=dict)
+    means: dict[str, Float[Array, "B K S D"]] = struct.field(default_factory=dict)
 
 
 AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, entropy=0, means=0)  # type: ignore[arg-type]  # of clips
@@ -100,7 +101,7 @@ def begin(net: Network, clips: int) -> State:
         frame=numbers,
         key=jax.random.split(jax.random.key(0), clips),
         entropy=jnp.zeros((clips, arch.grid**2)) if net.entropy else None,
-        means=no_means(arch, net.sample, clips),
+        means={name: jnp.stack([codes] * kept, axis=1) for name, codes in no_means(arch, net.sample, clips).items()},
     )
 
 
@@ -119,10 +120,15 @@ def restart(
         return jnp.where(which.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
     tokens = {name: grid.at[:, -1].set(pick(first[name], grid[:, -1])) for name, grid in state.tokens.items()}
+    means = {
+        name: grid.at[:, -1].set(pick(lfq.tokens_to_codes(first[name], grid.shape[-1]), grid[:, -1]))
+        for name, grid in state.means.items()
+    }
     # The cache stays: what is in it has positions that a clip has yet to reach, and is not read.
     return replace(
         state,
         tokens=tokens,
+        means=means,
         actions=pick(0.0, state.actions),
         base=pick(0.0, state.base),
         position=pick(1, state.position),
@@ -160,10 +166,11 @@ def _decoder(net: Network, params: Params, dials: Dials | None = None) -> Decode
 
 def _decode(net: Network, params: Params, state: State, actions: Float[Array, " A"], dials: Dials | None) -> State:
     """Decodes one clip's next frame; without the axis over clips."""
-    pair = {name: jnp.stack([grid[-1], grid[-1]])[None] for name, grid in state.tokens.items()}
+    read = _read(net, state)
+    pair = {name: jnp.stack([grid[-1], grid[-1]])[None] for name, grid in read.items()}
     rows = _window_rows(net.arch, jnp.stack([state.actions[-1], actions]), state.base, state.position - 1)[None]
     keys = step_keys(net.sample, state.key, state.frame)[None]
-    before = {name: grid[-2:-1] if len(grid) > 1 else grid for name, grid in state.tokens.items()}
+    before = {name: grid[-2:-1] if len(grid) > 1 else grid for name, grid in read.items()}
     frame, cache = _decoder(net, params, dials).decode_pair(pair, before, rows, state.position, keys, state.cache)
     return replace(
         state,
@@ -173,13 +180,18 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
         position=state.position + 1,
         frame=state.frame + 1,
         entropy=None if frame.entropy is None else frame.entropy[0],
-        means={name: codes[0] for name, codes in frame.means.items()},
+        means={name: jnp.append(grid[1:], frame.means[name], axis=0) for name, grid in state.means.items()},
     )
+
+
+def _read(net: Network, state: State) -> dict[str, Array]:
+    """Returns what later frames read of the last K: tokens, or mean codes."""
+    return state.means if net.sample.reads_means else state.tokens
 
 
 def last_frame(net: Network, state: State, name: str) -> Int[Array, "B H W"] | Float[Array, "B H W D"]:
     """Returns what a branch's last frame is decoded from: mean codes if there are any, or tokens."""
-    made = state.means[name] if state.means else state.tokens[name][:, -1]
+    made = (state.means or state.tokens)[name][:, -1]
     return made.reshape(-1, net.arch.grid, net.arch.grid, *made.shape[2:])
 
 
@@ -188,7 +200,7 @@ def _move_window(net: Network, params: Params, state: State, full: Bool[Array, "
     kept = kept_frames(net)
     base, cache = state.actions[-kept], state.cache
     if kept > 1:
-        tokens = {name: grid[None, -kept:-1] for name, grid in state.tokens.items()}
+        tokens = {name: grid[None, -kept:-1] for name, grid in _read(net, state).items()}
         rows = _window_rows(net.arch, state.actions[-kept:-1], base, 0)[None]
         mask = jnp.zeros((1, kept - 1, net.arch.grid**2), bool)
         _, cache = _decoder(net, params).apply(tokens, mask, rows, 0, cache)

@@ -6,6 +6,7 @@ that led from frame t-1 into frame t is added at frame t.
 Axes: B clips, T frames, H×W = S token cells, A action dimensions, n vocabularies of V codes, C width.
 """
 
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -21,6 +22,8 @@ from rsjax.models.roboscape.gelu import gelu
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
+# Of each cell its token, or its code: the mean of each bit in [-1, 1].
+Cells = Int[Array, "B T S"] | Float[Array, "B T S D"]
 StackedCache = dict[str, KeyValues]  # by branch
 Cache = StackedCache | list[StackedCache]  # of all blocks; of each, taken apart (rsjax.models.apart)
 
@@ -28,21 +31,25 @@ MUP_WIDTH = 256  # the public code's base width
 
 
 class TokenEmbed(nn.Module):
-    """The sum of the sub-tokens' embeddings; one learned vector for masked cells."""
+    """The sum of the sub-tokens' embeddings, or of their means under a code; one learned vector for masked cells."""
 
     config: Architecture
 
     @nn.compact
-    def __call__(self, tokens: Int[Array, "B T S"], mask: Bool[Array, "B T S"]) -> Float[Array, "B T S C"]:
+    def __call__(self, cells: Cells, mask: Bool[Array, "B T S"]) -> Float[Array, "B T S C"]:
         cfg = self.config
-        sub_tokens = lfq.split_tokens(tokens, cfg.code_bits, cfg.vocabularies)
         init = nn.initializers.normal(cfg.embed_std)
-        embedded = sum(
-            nn.Embed(cfg.vocabulary_size, cfg.width, embedding_init=init, name=f"factored_embed_{k}")(
-                sub_tokens[..., k]
-            )
+        tables = [
+            nn.Embed(cfg.vocabulary_size, cfg.width, embedding_init=init, name=f"factored_embed_{k}")
             for k in range(cfg.vocabularies)
-        )
+        ]
+        if jnp.issubdtype(cells.dtype, jnp.integer):
+            sub_tokens = lfq.split_tokens(cells, cfg.code_bits, cfg.vocabularies)
+            embedded = sum(table(sub_tokens[..., k]) for k, table in enumerate(tables))
+        else:
+            shares, codes = lfq.code_shares(cells, cfg.vocabularies), jnp.arange(cfg.vocabulary_size)
+            mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # tokens' codes embed as tokens do
+            embedded = sum(mean(shares[..., k, :], table(codes)) for k, table in enumerate(tables))
         mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.position_std), (cfg.width,))
         return jnp.where(mask[..., None], mask_embed, embedded)
 
@@ -55,19 +62,19 @@ class Transformer(nn.Module):
     @nn.compact
     def __call__(
         self,
-        tokens: dict[str, Int[Array, "B T H W"]],
+        tokens: dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"]],
         mask: Bool[Array, "B T H W"],
         actions: Float[Array, "B T A"] | None,
         start: Any = 0,
         cache: Cache | None = None,
         drop_actions: Bool[Array, " B"] | None = None,
         no_depth: Bool[Array, " B"] | None = None,
-        previous: dict[str, Int[Array, "B T S"]] | None = None,
+        previous: dict[str, Cells] | None = None,
     ) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
         """Returns logits of every cell of frames start … start + T - 1 by branch, and the cache.
 
         Args:
-            tokens: by branch ("rgb", and "depth" if the model has it); ignored where ``mask`` is True.
+            tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
             mask: True for masked cells, in both branches.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
@@ -92,7 +99,7 @@ class Transformer(nn.Module):
         if cfg.read_previous and previous is None and not (isinstance(start, int) and start == 0):
             raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
-        cells = lambda x: x.reshape(b, t, cfg.grid**2)  # noqa: E731
+        cells = lambda x: x.reshape(b, t, cfg.grid**2, *x.shape[4:])  # noqa: E731
         init = nn.initializers.normal(cfg.position_std)
         rotary = cfg.positions == "rotary"  # then the blocks encode time
         if not rotary and t + (start if isinstance(start, int) else 0) > cfg.frames:
@@ -110,7 +117,7 @@ class Transformer(nn.Module):
         if cfg.read_previous:
             first = (start + jnp.arange(t) == 0)[:, None]
             for branch, before in (previous or {name: shifted(cells(tokens[name])) for name in x}).items():
-                absent = jnp.broadcast_to(first, before.shape)
+                absent = jnp.broadcast_to(first, before.shape[:3])
                 if branch == "depth" and no_depth is not None:
                     absent = absent | no_depth[:, None, None]
                 x[branch] = x[branch] + TokenEmbed(cfg, name=f"{branch}_previous_embed")(before, absent)
@@ -160,7 +167,7 @@ class Transformer(nn.Module):
         return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
 
 
-def shifted(frames: Int[Array, "B T S"]) -> Int[Array, "B T S"]:
+def shifted(frames: Cells) -> Cells:
     """Returns the frame before each frame; for the first, itself."""
     return jnp.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
 

@@ -93,3 +93,10 @@ _departure(
     {"model.sample.mean_codes": False},
     _METRICS,
 )
+_departure(
+    "read-means",
+    "Later frames read mean codes instead of the most probable ones",
+    "What the model was unsure of in one frame is not lost to the next ones.",
+    {"model.sample.read_means": False},
+    _METRICS,
+)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from rsjax.config import SampleConfig
 from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
-from rsjax.models.roboscape.transformer import Transformer
+from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
@@ -61,11 +62,12 @@ def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
             np.testing.assert_array_equal(out[name][:, t].reshape(BATCH, -1), codes[..., 0] + 8 * codes[..., 1])
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int) -> None:
-    """Tokens stay as they are without them; with one step each frame's mean codes follow from the tokens before it."""
-    model, params, (tokens, actions) = DUAL, random_params(DUAL), given(DUAL, 2)
-    sample = SampleConfig(steps=steps, mean_codes=True)
+@pytest.mark.parametrize(("steps", "read"), [(1, False), (1, True), (3, False), (3, True)])
+def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int, read: bool) -> None:
+    """With one step each frame's mean codes follow from what it reads: tokens as without them, or mean codes."""
+    model = replace(DUAL, read_previous=True)
+    params, (tokens, actions) = random_params(model), given(model, 2)
+    sample = SampleConfig(steps=steps, mean_codes=True, read_means=read)
     drawn = rollout(model, replace(sample, mean_codes=False), params, tokens, actions, KEY)
     cached, plain = (rollout(model, sample, params, tokens, actions, KEY, cached=c) for c in (True, False))
     apply = jax.jit(Transformer(model).apply)
@@ -76,7 +78,7 @@ def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int) -> Non
         for t in range(2, 6) if steps == 1 else ():
             mask = np.zeros((BATCH, 6, 3, 3), bool)
             mask[:, t:] = True
-            logits, _ = apply({"params": params}, drawn, mask, actions)
+            logits, _ = apply({"params": params}, cached if read else drawn, mask, actions)
             expected = lfq.mean_codes(logits[name][:, t], model.code_bits).reshape(means[:, t].shape)
             np.testing.assert_allclose(means[:, t], expected, atol=1e-5)
     warm = rollout(model, replace(sample, temperature=1.0), params, tokens, actions, KEY)
@@ -150,3 +152,22 @@ def test_a_rollout_costs_the_frame_passes_that_it_should(
             rollout(model, SampleConfig(steps=steps), NO_PARAMS, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
             costs.append(seen["frames"])
     assert costs == [cached_passes, steps * (frames - 1) * frames]
+
+
+@pytest.mark.parametrize("read_previous", [False, True])
+def test_codes_of_tokens_are_read_as_the_tokens_and_mean_codes_as_the_mean(read_previous: bool) -> None:
+    model = replace(DUAL, read_previous=read_previous)
+    params, (tokens, actions) = random_params(model), given(model, 6)
+    mask = np.random.default_rng(3).random((BATCH, 6, 3, 3)) < 0.5
+    apply = jax.jit(Transformer(model).apply)
+    codes = {name: lfq.tokens_to_codes(jnp.asarray(grid), model.code_bits) for name, grid in tokens.items()}
+    of_tokens, of_codes = (apply({"params": params}, cells, mask, actions)[0] for cells in (tokens, codes))
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), of_codes, of_tokens)
+
+    embed = TokenEmbed(model)
+    table = {"params": params["rgb_embed"]}
+    either = jnp.array([[[5]], [[13]]])  # they differ in bit 3 alone
+    unsure = lfq.tokens_to_codes(either, model.code_bits).mean(0, keepdims=True)
+    visible = jnp.zeros((2, 1, 1), bool)
+    expected = embed.apply(table, either, visible).mean(0, keepdims=True)
+    np.testing.assert_allclose(embed.apply(table, unsure, visible[:1]), expected, atol=1e-6)

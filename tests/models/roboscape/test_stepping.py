@@ -25,8 +25,9 @@ FRAMES = 15
         (SUMS, SampleConfig(steps=2, temperature=1.0, window_stride=2)),
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
         (SUMS, SampleConfig(steps=2, mean_codes=True)),
+        (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
     ],
-    ids=["dual-sums", "rotary-guided", "means"],
+    ids=["dual-sums", "rotary-guided", "means", "read-means"],
 )
 def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
     model: Architecture, sample: SampleConfig
