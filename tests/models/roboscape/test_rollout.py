@@ -164,10 +164,9 @@ def test_codes_of_tokens_are_read_as_the_tokens_and_mean_codes_as_the_mean(read_
     of_tokens, of_codes = (apply({"params": params}, cells, mask, actions)[0] for cells in (tokens, codes))
     jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), of_codes, of_tokens)
 
-    embed = TokenEmbed(model)
-    table = {"params": params["rgb_embed"]}
+    embed: Any = partial(TokenEmbed(model).apply, {"params": params["rgb_embed"]})
     either = jnp.array([[[5]], [[13]]])  # they differ in bit 3 alone
     unsure = lfq.tokens_to_codes(either, model.code_bits).mean(0, keepdims=True)
     visible = jnp.zeros((2, 1, 1), bool)
-    expected = embed.apply(table, either, visible).mean(0, keepdims=True)
-    np.testing.assert_allclose(embed.apply(table, unsure, visible[:1]), expected, atol=1e-6)
+    expected = embed(either, visible).mean(0, keepdims=True)
+    np.testing.assert_allclose(embed(unsure, visible[:1]), expected, atol=1e-6)
