@@ -339,8 +339,9 @@ def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeyp
         return b""
 
     monkeypatch.setattr(page, "draw", draw)
-    run(toy.plan(toy.claim()), tmp_path)
-    assert set(drawn) == {"psnr"}
+    compared = (Comparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial"))
+    run(toy.plan(toy.claim("toy", *compared)), tmp_path)
+    assert set(drawn) == {"psnr", "physics_iq_spatial"}
 
 
 def test_mistakes_are_one_line(command: Commands) -> None:
