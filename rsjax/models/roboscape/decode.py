@@ -54,7 +54,7 @@ class Decoder:
                 writes for t is overwritten later.
         """
         tokens, means, cache = carry
-        read = means if self.sample.reads_means else tokens
+        read = self._read(tokens, means)
         pair = {name: jax.lax.dynamic_slice_in_dim(grid, t - 1, 2, axis=1) for name, grid in read.items()}
         actions = window_actions(self.arch, self.actions, base, t - 1, 2)
         before = {name: grid[:, t - 2] for name, grid in read.items()}
@@ -91,7 +91,7 @@ class Decoder:
         previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
         def step(i: Array, frame: Frame) -> Frame:
-            one = {name: grid[:, None] for name, grid in self._read(frame).items()}
+            one = {name: grid[:, None] for name, grid in self._read(frame.tokens, frame.means).items()}
             logits, _ = self.apply(one, frame.mask[:, None], actions[:, 1:], position, cache, previous=previous)
             return self._unmask(keys[:, i], i, frame, {name: x[:, 0] for name, x in logits.items()})
 
@@ -103,7 +103,7 @@ class Decoder:
         length = self.arch.frames - stride(self.arch, self.sample) - 1
         if length == 0:
             return carry
-        read = means if self.sample.reads_means else tokens
+        read = self._read(tokens, means)
         kept = {name: jax.lax.dynamic_slice_in_dim(grid, base, length, axis=1) for name, grid in read.items()}
         actions = window_actions(self.arch, self.actions, base, base, length)
         _, cache = self.apply(kept, jnp.zeros(kept["rgb"].shape[:3], bool), actions, 0, cache)
@@ -121,7 +121,7 @@ class Decoder:
         frame = Frame(given, jnp.ones((b, cells), bool), None, no_means(self.arch, self.sample, b))
 
         def step(i: Array, frame: Frame) -> Frame:
-            grids = _put(means if self.sample.reads_means else tokens, self._read(frame), t)
+            grids = _put(self._read(tokens, means), self._read(frame.tokens, frame.means), t)
             seen = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, base, length, axis=1), grids)
             here = jnp.arange(length)[None, :, None] == t - base
             logits, _ = self.apply(seen, here & frame.mask[:, None], actions, 0, None)
@@ -133,8 +133,9 @@ class Decoder:
         frame = jax.lax.fori_loop(0, self.sample.steps, step, frame)
         return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
 
-    def _read(self, frame: Frame) -> dict[str, Array]:
-        return frame.means if self.sample.reads_means else frame.tokens
+    def _read(self, tokens: dict[str, Array], means: dict[str, Array]) -> dict[str, Array]:
+        """Returns what later passes read."""
+        return means if self.sample.reads_means else tokens
 
     def _step_keys(self, t: Array) -> Key[Array, "B steps"]:
         return jax.vmap(lambda key: step_keys(self.sample, key, t))(self.keys)
