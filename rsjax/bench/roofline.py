@@ -184,8 +184,8 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
 def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
     """Returns a pass over the last frame of a full window, from parameters and the cache of the frames before."""
     arch, sample = model.architecture, model.config.sample
-    tokens, actions = inputs.prompt(arch, batch, 1), inputs.actions(arch, batch, 1)
-    hidden = jnp.ones((batch, 1, arch.grid**2), bool)
+    actions, hidden = inputs.actions(arch, batch, 1), jnp.ones((batch, 1, arch.grid**2), bool)
+    tokens = {name: cells.reshape(hidden.shape) for name, cells in inputs.prompt(arch, batch, 1).items()}
 
     def run(params: Params, cache: Cache) -> Any:
         start = jnp.asarray(arch.frames - 1)
