@@ -1,7 +1,7 @@
 """The interface of models that go on from any frame of a clip, in several ways: what ``experiments.play`` needs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -43,6 +43,7 @@ class Moment:
         entropy: of each RGB token when it was decided, in nats, (S,); None for a first frame.
         memory: the family's own; None if it was used up.
         size: bytes of the part of it that :meth:`Branching.lightened` leaves out.
+        means: the mean codes by branch that the frame is decoded from, (S, D); empty: it is decoded from its tokens.
     """
 
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -50,6 +51,7 @@ class Moment:
     entropy: Float[np.ndarray, " S"] | None
     memory: Any
     size: int = 0
+    means: dict[str, Float32[np.ndarray, "S D"]] = field(default_factory=dict)
 
 
 class Branching(Protocol):
@@ -82,6 +84,6 @@ class Branching(Protocol):
         """
         ...
 
-    def depth(self, tokens: dict[str, Int[np.ndarray, " S"]]) -> Float32[np.ndarray, "H W"] | None:
+    def depth(self, moment: Moment) -> Float32[np.ndarray, "H W"] | None:
         """Returns a frame's depth in metres; None if its clip has none."""
         ...

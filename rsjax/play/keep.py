@@ -157,7 +157,7 @@ def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str
 
 
 def _depth(session: Session, node: Node) -> np.ndarray:
-    depth = session.engine.branching(True).depth(node.moment.tokens)
+    depth = session.engine.branching(True).depth(node.moment)
     assert depth is not None
     return depth
 

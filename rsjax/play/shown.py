@@ -52,7 +52,7 @@ async def send_depth(session: Session, side: Side, place: Place, node: Node) -> 
 
 
 def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
-    depth = session.engine.branching(session.has_depth).depth(node.moment.tokens)
+    depth = session.engine.branching(session.has_depth).depth(node.moment)
     near_far = session.run.trained.assets.normalization.depth_range
     return None if depth is None or near_far is None else frames.depth_picture("depth", place, depth, *near_far)
 

@@ -106,7 +106,7 @@ def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
     """Returns what a policy sees of a frame."""
     seen = {"rgb": node.moment.rgb}
     if session.has_depth:
-        depth = session.engine.branching(True).depth(node.moment.tokens)
+        depth = session.engine.branching(True).depth(node.moment)
         seen |= {} if depth is None else {"depth": depth}
     return seen
 

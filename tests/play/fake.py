@@ -62,7 +62,8 @@ class FakeBranching:
         memory = moment.memory
         return moment if memory is None or memory.light else replace(moment, memory=None)
 
-    def depth(self, tokens: dict[str, np.ndarray]) -> np.ndarray | None:
+    def depth(self, moment: Moment) -> np.ndarray | None:
+        tokens = moment.tokens
         return np.full((64, 64), 1.0, np.float32) + tokens["depth"][0] / 100 if "depth" in tokens else None
 
     def _next(self, moment: Moment, action: np.ndarray, how: Decoding) -> Moment:

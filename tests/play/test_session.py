@@ -188,7 +188,7 @@ def test_frames_of_two_viewers_share_passes_and_keep_their_bits(server: Server, 
         threads = [threading.Thread(target=drive, args=each) for each in zip((one, other), made, strict=True)]
         for thread in threads:
             thread.start()
-        threading.Timer(1.5, fake.gate.set).start()  # by then both have asked, on a busy machine too
+        threading.Timer(3, fake.gate.set).start()  # by then both have asked, on a busy machine too
         for thread in threads:
             thread.join()
         assert 2 in fake.passes, "no pass had two frames, which tests nothing"

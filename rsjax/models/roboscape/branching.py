@@ -21,8 +21,9 @@ from rsjax.config import TokenizerConfig, TokenModelConfig
 from rsjax.data.normalization import with_sums
 from rsjax.models.moments import Decoding, Moment
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.stepping import Dials, Network, State, advance, begin, restart
+from rsjax.models.roboscape.stepping import Dials, Network, State, advance, begin, last_frame, restart
 from rsjax.models.roboscape.transformer import Cache
+from rsjax.tokenizers import lfq
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -96,7 +97,7 @@ class TokenBranching:
         seeds = np.array([(each.seed, each.draw) for each in chosen], np.uint32)
         own = [memory.cache for memory in memories[:count]] + [None] * (self.lanes - count)
         caches = tuple(self._empty_cache() if cache is None else cache for cache in own)
-        states = tuple(memory.state for memory in memories)
+        states = tuple(_fitted(net, memory.state) for memory in memories)
         codec = self._codec
         made, caches, rgb = _advance(net, codec.config, self._params, codec.params, caches, states, rows, seeds, dials)
         pictures = np.asarray(rgb)
@@ -110,10 +111,11 @@ class TokenBranching:
         full = self._arch.positions == "learned" and int(memory.state.position[0]) == self._arch.frames
         return replace(moment, memory=replace(memory, cache=None) if full else None)
 
-    def depth(self, tokens: dict[str, Int[np.ndarray, " S"]]) -> Float32[np.ndarray, "H W"] | None:
-        if "depth" not in tokens:
+    def depth(self, moment: Moment) -> Float32[np.ndarray, "H W"] | None:
+        cells = (moment.means or moment.tokens).get("depth")
+        if cells is None:
             return None
-        return self._codec.decode_depth(tokens["depth"].reshape(1, self._arch.grid, self._arch.grid))[0]
+        return self._codec.decode_depth(cells.reshape(1, self._arch.grid, self._arch.grid, *cells.shape[1:]))[0]
 
     def _network(self, decoding: Decoding) -> Network:
         """Returns the settings of the program for a decoding, whose temperature and guidance are arguments of it.
@@ -122,19 +124,28 @@ class TokenBranching:
         """
         drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.action_dropout else 1.0
         sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
-        # A moment has tokens, so its pictures are decoded from them.
-        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k, mean_codes=False)
+        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k)
         return Network(self._arch, sample, self._has_depth, True)
 
     def _empty_cache(self) -> Cache:
         return jax.tree.map(jnp.copy, self._empty.cache)  # a pass uses up what it gets
 
     def _moment(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> Moment:
-        tokens = {name: np.asarray(grid[0, -1]) for name, grid in memory.state.tokens.items()}
-        if not self._has_depth:
-            tokens.pop("depth", None)
+        state = memory.state
+        last = {
+            kind: {name: np.asarray(cells[0, -1]) for name, cells in of.items() if name == "rgb" or self._has_depth}
+            for kind, of in (("tokens", state.tokens), ("means", state.means))
+        }
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
-        return Moment(rgb, tokens, np.asarray(cast(Array, memory.state.entropy)[0]), memory, size)
+        return Moment(rgb, last["tokens"], np.asarray(cast(Array, state.entropy)[0]), memory, size, last["means"])
+
+
+def _fitted(net: Network, state: State) -> State:
+    """Returns a state with mean codes if these settings show them: for frames that have none, their tokens' codes."""
+    if not net.sample.shows_means:
+        return replace(state, means={})
+    codes = {name: lfq.tokens_to_codes(cells, net.arch.code_bits) for name, cells in state.tokens.items()}
+    return replace(state, means=state.means or codes)
 
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(4,))
@@ -154,7 +165,7 @@ def _advance(
     state: State = jax.tree.map(lambda *rows: jnp.concatenate(rows), *states)
     cache: Cache = jax.tree.map(lambda *clips: jnp.concatenate(clips, axis=1), *caches)
     state = advance(net, params, replace(state, cache=cache, key=keys), actions, dials)
-    grid = state.tokens["rgb"][:, -1].reshape(-1, net.arch.grid, net.arch.grid)
+    grid = last_frame(net, state, "rgb")
     pixels = cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode"))
     numbers = [slice(i, i + 1) for i in range(len(states))]
     parts = tuple(jax.tree.map(lambda x, at=at: x[at], replace(state, cache={})) for at in numbers)

@@ -8,6 +8,7 @@ import pytest
 from rsjax.clip import Video
 from rsjax.config import SampleConfig
 from rsjax.data.store import Store
+from rsjax.models.base import create_model
 from rsjax.models.moments import Branching, Decoding, Moment
 from rsjax.models.trained import TrainedModel
 from tests.pipeline import toy
@@ -63,9 +64,39 @@ def test_frames_are_those_of_generate(lanes: Branching, model: TrainedModel, cli
     video = model.generate(clip["rgb"][:1], actions, clip["depth"][:1])
     rgb = np.stack([moment.rgb for moment in made])
     assert np.abs(rgb.astype(int) - video.rgb[1:]).max() <= 1  # pictures decoded in other numbers differ by a level
-    depth = lanes.depth(made[-1].tokens)
+    depth = lanes.depth(made[-1])
     assert video.depth is not None and depth is not None
     np.testing.assert_allclose(depth, video.depth[-1], rtol=0.01)
+
+
+def test_frames_of_mean_codes_are_those_of_generate_and_drawn_ones_may_come_between(
+    model: TrainedModel, clips: Store
+) -> None:
+    means = SampleConfig(steps=2, mean_codes=True, read_means=True)
+    shown = with_sample(model, means)
+    lanes = shown.model.branching(shown.params, shown.assets, True, lanes=2)
+    actions, clip, sure = rows(1), clips.source("test")[1], Decoding(steps=2)
+    made = alone(lanes, lanes.begin(first(clips, 1)), actions[1:], sure)
+    video = shown.generate(clip["rgb"][:1], actions, clip["depth"][:1])
+    tokens = with_sample(model, replace(means, mean_codes=False)).generate(clip["rgb"][:1], actions, clip["depth"][:1])
+    # Of the first frames: what is read of mean codes that differ in rounding drifts apart.
+    rgb = np.stack([moment.rgb for moment in made[:3]]).astype(int)
+    assert np.abs(rgb - video.rgb[1:4]).max() <= 1
+    assert np.abs(rgb - tokens.rgb[1:4]).max() > 10
+    depth = lanes.depth(made[2])
+    assert video.depth is not None and depth is not None
+    np.testing.assert_allclose(depth, video.depth[3], rtol=0.01)
+
+    start = lanes.begin(first(clips, 1))
+    assert not start.means
+    for how, has_means in ((DRAWN, False), (sure, True), (DRAWN, False)):
+        [start] = lanes.advance([start], actions[1:2], [how])
+        assert bool(start.means) == has_means
+
+
+def with_sample(model: TrainedModel, sample: SampleConfig) -> TrainedModel:
+    config = toy.with_model(model.config, sample=sample)
+    return TrainedModel(config, create_model(config), model.params, model.assets)
 
 
 def test_a_frame_has_the_same_bits_whoever_shares_its_pass(lanes: Branching, clips: Store) -> None:
