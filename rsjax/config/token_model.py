@@ -21,6 +21,11 @@ class MaskConfig:
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
     corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
     visible_prefix: float = 0.0  # step 3: share of the clips in which all frames before a random one stay visible
+    # With model.whole_frames: in this share of the steps after so many, every frame is predicted from the model's own
+    # prediction of the frame before (its mean codes), as in a rollout. Such a step is a third more work. Not in the
+    # reference.
+    own_frames: float = added(0.0)
+    own_frames_after: int = added(0)
 
 
 @dataclass(frozen=True)
@@ -121,6 +126,11 @@ class TransformerConfig:
     # spatial attention finds more than masks in the frame to predict. No output sees its own frame by it. Not in the
     # paper.
     read_previous: bool = False
+    # All cells of every frame but a clip's first stay masked, so each frame is predicted as a whole, from the actions
+    # and the frames before, which the network sees by read_previous alone. Training then asks of every cell what
+    # decoding in one step asks, and decoding makes one pass over a frame instead of two; further decoding steps gain
+    # nothing. The paper and the public code mask a share of the cells.
+    whole_frames: bool = added(False)
     width: int = 256
     blocks: int = 32
     heads: int = 8
@@ -168,6 +178,11 @@ class TransformerConfig:
             "model.action_dropout; set them to False and 0",
         )
         require(
+            self.read_previous or not self.whole_frames,
+            "model.whole_frames masks all frames but the first, and model.read_previous is off, so the model would see "
+            "no other frame; switch it on",
+        )
+        require(
             0 <= self.action_dropout < 1,
             f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
         )
@@ -213,10 +228,21 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     def check(self, clips: ClipShape) -> None:
         require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
+        require_range(self.mask, "model.mask", 0, 1, "own_frames")
         require(
             clips.frames <= self.frames(clips),
             f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "
             f"it to 0 (as many as the clips have)",
+        )
+        require(
+            self.whole_frames or not self.mask.own_frames,
+            f"model.mask.own_frames is {self.mask.own_frames}, but without model.whole_frames no single pass predicts "
+            f"all frames; switch that on, or set own_frames to 0",
+        )
+        require(
+            not (self.whole_frames and self.mask.visible_prefix),
+            f"model.mask.visible_prefix is {self.mask.visible_prefix}, but model.whole_frames leaves no frame visible "
+            f"after the first; set one of them to 0 or False",
         )
         check_sampling(self.sample, self.frames(clips), self.action_dropout)
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import jax
 
-from rsjax.config import Config, LoopConfig, TokenizerConfig, require
+from rsjax.config import Config, LoopConfig, TokenizerConfig, TokenModelConfig, require
 from rsjax.config.leaves import with_values
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tokenizers.flops import tokenizer_flops
@@ -92,6 +92,9 @@ def scale(preset: Config, seconds: float) -> Scale:
     base = with_values(preset, values)
     steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
     base = with_values(base, {"train.steps": min(preset.train.steps, max(LEAST_STEPS, _round(steps)))})
+    if isinstance(base.model, TokenModelConfig):
+        begin = base.model.mask.own_frames_after * base.train.steps // preset.train.steps
+        base = with_values(base, {"model.mask.own_frames_after": begin})
     return Scale(seconds, base)
 
 
@@ -113,7 +116,11 @@ def cut(config: Config, share: float) -> Config:
 def train_flops(config: Config) -> int | None:
     """Returns the operations of the world model's whole training; None for a family without counts."""
     per_clip = create_model(config).flops(config.clips.frames).get("train")
-    return None if per_clip is None else config.train.steps * config.train.batch_size * per_clip
+    if per_clip is None:
+        return None
+    # A step on own frames has another forward pass, a third of a step. Counted as if they began with the first step.
+    own = config.model.mask.own_frames / 3 if isinstance(config.model, TokenModelConfig) else 0.0
+    return round(config.train.steps * config.train.batch_size * per_clip * (1 + own))
 
 
 @cache

@@ -96,3 +96,19 @@ def test_two_families_of_one_name_are_refused() -> None:
             pass
 
     assert FAMILIES["genie"] is GenieConfig
+
+
+def test_frames_that_are_masked_whole_must_be_read_otherwise() -> None:
+    with pytest.raises(ConfigError, match="model.read_previous is off"):
+        RoboScapeConfig(whole_frames=True)
+    model = RoboScapeConfig(read_previous=True, whole_frames=True, mask=MaskConfig(visible_prefix=0.5))
+    with pytest.raises(ConfigError, match="model.mask.visible_prefix is 0.5"):
+        replace(DEBUG, model=model)
+
+
+def test_own_frames_need_whole_frames_and_are_a_share() -> None:
+    model = RoboScapeConfig(read_previous=True, mask=MaskConfig(own_frames=0.5))
+    with pytest.raises(ConfigError, match="model.mask.own_frames is 0.5, but without model.whole_frames"):
+        replace(DEBUG, model=model)
+    with pytest.raises(ConfigError, match=r"model.mask.own_frames is 1.5; it must be 0 … 1"):
+        replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames=1.5)))

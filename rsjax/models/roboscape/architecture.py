@@ -57,6 +57,15 @@ class Architecture(TransformerConfig):
         """Names of the network's branches."""
         return ("rgb", "depth") if self.use_depth else ("rgb",)
 
+    @property
+    def uncommitted(self) -> int:
+        """Frames at the end of those known that a temporal cache lacks.
+
+        The pass that begins the next frame commits the last one, whose cells it sees decided. A pass over a whole
+        masked frame is final.
+        """
+        return 0 if self.whole_frames else 1
+
     def check_sampling(self, sample: SampleConfig) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the network does not support these settings."""
         check_sampling(sample, self.frames, self.action_dropout)

@@ -46,12 +46,11 @@ class Decoder:
     entropy: bool = False
 
     def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
-        """Decodes frame t with the cache of frames before t-1: one pass over (t-1, t), then passes over t.
+        """Decodes frame t with the cache of the frames before, all but ``arch.uncommitted`` of them.
 
         Args:
             base: the first frame of the window.
-            carry: tokens and means of all frames, and the cache. The first pass commits t-1 to the cache; what it
-                writes for t is overwritten later.
+            carry: tokens and means of all frames, and the cache.
         """
         tokens, means, cache = carry
         read = self._read(tokens, means)
@@ -72,22 +71,27 @@ class Decoder:
     ) -> tuple[Frame, Cache]:
         """Decodes the second of two frames: one pass over both, which commits the first one, then passes over it alone.
 
+        What the first pass writes for the second frame is overwritten later. With ``arch.whole_frames`` it is final,
+        and the first frame, which is in the cache, is left out.
+
         Args:
             pair: what is read of both: tokens, or mean codes if ``sample.reads_means``; the second's have no effect.
             before: likewise of the frame before both, without T, for ``read_previous``; not read if the first is its
                 window's first.
             actions: into both, as the window has them.
             position: the second one's in the window.
-            cache: of the frames before the first one.
+            cache: of the frames before the first one, or before the second.
         """
         b, _, cells = pair["rgb"].shape[:3]
+        first = 1 - self.arch.uncommitted  # of the pass
         mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
         previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
-        logits, cache = self.apply(pair, mask, actions, position - 1, cache, previous=previous)
+        seen, rows, known = jax.tree.map(lambda x: x[:, first:], (pair, actions, previous))
+        logits, cache = self.apply(seen, mask[:, first:], rows, position - 1 + first, cache, previous=known)
         entropy = jnp.zeros((b, cells)) if self.entropy else None
         undecided = {name: jnp.zeros((b, cells), jnp.int32) for name in pair}
         frame = Frame(undecided, mask[:, 1], entropy, no_means(self.arch, self.sample, b))
-        frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, 1] for name, x in logits.items()})
+        frame = self._unmask(keys[:, 0], 0, frame, {name: x[:, -1] for name, x in logits.items()})
         previous = {name: grid[:, 1:] for name, grid in previous.items()}
 
         def step(i: Array, frame: Frame) -> Frame:
@@ -98,9 +102,9 @@ class Decoder:
         return jax.lax.fori_loop(1, self.sample.steps, step, frame), cache
 
     def encode_anew(self, base: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
-        """Fills the cache with the frames that a window beginning at ``base`` keeps, except the last of them."""
+        """Fills the cache with the frames that a window beginning at ``base`` keeps."""
         tokens, means, cache = carry
-        length = self.arch.frames - stride(self.arch, self.sample) - 1
+        length = self.arch.frames - stride(self.arch, self.sample) - self.arch.uncommitted
         if length == 0:
             return carry
         read = self._read(tokens, means)

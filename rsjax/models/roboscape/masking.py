@@ -76,6 +76,16 @@ def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Ar
     return jax.vmap(lambda place: jax.random.bernoulli(jax.random.fold_in(key, place), rate))(index)
 
 
+def reads_own_frames(config: MaskConfig, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
+    """Draws whether this step's clips are read as the model predicts them; never in the first steps.
+
+    Args:
+        key: the step's key, as for :func:`corrupt`.
+    """
+    drawn = jax.random.bernoulli(jax.random.fold_in(key, 3), config.own_frames)
+    return drawn & (step >= config.own_frames_after)
+
+
 def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int) -> tuple[Array, Array]:
     """Draws the probability per frame that a sub-token is replaced, (T,), and f."""
     u_key, happens_key, f_key, keep_key, decay_key = jax.random.split(key, 5)

@@ -30,8 +30,9 @@ from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.imagine import Imagined
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
+from rsjax.models.roboscape.own_frames import previous_frames
 from rsjax.models.roboscape.records import Batch
-from rsjax.models.roboscape.transformer import Transformer, empty_cache
+from rsjax.models.roboscape.transformer import Transformer, empty_cache, hidden
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
@@ -185,9 +186,16 @@ class RoboScape(WorldModel[Batch]):
         masked = masking.corrupt(self.config.mask, *shape, key, clean, batch.index)
         drop = masking.dropped_actions(arch.action_dropout, key, batch.index) if arch.action_dropout else None
         no_depth = None if batch.has_depth is None else batch.has_depth == 0
-        inputs = (masked.tokens, masked.mask, batch.actions)
-        logits, _ = Transformer(arch).apply({"params": params}, *inputs, drop_actions=drop, no_depth=no_depth)
-        predictions = Predictions(self, logits, clean, masked.mask, batch)
+        mask = hidden(arch, masked.mask)
+        inputs = (masked.tokens, mask, batch.actions)
+        apply = partial(Transformer(arch).apply, drop_actions=drop, no_depth=no_depth)
+        previous = None
+        if self.config.mask.own_frames:
+            own = masking.reads_own_frames(self.config.mask, key, context.step)
+            fixed = {"params": jax.lax.stop_gradient(params)}
+            previous = previous_frames(lambda: apply(fixed, *inputs)[0], masked.tokens, arch.code_bits, own)
+        logits, _ = apply({"params": params}, *inputs, previous=previous)
+        predictions = Predictions(self, logits, clean, mask, batch)
         terms = {name: TERMS[name](predictions) for name in TERMS if name in self.loss_weights}
         return jax.tree.map(lambda x: x.astype("float32"), terms)
 

@@ -42,7 +42,7 @@ class Prompt:
 
     tokens: Tokens
     actions: Float[Array, "B P A"]
-    cache: StackedCache  # of all frames but the last, whose commit is fused with the next frame's first step
+    cache: StackedCache  # of all frames but ``Architecture.uncommitted``
     no_depth: Bool[Array, " B"] | None  # as for :func:`rollout`
     # Settings that the cache depends on and a rollout must share; the stride is resolved.
     guided: bool = struct.field(pytree_node=False)
@@ -241,8 +241,8 @@ def _encode(
     b, past = prompt["rgb"].shape[:2]
     cache: Any = guided_cache(arch, sample, b, cache_slots(arch, past))
     base = int(window_start(arch, sample, past))
-    if (known := past - 1 - base) > 0:
-        tokens = {name: grid[:, base : past - 1].reshape(b, known, -1) for name, grid in prompt.items()}
+    if (known := past - arch.uncommitted - base) > 0:
+        tokens = {name: grid[:, base : base + known].reshape(b, known, -1) for name, grid in prompt.items()}
         seen = window_actions(arch, actions, base, base, known)
         mask = jnp.zeros((b, known, arch.grid**2), bool)
         _, cache = apply_guided(arch, sample, params, tokens, mask, seen, 0, cache, no_depth)

@@ -54,7 +54,8 @@ class State:
         tokens: of the last K frames by branch.
         actions: into these frames, as a whole clip's (sums since its first frame).
         base: the row of ``actions`` of the window's first frame.
-        cache: of the window's frames but the last; clips are axis 1.
+        cache: of the window's frames but the last ``Architecture.uncommitted``, and but a clip's first until the next
+            step; clips are axis 1.
         position: the next frame's in its window.
         frame: the next frame's number in its clip.
         key: decides each clip's draws.
@@ -147,9 +148,9 @@ def advance(
         dials: each clip's settings; None: those of the network.
     """
     if net.arch.positions == "learned":
-        full = state.position == net.arch.frames
-        moved = jax.vmap(partial(_move_window, net, params), in_axes=(AXES, 0), out_axes=AXES)
-        state = jax.lax.cond(full.any(), moved, lambda kept, full: kept, state, full)
+        state = _begin_windows(net, params, kept_frames(net), state, state.position == net.arch.frames)
+    if not net.arch.uncommitted:
+        state = _begin_windows(net, params, 1, state, state.position == 1)
     return jax.vmap(partial(_decode, net, params), in_axes=(AXES, 0, 0), out_axes=AXES)(state, actions, dials)
 
 
@@ -195,16 +196,22 @@ def last_frame(net: Network, state: State, name: str) -> Int[Array, "B H W"] | F
     return made.reshape(-1, net.arch.grid, net.arch.grid, *made.shape[2:])
 
 
-def _move_window(net: Network, params: Params, state: State, full: Bool[Array, ""]) -> State:
-    """Moves one clip's window if it is full, and fills the cache with the frames that stay but the last."""
-    kept = kept_frames(net)
+def _begin_windows(net: Network, params: Params, kept: int, state: State, which: Bool[Array, " B"]) -> State:
+    """Begins windows of some clips anew with their last ``kept`` frames, and encodes these into the cache."""
+    begun = jax.vmap(partial(_begin_window, net, params, kept), in_axes=(AXES, 0), out_axes=AXES)
+    return jax.lax.cond(which.any(), begun, lambda state, which: state, state, which)
+
+
+def _begin_window(net: Network, params: Params, kept: int, state: State, this: Bool[Array, ""]) -> State:
+    """Does so for one clip if ``this`` is True."""
     base, cache = state.actions[-kept], state.cache
-    if kept > 1:
-        tokens = {name: grid[None, -kept:-1] for name, grid in _read(net, state).items()}
-        rows = _window_rows(net.arch, state.actions[-kept:-1], base, 0)[None]
-        mask = jnp.zeros((1, kept - 1, net.arch.grid**2), bool)
+    if encoded := kept - net.arch.uncommitted:
+        frames = slice(-kept, encoded - kept or None)
+        tokens = {name: grid[None, frames] for name, grid in _read(net, state).items()}
+        rows = _window_rows(net.arch, state.actions[frames], base, 0)[None]
+        mask = jnp.zeros((1, encoded, net.arch.grid**2), bool)
         _, cache = _decoder(net, params).apply(tokens, mask, rows, 0, cache)
-    choose = partial(jax.tree.map, lambda new, old: jnp.where(full, new, old))
+    choose = partial(jax.tree.map, lambda new, old: jnp.where(this, new, old))
     return replace(
         state,
         base=choose(base, state.base),

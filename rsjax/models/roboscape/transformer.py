@@ -75,7 +75,7 @@ class Transformer(nn.Module):
 
         Args:
             tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
-            mask: True for masked cells, in both branches.
+            mask: True for masked cells, in both branches; with ``config.whole_frames`` more are, see :func:`hidden`.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
                 not exceed ``config.frames``, which is not checked.
@@ -107,12 +107,12 @@ class Transformer(nn.Module):
         position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
         position = position if rotary else jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
         shared = position + self._action(actions, drop_actions) if cfg.action_inputs else position
-        hidden = dict.fromkeys(cfg.branches, cells(mask))
+        masks = dict.fromkeys(cfg.branches, cells(hidden(cfg, mask, start)))
         if cfg.use_depth and no_depth is not None:
-            hidden["depth"] = hidden["depth"] | no_depth[:, None, None]  # not in place: the caller owns the mask
+            masks["depth"] = masks["depth"] | no_depth[:, None, None]  # not in place: the caller owns the mask
         x = {
             branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), masked) + shared
-            for branch, masked in hidden.items()
+            for branch, masked in masks.items()
         }
         if cfg.read_previous:
             first = (start + jnp.arange(t) == 0)[:, None]
@@ -165,6 +165,17 @@ class Transformer(nn.Module):
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
         return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
+
+
+def hidden(config: Architecture, mask: Bool[Array, "B T H W"], start: Any = 0) -> Bool[Array, "B T H W"]:
+    """Returns the cells that the network does not see: the masked ones, or all after a clip's first frame.
+
+    Args:
+        start: position of the first of these frames.
+    """
+    if not config.whole_frames:
+        return mask
+    return mask | (start + jnp.arange(mask.shape[1]) > 0)[:, None, None]
 
 
 def shifted(frames: Cells) -> Cells:

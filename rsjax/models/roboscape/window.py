@@ -44,7 +44,7 @@ def cache_slots(arch: Architecture, past: int) -> int:
     In the pass over frames (t-1, t), frame t-1 still attends to t - ``arch.frames``, so a rolling cache has one slot
     more than the window. A longer prompt is encoded in one pass and must fit.
     """
-    return arch.frames if arch.positions == "learned" else max(arch.frames + 1, past - 1)
+    return arch.frames if arch.positions == "learned" else max(arch.frames + 1, past - arch.uncommitted)
 
 
 def window_actions(

@@ -83,7 +83,21 @@ _departure(
     "read-previous",
     "Every frame's input has the tokens of the frame before it",
     "What stays need not be found by temporal attention first.",
-    {"model.read_previous": False},
+    {"model.read_previous": False, "model.whole_frames": False, "model.mask.own_frames": 0.0},
+    _METRICS,
+)
+_departure(
+    "whole-frames",
+    "All cells of every frame masked, instead of a share of them",
+    "Decoding in one step begins with no cell of the frame, so training on shares of it asks something else.",
+    {"model.whole_frames": False, "model.mask.own_frames": 0.0},
+    _METRICS,
+)
+_departure(
+    "own-frames",
+    "Frames predicted from the model's own predictions in half of the steps",
+    "A rollout reads what the model made, which training on true frames alone never shows it.",
+    {"model.mask.own_frames": 0.0},
     _METRICS,
 )
 _departure(

@@ -100,6 +100,14 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
         np.testing.assert_allclose(terms[name], (value, cells[name]), rtol=1e-4, err_msg=name)
 
 
+def test_whole_frames_are_scored_in_every_cell_after_the_first_frame() -> None:
+    model = replace(MODEL, read_previous=True, whole_frames=True)
+    batch = random_batch()
+    scored = {name: float(weight) for name, (_, weight) in terms_of(model, LOSS, random_params(model), batch).items()}
+    frames, cells = MODEL.frames - 1, MODEL.grid**2
+    assert scored["rgb"] == scored["depth"] == scored["attention"] == batch.weight.sum() * frames * cells
+
+
 def objective(params: Any, batch: Batch) -> tuple[Any, Any]:
     return combine(terms_of(MODEL, LOSS, params, batch), model_of(MODEL, LOSS).loss_weights)
 

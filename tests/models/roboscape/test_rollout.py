@@ -15,6 +15,8 @@ from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
+WHOLE = replace(DUAL, read_previous=True, whole_frames=True)
+
 
 @pytest.mark.parametrize(
     ("model", "prompt", "sample"),
@@ -26,6 +28,8 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, 
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
         (replace(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
         (replace(DUAL, read_previous=True), 3, SampleConfig(steps=1)),
+        (WHOLE, 1, SampleConfig(steps=1)),
+        (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
     ],
     ids=[
         "dual-2-random",
@@ -35,6 +39,8 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, 
         "rgb-3-prompt-2-warm",
         "previous-1-prompt",
         "previous-3-prompt",
+        "whole-1-prompt",
+        "whole-3-prompt-warm",
     ],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
@@ -152,6 +158,14 @@ def test_a_rollout_costs_the_frame_passes_that_it_should(
             rollout(model, SampleConfig(steps=steps), NO_PARAMS, tokens, np.zeros((1, frames, 3)), KEY, cached=cached)
             costs.append(seen["frames"])
     assert costs == [cached_passes, steps * (frames - 1) * frames]
+
+
+def test_a_whole_frame_costs_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, seen = replace(RGB, frames=16, grid=1, read_previous=True, whole_frames=True), count_model(monkeypatch)
+    tokens = {"rgb": np.zeros((1, 3, 1, 1), np.int32)}
+    with jax.disable_jit():
+        rollout(model, SampleConfig(steps=1), NO_PARAMS, tokens, np.zeros((1, 16, 3)), KEY)
+    assert seen["frames"] == 16  # the prompt, in one pass, and 13 others
 
 
 @pytest.mark.parametrize("read_previous", [False, True])

@@ -26,8 +26,19 @@ FRAMES = 15
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
         (SUMS, SampleConfig(steps=2, mean_codes=True)),
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
+        (replace(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
+        (replace(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5)),
+        (replace(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
     ],
-    ids=["dual-sums", "rotary-guided", "means", "read-means"],
+    ids=[
+        "dual-sums",
+        "rotary-guided",
+        "means",
+        "read-means",
+        "whole-frames",
+        "whole-frames-one-kept",
+        "whole-frames-rotary-guided",
+    ],
 )
 def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
     model: Architecture, sample: SampleConfig
@@ -48,7 +59,7 @@ def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
         for name in state.tokens:
             for clip in range(BATCH):
                 made[name][clip].append(np.asarray(last_frame(net, state, name)[clip]))
-    same = partial(np.testing.assert_allclose, rtol=0, atol=1e-5)  # tokens are whole numbers, mean codes are not
+    same = partial(np.testing.assert_allclose, rtol=0, atol=1e-4)  # tokens are whole numbers, mean codes are not
     for name, grid in expected.items():
         truth = np.asarray(grid)
         same(made[name][0], truth[0, 1:], err_msg=name)

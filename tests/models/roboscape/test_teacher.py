@@ -17,6 +17,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, rand
 
 SAMPLE = SampleConfig(steps=1, window_stride=2)
 SUMS = replace(RGB, action_inputs=4, integrate_actions=True, read_previous=True)
+WHOLE = replace(SUMS, whole_frames=True)
 ROTARY = replace(RGB, positions="rotary", read_previous=True)
 NONE, FIRST = np.zeros(BATCH, bool), np.arange(BATCH) == 0
 
@@ -52,8 +53,8 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
 
 @pytest.mark.parametrize(
     ("model", "past", "frames", "no_depth"),
-    [(DUAL, 1, 6, NONE), (DUAL, 2, 5, FIRST), (SUMS, 3, 11, NONE), (ROTARY, 1, 11, NONE)],
-    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long"],
+    [(DUAL, 1, 6, NONE), (DUAL, 2, 5, FIRST), (SUMS, 3, 11, NONE), (ROTARY, 1, 11, NONE), (WHOLE, 2, 9, NONE)],
+    ids=["dual", "some-without-depth-short", "windows-sums", "rotary-long", "whole-frames"],
 )
 def test_one_pass_with_the_cache_is_one_full_pass_for_each_frame(
     model: Architecture, past: int, frames: int, no_depth: np.ndarray

@@ -17,6 +17,7 @@ from tests.models.roboscape.toy import (
     QK_NORM,
     READS_PREVIOUS,
     RGB,
+    WHOLE,
     apply,
     apply_plain,
     blind,
@@ -27,6 +28,7 @@ from tests.models.roboscape.toy import (
 )
 
 CONFIGS = {"dual": DUAL, "rgb": RGB, "normed": NORMED, "qk-norm": QK_NORM, "previous": READS_PREVIOUS, "genie": GENIE}
+CONFIGS |= {"whole-frames": WHOLE}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

@@ -20,6 +20,7 @@ from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, 
 Positions = Literal["learned", "rotary"]
 ROTARY = replace(RGB, positions="rotary")
 PREVIOUS = replace(RGB, read_previous=True)
+WHOLE = replace(PREVIOUS, whole_frames=True)
 SUMS = replace(RGB, action_inputs=4, integrate_actions=True)
 
 
@@ -50,8 +51,8 @@ def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, inte
 
 @pytest.mark.parametrize(
     ("model", "prompt", "stride"),
-    [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0), (PREVIOUS, 1, 2)],
-    ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt", "previous"],
+    [(SUMS, 3, 1), (RGB, 9, 5), (ROTARY, 11, 0), (PREVIOUS, 1, 2), (WHOLE, 9, 2)],
+    ids=["stride-1-sums", "stride-5-long-prompt", "rotary-long-prompt", "previous", "whole-frames"],
 )
 def test_cached_is_uncached_beyond_the_window(model: Architecture, prompt: int, stride: int) -> None:
     sample = SampleConfig(steps=2, temperature=1.0, window_stride=stride)

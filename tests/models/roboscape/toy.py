@@ -17,6 +17,7 @@ RGB = replace(DUAL, use_depth=False)
 NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
 QK_NORM = replace(DUAL, qk_norm=True, mup=True)
 READS_PREVIOUS = replace(DUAL, read_previous=True)
+WHOLE = replace(READS_PREVIOUS, whole_frames=True)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
 GUIDED = replace(DUAL, action_dropout=0.5)
 BATCH = 2
@@ -139,6 +140,9 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
     tokens, mask, actions = inputs
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
     b, t = mask.shape[:2]
+    if config.whole_frames:
+        mask = mask.copy()
+        mask[:, 1:] = True
     h = {}
     for name, grid in tokens.items():
         flat = grid.reshape(b, t, -1)

@@ -1,0 +1,48 @@
+"""Lets the model train on frames of its own, as it reads them in a rollout (scheduled sampling in parallel).
+
+A rollout reads what the model made, not true frames. With whole masked frames a single pass predicts all frames of a
+clip, each from the true one before it, so the mean codes of that pass stand in for a rollout's
+(arXiv 1906.04331, "Parallel Scheduled Sampling", with mean codes in place of drawn tokens).
+
+Axes: B clips, T frames, S cells, D code bits.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rsjax.models.roboscape.transformer import shifted
+from rsjax.tokenizers import lfq
+
+Previous = dict[str, Float[Array, "B T S D"]]
+
+
+def previous_frames(
+    predict: Callable[[], dict[str, Float[Array, "B T S n V"]]],
+    tokens: dict[str, Int[Array, "B T H W"]],
+    code_bits: int,
+    own: Bool[Array, ""] | bool,
+) -> Previous:
+    """Returns the codes of the frame before each frame: the true ones, or if ``own`` the model's mean codes.
+
+    The first frame stays true, as in a rollout. No gradient flows into the predictions.
+
+    Args:
+        predict: returns the logits of all frames, each from the true frames before it; not computed unless ``own``.
+        tokens: of the true frames, by branch.
+    """
+    true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}
+
+    def predicted() -> Previous:
+        means = {name: lfq.mean_codes(logits, code_bits) for name, logits in predict().items()}
+        return {name: jnp.concatenate([true[name][:, :1], mean[:, 1:]], axis=1) for name, mean in means.items()}
+
+    read: Any = jax.lax.cond(own, predicted, lambda: true)
+    return {name: jax.lax.stop_gradient(shifted(codes)) for name, codes in read.items()}
+
+
+def _codes(grid: Int[Array, "B T H W"], code_bits: int) -> Float[Array, "B T S D"]:
+    return lfq.tokens_to_codes(grid.reshape(*grid.shape[:2], -1), code_bits)
