@@ -229,6 +229,7 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     def check(self, clips: ClipShape) -> None:
         require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
         require_range(self.mask, "model.mask", 0, 1, "own_frames")
+        require_range(self.mask, "model.mask", 0, math.inf, "own_frames_after")
         require(
             clips.frames <= self.frames(clips),
             f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "

@@ -112,3 +112,5 @@ def test_own_frames_need_whole_frames_and_are_a_share() -> None:
         replace(DEBUG, model=model)
     with pytest.raises(ConfigError, match=r"model.mask.own_frames is 1.5; it must be 0 … 1"):
         replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames=1.5)))
+    with pytest.raises(ConfigError, match="model.mask.own_frames_after is -1; it must be at least 0"):
+        replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames_after=-1)))

@@ -77,7 +77,7 @@ def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Ar
 
 
 def reads_own_frames(config: MaskConfig, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
-    """Draws whether this step's clips are read as the model predicts them; never in the first steps.
+    """Draws whether a step reads the model's own frames; never before step ``own_frames_after``.
 
     Args:
         key: the step's key, as for :func:`corrupt`.

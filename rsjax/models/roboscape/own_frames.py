@@ -33,6 +33,7 @@ def previous_frames(
     Args:
         predict: returns the logits of all frames, each from the true frames before it; not computed unless ``own``.
         tokens: of the true frames, by branch.
+        own: the same on all devices.
     """
     true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}
 

@@ -197,13 +197,13 @@ def last_frame(net: Network, state: State, name: str) -> Int[Array, "B H W"] | F
 
 
 def _begin_windows(net: Network, params: Params, kept: int, state: State, which: Bool[Array, " B"]) -> State:
-    """Begins windows of some clips anew with their last ``kept`` frames, and encodes these into the cache."""
+    """Begins the windows of the clips ``which`` with their last ``kept`` frames, and encodes these into the cache."""
     begun = jax.vmap(partial(_begin_window, net, params, kept), in_axes=(AXES, 0), out_axes=AXES)
     return jax.lax.cond(which.any(), begun, lambda state, which: state, state, which)
 
 
 def _begin_window(net: Network, params: Params, kept: int, state: State, this: Bool[Array, ""]) -> State:
-    """Does so for one clip if ``this`` is True."""
+    """Begins one clip's window so, if ``this`` is True."""
     base, cache = state.actions[-kept], state.cache
     if encoded := kept - net.arch.uncommitted:
         frames = slice(-kept, encoded - kept or None)
