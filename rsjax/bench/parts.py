@@ -161,7 +161,7 @@ def environment(config: Config, budget: float) -> Numbers:
     """Measures steps a second of 1 and of 64 environments in the world model, summed over them, without a judge.
 
     A step goes from an action on the host to a frame on the host, with depth if the model has it, in windows that are
-    on average half full. Empty for a family that cannot generate frame by frame.
+    on average half full. Empty for a model that takes no actions or cannot generate frame by frame.
     """
     model, size = create_model(config), config.clips.image_size
     trained = TrainedModel(config, model, jax.jit(model.init)(jax.random.key(0)), inputs.assets(config))

@@ -24,7 +24,7 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         settings: fields of :class:`rsjax.policies.episodes.Settings`.
 
     Raises:
-        UserError: the run is missing or unfinished, or its family of models cannot generate frame by frame.
+        UserError: the run is missing or unfinished, or its model takes no actions or cannot generate frame by frame.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type

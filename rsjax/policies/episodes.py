@@ -18,7 +18,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.trained import load
-from rsjax.policies.actions import OutOfRange, checked_actions
+from rsjax.policies.actions import OutOfRange, check_takes_actions, checked_actions
 from rsjax.policies.judging import judge_of
 from rsjax.policies.simulator import FAR, STEPS, UNIT, Observation
 from rsjax.policies.starts import Starts
@@ -79,8 +79,8 @@ class Episodes:
         observation_space: likewise.
 
     Raises:
-        UserError: the run is missing or unfinished, its family of models cannot generate frame by frame, or the judge
-            is missing, damaged or of frames of another size.
+        UserError: the run is missing or unfinished, its model takes no actions or cannot generate frame by frame, or
+            the judge is missing, damaged or of frames of another size.
     """
 
     def __init__(self, run: Path | str | TrainedModel, count: int | None, settings: Settings) -> None:
@@ -90,6 +90,7 @@ class Episodes:
         count = count or 1
         trained = run if isinstance(run, TrainedModel) else load(run)
         config, where = trained.config, Path("." if isinstance(run, TrainedModel) else run)
+        check_takes_actions(config.model, "the model" if isinstance(run, TrainedModel) else f"{run}: the model")
         norm, size = trained.assets.normalization, config.clips.image_size
         self._imagination = trained.model.imagine(trained.params, trained.assets, count)
         self._depth = config.model.uses_depth and norm.depth_range is not None

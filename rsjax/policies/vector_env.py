@@ -24,7 +24,7 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         settings: fields of :class:`rsjax.policies.episodes.Settings`.
 
     Raises:
-        UserError: the run is missing or unfinished, or its family of models cannot generate frame by frame.
+        UserError: the run is missing or unfinished, or its model takes no actions or cannot generate frame by frame.
     """
 
     metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - Gymnasium's own type

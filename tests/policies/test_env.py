@@ -163,3 +163,6 @@ def test_a_family_without_steps_is_named(clips: Store) -> None:
     family = toy.trained(clips, replace(toy.config(), model=ToyConfig()))
     with pytest.raises(UserError, match="cannot generate frame by frame"):
         WorldModelEnv(family)
+    still: Any = replace(toy.config().model, action_encoder="none")  # type: ignore[call-arg]
+    with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
+        WorldModelEnv(toy.trained(clips, replace(toy.config(), model=still)))
