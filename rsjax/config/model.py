@@ -5,7 +5,7 @@ Each family is registered under a name. ``Config.model`` is one of them, chosen 
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from rsjax.config.data import ClipShape
 from rsjax.config.fields import ConfigError, loss_weights, require
@@ -112,9 +112,12 @@ def family(name: str) -> type[ModelConfig]:
 def converted(model: ModelConfig, name: str) -> ModelConfig:
     """Returns settings of the family called ``name`` that keep those fields of ``model`` that are not defaults.
 
-    Fields that the new family lacks are dropped.
+    Fields that the new family lacks or has of another type, such as its own ``sample``, are dropped.
     """
     kind, default = family(name), type(model)()
-    changed = {f.name for f in fields(default) if getattr(model, f.name) != getattr(default, f.name)}
-    shared: dict[str, Any] = {f.name: getattr(model, f.name) for f in fields(kind) if f.name in changed}
+    values: dict[str, Any] = {f.name: getattr(model, f.name) for f in fields(model)}
+    changed = {name: value for name, value in values.items() if value != getattr(default, name)}
+    here, there = get_type_hints(type(model)), get_type_hints(kind)
+    choices = {name: get_args(there.get(name)) for name in changed}  # of a Literal
+    shared = {name: x for name, x in changed.items() if here[name] == there.get(name) or x in choices[name]}
     return model if type(model) is kind else kind(**shared)

@@ -58,6 +58,17 @@ def test_a_family_keeps_changed_fields_and_its_own_defaults_for_the_others() -> 
     assert without.with_family("roboscape").model == RoboScapeConfig(width=64, heads=4, action_encoder="none")
 
 
+@pytest.mark.parametrize("preset", ["tiny", "irasim_tiny", "cogvideox_tiny", "ivideogpt_tiny"])
+@pytest.mark.parametrize("name", ["roboscape", "genie", "ivideogpt", "irasim", "cogvideox"])
+def test_fields_of_one_name_and_unlike_types_stay_with_their_family(preset: str, name: str) -> None:
+    """They all have ``sample``, and some ``autoencoder`` and ``positions``, each in its own way."""
+    config = presets.get(preset).with_family(name)
+    assert as_read(to_dict(config)) == config
+    width, dtype = (getattr(config.model, field) for field in ("width", "compute_dtype"))
+    before: Any = presets.get(preset).model
+    assert (width, dtype) == (before.width, before.compute_dtype)
+
+
 @pytest.mark.parametrize("name", ["roboscape", "genie"])
 def test_a_model_of_the_family_already_stays_as_it_is(name: str) -> None:
     config = replace(DEBUG, model=replace(FAMILIES[name](), width=64))  # type: ignore[call-arg]
