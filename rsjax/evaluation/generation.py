@@ -146,14 +146,16 @@ class Generation:
         """Generates a batch; the last one is filled up, so that one program is compiled."""
         sampled, rows = batch.kind == SAMPLE, np.arange(batch.start, batch.start + batch.clips)
         padded = np.minimum(np.arange(batch.start, batch.start + batch_size(self.trained)), rows[-1])
-        actions = self.draws[OWN][0] if sampled else self.draws[batch.kind][batch.draw]
+        own = self.draws[OWN][0]
+        actions = own if sampled else self.draws[batch.kind][batch.draw]
         repetition = batch.run * self.protocol.samples + (batch.draw if sampled else 0)
         index = self.clips.index[padded] + repetition * self.split_size
         with_depth = batch.kind == OWN
         generate = partial(
             self.trained.model.generate, self.trained.params, self.trained.assets, index=index, depth=with_depth
         )
-        video = _rolled_out(generate, self.protocol, self._truth[padded], actions[padded])[: len(rows)]
+        inputs = (self._truth[padded], own[padded], actions[padded])
+        video = rolled_out(generate, self.protocol, *inputs)[: len(rows)]
         return self.score(rows, video) if sampled else {"rgb": video.rgb, "depth": video.depth}
 
 
@@ -185,14 +187,27 @@ def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> T
     return TeacherForced(joined("cross_entropy"), joined("accuracy"))
 
 
-def _rolled_out(
-    generate: Callable[..., Video], protocol: Protocol, truth: Video, actions: Float[np.ndarray, "B T A"]
+def rolled_out(
+    generate: Callable[..., Video],
+    protocol: Protocol,
+    truth: Video,
+    own: Float[np.ndarray, "B T A"],
+    actions: Float[np.ndarray, "B T A"],
 ) -> Video:
-    """Returns the generated videos, whose frames follow the generated ones before them, or the recorded ones."""
+    """Returns the generated videos, whose frames follow the generated ones before them, or the recorded ones.
+
+    Args:
+        own: the clips' own actions, which led into the recorded frames that generation starts from.
+        actions: those into generated frames.
+    """
     prompt, frames = protocol.prompt_frames, actions.shape[1]
+
+    def after(past: int, until: int) -> Video:
+        return generate(truth.frames(0, past), np.concatenate([own[:, :past], actions[:, past:until]], axis=1))
+
     if not protocol.teacher_forced:
-        return generate(truth.frames(0, prompt), actions)
-    steps = [generate(truth.frames(0, past), actions[:, : past + 1]) for past in range(prompt, frames)]
+        return after(prompt, frames)
+    steps = [after(past, past + 1) for past in range(prompt, frames)]
     return _joined([steps[0], *(step.frames(-1) for step in steps[1:])], axis=1)
 
 

@@ -12,10 +12,10 @@ from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut, evaluate
-from rsjax.evaluation.generation import Batch, Generation
+from rsjax.evaluation.generation import Batch, Generation, rolled_out
 from rsjax.evaluation.metrics.delta_psnr import other_clips
 from rsjax.evaluation.metrics.psnr import psnr as pixels
-from rsjax.evaluation.protocols import find, of_run
+from rsjax.evaluation.protocols import PAPER, find, of_run
 from rsjax.evaluation.registry import metrics
 from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
@@ -241,6 +241,23 @@ def test_a_teacher_forced_frame_follows_true_frames(clips: Store, trained: Train
     later = trained.generate(whole[0][:, : prompt + 1], whole[1][:, : prompt + 2], whole[2][:, : prompt + 1])
     np.testing.assert_array_equal(made.rgb[:, -1], later.rgb[:, -1])
     assert made.rgb.shape[1] == prompt + 2
+
+
+@pytest.mark.parametrize("teacher_forced", [False, True])
+def test_actions_into_recorded_frames_stay_the_clips_own(teacher_forced: bool) -> None:
+    """Random actions that contradict the frames of a prompt would count as loss of PSNR under other actions."""
+    own, others, seen = np.zeros((1, 5, 1)), np.ones((1, 5, 1)), []
+
+    def generate(prompt: Video, actions: np.ndarray) -> Video:
+        seen.append((prompt.rgb.shape[1], actions[0, :, 0].tolist()))
+        return Video(np.zeros((1, actions.shape[1], 2, 2, 3), np.uint8))
+
+    protocol, truth = (
+        replace(PAPER, prompt_frames=3, teacher_forced=teacher_forced),
+        np.zeros((1, 5, 2, 2, 3), np.uint8),
+    )
+    assert rolled_out(generate, protocol, Video(truth), own, others).rgb.shape == truth.shape
+    assert seen == ([(3, [0, 0, 0, 1]), (4, [0, 0, 0, 0, 1])] if teacher_forced else [(3, [0, 0, 0, 1, 1])])
 
 
 def test_clips_that_are_too_short_or_small_are_refused(clips: Store, trained: TrainedModel) -> None:
