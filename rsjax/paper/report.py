@@ -256,8 +256,11 @@ def _figure(outcome: Outcome) -> bytes | None:
 def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:
     """Draws a clip as the first seed of every arm predicts it: of those that all arms kept, the first arm's middle one.
 
-    None with fewer than two arms, or where no frames of the same clip were kept.
+    None with fewer than two arms, where no frames of the same clip were kept, or for a claim about other clips or
+    frames than those of the runs' evaluations.
     """
+    if all(each.measurement for each in outcome.claim.comparisons):
+        return None
     arms = [(arm.name, arm.finished[0]) for arm in outcome.arms if arm.finished]
     try:
         kept = [(name, read_frames(result.run.output("evaluation").parent)) for name, result in arms]

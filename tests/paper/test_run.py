@@ -304,6 +304,7 @@ def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, 
         assert (there.output("world_model") / "weights").read_text() == there.keys()["world_model"]
 
 
+@pytest.mark.usefixtures("longer")
 def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one in the middle by the first arm's error among those that all arms kept, whatever else one of them kept."""
     kept = {"with": ([0, 2, 5], [40, 0, 20]), "without": ([0, 2, 4, 5], [1, 2, 9, 3])}
@@ -328,6 +329,9 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
     assert shown == {"with": 20, "without": 3}
     assert (tmp_path / "out" / "figures" / "toy-clip.webp").exists()
     assert "(figures/toy-clip.webp)" in (tmp_path / "out" / "report.md").read_text()
+    drawn.clear()
+    run(toy.plan(toy.claim("toy", Comparison("psnr", "with", "without", measurement="longer"))), tmp_path)
+    assert not drawn  # the runs kept other frames than it compares
 
 
 def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
