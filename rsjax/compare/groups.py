@@ -157,11 +157,15 @@ def check_seeds(group: Group) -> None:
 
 
 def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the :data:`SEEDED` fields of a result's model that decide scores, by dotted name."""
+    """Returns the :data:`SEEDED` fields of a result's model that decide scores, by dotted name.
+
+    A setting that came after the result was made has the default that it came with.
+    """
     kind = FAMILIES.get(model["family"])
-    runtime = {f"settings.{name}" for name, leaf in leaves(kind()).items() if leaf.runtime} if kind else set()
-    named = _flat({name: model[name] for name in SEEDED if name in model})
-    return {name: value for name, value in named.items() if name not in runtime}
+    known = {f"settings.{name}": leaf for name, leaf in leaves(kind()).items()} if kind else {}
+    later = {name: leaf.value for name, leaf in known.items() if leaf.added}
+    named = later | _flat({name: model[name] for name in SEEDED if name in model})
+    return {name: value for name, value in named.items() if not (name in known and known[name].runtime)}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

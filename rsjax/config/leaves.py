@@ -9,11 +9,12 @@ T = TypeVar("T")
 
 
 class Leaf(NamedTuple):
-    """A field's value, its declared type, and whether it is a :func:`rsjax.config.runtime` field."""
+    """A field's value, its declared type, and whether :mod:`rsjax.config.fields` marks it as runtime or as added."""
 
     value: Any
     kind: Any
     runtime: bool
+    added: bool = False
 
 
 def leaves(config: Any, prefix: str = "") -> dict[str, Leaf]:
@@ -25,7 +26,8 @@ def leaves(config: Any, prefix: str = "") -> dict[str, Leaf]:
         if dataclasses.is_dataclass(value):
             out |= leaves(value, f"{name}.")
         else:
-            out[name] = Leaf(value, hints[field.name], bool(field.metadata.get("runtime")))
+            marks = (bool(field.metadata.get(mark)) for mark in ("runtime", "added"))
+            out[name] = Leaf(value, hints[field.name], *marks)
     return out
 
 

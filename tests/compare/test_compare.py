@@ -248,6 +248,7 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
         ({"family": "genie"}, "model.family is roboscape in the first, genie in the other"),
         ({"preset": "debug"}, "model.preset is tiny in the first, debug in the other"),
         ({"settings": {"loss": {"gamma": 9.0}}}, "model.settings.loss.gamma is 5.0 in the first, 9.0 in the other"),
+        ({"settings": {"whole_frames": True}}, "model.settings.whole_frames is False in the first, True in the other"),
         ({"training": {"train": {"steps": 9}}}, "model.training.train.steps is 5 in the first, 9 in the other"),
         ({"weights_sha256": "w0"}, "have the same weights; a group takes each training once"),
         ({"seed": 1, "settings": {"loss": {"gamma": 5.0}, "unroll": 4, "new": 1}}, ""),
