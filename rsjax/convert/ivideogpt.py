@@ -153,8 +153,7 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     aside = Counter(ASIDE.search(name)[0] for name in tensors if ASIDE.search(name))  # type: ignore[index]
     used = {name: x for name, x in tensors.items() if not ASIDE.search(name)}
     model, actions = (own[0], own[1].action_dim) if own else infer_llama(source, used, heads, names)
-    arch = Architecture(model, _layout(model), actions * (1 + model.integrate_actions))
-    shapes = jax.eval_shape(LLaMA(arch).init_params, jax.random.key(0))
+    shapes = _llama_shapes(model, actions)
     params = to_params(source, used, llama_table(model), shapes, names)
     before = saved_part(out, IVideoGPTConfig, "tokenizer")
     whole = replace(model, autoencoder=before[0].autoencoder) if before else model
@@ -175,9 +174,7 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
         shapes = tokenizer_shapes(model.autoencoder, inputs.image_size)
         entries = tokenizer_table(shapes)
     else:
-        actions = inputs.action_dim * (1 + model.integrate_actions) * model.use_actions
-        shapes = jax.eval_shape(LLaMA(Architecture(model, _layout(model), actions)).init_params, jax.random.key(0))
-        entries = llama_table(model)
+        shapes, entries = _llama_shapes(model, inputs.action_dim), llama_table(model)
     tensors = to_tensors(load_weights(source / part / "weights", shapes), entries)
     write_safetensors(out, tensors, {METADATA: json.dumps({"model": to_dict(model), "inputs": inputs._asdict()})})
     return f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"
@@ -193,9 +190,11 @@ def _exported(source: Path, metadata: dict[str, str]) -> tuple[IVideoGPTConfig, 
         raise ConvertError(f"{source}: its metadata {METADATA} are of another version or damaged ({error})") from error
 
 
-def _layout(model: IVideoGPTConfig) -> Layout:
-    """Returns a layout with the model's vocabulary, which is all that the parameters depend on."""
-    return Layout(model.autoencoder.codes, 1, 1, 1, model.positions)
+def _llama_shapes(model: IVideoGPTConfig, actions: int) -> Params:
+    """Returns the shapes of the transformer's parameters; ``actions`` are the numbers of one, perhaps not read."""
+    inputs = actions * (1 + model.integrate_actions) * model.use_actions
+    layout = Layout(model.autoencoder.codes, 1, 1, 1, model.positions)  # parameters depend on its vocabulary alone
+    return jax.eval_shape(LLaMA(Architecture(model, layout, inputs)).init_params, jax.random.key(0))
 
 
 def _check_codes(directory: Path, there: IVideoGPTConfig | None, model: IVideoGPTConfig) -> None:

@@ -1,6 +1,7 @@
 """iVideoGPT's public files, in and out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 from rsjax.config import ClipShape, ConditionalVQConfig, IVideoGPTConfig
+from rsjax.convert.directory import save_part
 from rsjax.convert.files import write_safetensors
 from rsjax.convert.ivideogpt import llama_table, tokenizer_shapes, tokenizer_table
-from rsjax.convert.table import public_shapes
+from rsjax.convert.table import public_shapes, to_params
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
+from rsjax.models.saved import Inputs
 from rsjax.training.checkpoint import load_weights
 from tests.convert.public import Tensors, random_tensors
 from tests.convert.test_commands import assert_same, convert, refused
@@ -78,6 +81,17 @@ def test_weights_without_actions_start_a_model_with_actions_that_changes_nothing
     mine, _ = LLaMA(model.architecture).apply({"params": started}, tokens, actions)
     theirs, _ = LLaMA(Architecture.create(alone, CLIPS)).apply({"params": saved}, tokens, None)
     np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_model_without_actions_of_clips_that_have_some_comes_back(tmp_path: Path) -> None:
+    alone = replace(LLAMA, use_actions=False)
+    shapes = jax.eval_shape(LLaMA(Architecture.create(alone, CLIPS)).init_params, jax.random.key(0))
+    params = to_params("", llama_tensors(alone), llama_table(alone), shapes)
+    save_part(tmp_path / "own", "world_model", alone, Inputs(CLIPS.image_size, CLIPS.action_dim), params)
+    convert("ivideogpt", tmp_path / "own", tmp_path / "out.safetensors")
+    convert("ivideogpt", tmp_path / "out.safetensors", tmp_path / "again")
+    old, new = (json.loads((tmp_path / name / "config.json").read_text()) for name in ("own", "again"))
+    assert new["inputs"] == old["inputs"] and new["model"]["use_actions"] is False
 
 
 def test_files_that_do_not_fit_are_refused(
