@@ -16,7 +16,7 @@ from jaxtyping import Float32, UInt8
 from rsjax.config import ConfigError, LoopConfig, content_key, from_dict, to_dict
 from rsjax.config.policy import PolicyConfig
 from rsjax.errors import UserError
-from rsjax.files import read_json, write_json
+from rsjax.files import disk_guard, read_json, write_json
 from rsjax.policies.diffusion_policy import DiffusionPolicy, Range
 from rsjax.policies.keys import arrays_key
 from rsjax.trainable import Params
@@ -50,12 +50,14 @@ class Policy:
         return Actor(self, seed)
 
     def save(self, directory: Path) -> None:
-        """Writes what :func:`load_policy` reads."""
+        """Writes what :func:`load_policy` reads; a policy is there once its ``policy.json`` is, so that comes last."""
         model = self.model
         values: dict[str, Any] = {"image_size": model.image_size, "controls": model.controls, "width": model.width}
         values |= {"config": to_dict(model.config), "range": to_dict(self.range)}
-        write_json(directory / FILE, values)
+        with disk_guard(directory):
+            directory.mkdir(parents=True, exist_ok=True)
         save_weights(directory / WEIGHTS, self.params)
+        write_json(directory / FILE, values)
 
 
 def load_policy(directory: Path) -> Policy:

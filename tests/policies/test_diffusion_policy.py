@@ -19,6 +19,7 @@ from rsjax.data.merge import into_parts, merge, split
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.files import FileError, making
+from rsjax.policies import policy as policy_module
 from rsjax.policies import training
 from rsjax.policies.ddpm import add_noise, cosine_schedule
 from rsjax.policies.demos import Demos, load_demos
@@ -166,6 +167,26 @@ def test_training_stopped_and_resumed_is_the_same(policy: tuple[Policy, Path], t
     mark = tmp_path / "straight" / "training.json"
     mark.write_text(json.dumps({"key": json.loads(mark.read_text())["key"]}))
     assert train_policy(toy(), demos(), tmp_path / "straight").key == whole.key  # an older mark will do
+
+
+def test_a_policy_whose_saving_was_interrupted_is_saved_again(
+    policy: tuple[Policy, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, source = policy
+    shutil.copytree(source, tmp_path / "cut")
+    for name in ("policy.json", "weights"):
+        place = tmp_path / "cut" / name
+        shutil.rmtree(place) if place.is_dir() else place.unlink()
+
+    def killed(path: Path, params: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(policy_module, "save_weights", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_policy(toy(), demos(), tmp_path / "cut", stops=(2,))
+    again = train_policy(toy(), demos(), tmp_path / "cut", stops=(2,))
+    assert again.key == whole.key == load_policy(tmp_path / "cut").key
 
 
 def test_a_training_that_kept_other_stops_is_named(policy: tuple[Policy, Path], tmp_path: Path) -> None:
