@@ -116,7 +116,7 @@ def search(
         if not finite.any():
             continue  # nothing to move towards
         if config.method == "cem":
-            elites = drawn[np.argsort(energies, kind="stable")[: config.elites]]
+            elites = drawn[np.argsort(energies, kind="stable")[: min(config.elites, finite.sum())]]
             mean, deviation = elites.mean(0), elites.std(0) + 0.05 * (high - low) / 2
         else:
             scale = config.temperature * max(float(energies[finite].std()), 1e-12)

@@ -66,6 +66,18 @@ def test_impossible_candidates_are_left_out_of_the_search(method: Any) -> None:
     assert nowhere.energy == np.inf and np.isfinite(nowhere.actions).all()
 
 
+def test_the_mean_of_elites_leaves_impossible_candidates_out() -> None:
+    means: list[np.ndarray] = []
+
+    def only_one(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+        means.append(candidates[0])
+        return np.where(np.arange(len(candidates)) == 5, 1.0, np.inf)
+
+    config = PlannerConfig("cem", horizon=2, candidates=8, rounds=2, elites=4)
+    plan = search(only_one, None, np.zeros((2, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    np.testing.assert_array_equal(means[1], plan.actions)
+
+
 def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
     config = PlannerConfig(candidates=8, elites=2, hold=3)
     seen: list[np.ndarray] = []
