@@ -20,8 +20,9 @@ from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.export.lerobot_layouts import Episode, LayoutV21, LayoutV30
 from rsjax.export.lerobot_meta import describe_features
-from rsjax.export.lerobot_video import VideoSettings
+from rsjax.export.lerobot_video import VideoSettings, video_rate
 from rsjax.files import disk_guard, making, replace_directory
+from rsjax.progress import note
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
@@ -93,6 +94,7 @@ def export_lerobot(
 def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[int, int], None]) -> dict[str, Any]:
     names = store.splits if options.split == "all" else (options.split,)
     total, layout, splits = sum(len(store.source(name)) for name in names), None, {}
+    cameras: dict[str, None] = {}
     for name in names:
         begins = layout.episodes if layout else 0
         for clip in _clips(store, name):
@@ -107,12 +109,15 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
                     f"{store.path}: has clips of {layout.video.fps:g} and {rate or 0:g} frames a second (0: unknown); "
                     f"export them from stores of their own, or give --fps"
                 )
+            cameras[_camera(clip)] = None
             layout.add(episode)
             report(layout.episodes, total)
         if layout is not None and layout.episodes > begins:
             splits[name] = f"{begins}:{layout.episodes}"
     if layout is None:
         raise StoreError(f"{store.path}: has no readable clip of split {options.split}")
+    if len(cameras) > 1:
+        note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
 
 
@@ -127,14 +132,18 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
     fps = options.fps or frame_rate(clip, store.manifest)
     if not fps:
         raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
+    fps = float(video_rate(fps))  # timestamps of a long video of many episodes have to be those of its frames
     size = clip["rgb"].shape[1]
     if size % 2 or not 0 < fps <= 1000:
         raise UserError(f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0 to 1000 Hz")
     width = clip["actions"].shape[1]
     states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
-    camera = "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
     video = VideoSettings(options.codec, options.crf, fps, size)
-    return LAYOUTS[options.version](root, video, describe_features(video, camera, _names(store, width), states))
+    return LAYOUTS[options.version](root, video, describe_features(video, _camera(clip), _names(store, width), states))
+
+
+def _camera(clip: Record) -> str:
+    return "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
 
 
 def _names(store: Store, width: int) -> list[str]:

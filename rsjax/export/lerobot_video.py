@@ -14,6 +14,11 @@ ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
 KEY_FRAMES = 2  # frames from one to the next: LeRobot's choice, as training reads frames in random order
 
 
+def video_rate(fps: float) -> Fraction:
+    """Returns the frames per second that a video file can say: fractions, up to those of 24000/1001."""
+    return Fraction(fps).limit_denominator(1001)
+
+
 @dataclass(frozen=True)
 class VideoSettings:
     """Settings of all videos of a data set: codec, constant rate factor, frames per second, pixels along each side."""
@@ -51,7 +56,7 @@ class VideoFile:
         self.frames = self.bytes = 0
         self._container = av.open(str(path), "w", format="mp4")
         options = {"crf": str(settings.crf), "g": str(KEY_FRAMES)}
-        rate = Fraction(settings.fps).limit_denominator(1000)
+        rate = video_rate(settings.fps)
         stream: Any = self._container.add_stream(ENCODERS[settings.codec], rate=rate, options=options)
         stream.height = stream.width = settings.size
         stream.pix_fmt = "yuv420p"

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -103,6 +104,23 @@ def test_large_data_sets_fill_several_files(tmp_path: Path, monkeypatch: pytest.
     for clip, episode in zip(records(store), read_all("lerobot", tmp_path / "out"), strict=True):
         np.testing.assert_array_equal(episode.actions, clip["actions"])
         assert_near(episode.cameras["image"].read(range(6)), clip["rgb"])
+
+
+@pytest.mark.parametrize("fps", [24000 / 1001, 29.9712 * 15 / 113])
+def test_a_videos_frames_are_where_the_timestamps_are_however_long_it_is(tmp_path: Path, fps: float) -> None:
+    info = export_lerobot(toy_store(tmp_path / "store", fps=fps), tmp_path / "out", LeRobotOptions(codec="h264"))
+    with av.open(next((tmp_path / "out").glob("videos/*/*/*.mp4"))) as video:
+        assert float(video.streams.video[0].average_rate) == info["fps"]  # type: ignore[arg-type]
+    assert info["fps"] == pytest.approx(fps, rel=1e-6) and (info["fps"] == fps or fps < 20)
+
+
+def test_clips_of_several_cameras_are_named_after_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stores = [toy_store(tmp_path / name, 2, provenance={"camera": name}) for name in ("front", "wrist")]
+    merge([store.path for store in stores], tmp_path / "both")
+    info = export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "out", LeRobotOptions(codec="h264"))
+    assert "observation.images.front" in info["features"]
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "clips of the cameras front, wrist; all are in observation.images.front" in said
 
 
 def test_statistics_are_those_of_all_rows(tmp_path: Path) -> None:
