@@ -51,13 +51,14 @@ def main() -> None:
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
     settings, trials = part(options, Improvement), part(options, Trials)
+    config = run.simulator  # before a policy is trained
     model, demos = run.world(trials.together, options.judge), run.demos().first(options.demos)
     if options.policy:
         policy = load_policy(options.policy)
     else:
         policy = train_policy(sized_policy(options.size, options.train_steps), demos, out / "policy")
     starts = run.first_frames(settings.imagined * settings.rounds)
-    with lift_simulators(run.simulator, trials) as simulator:
+    with lift_simulators(config, trials) as simulator:
         improve(policy, demos, starts, model, simulator, settings, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 
