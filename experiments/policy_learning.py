@@ -41,16 +41,19 @@ def main() -> None:
     """Writes results.json, results.md and success.png, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.policy_learning", Options.__doc__ or "", Options())
+    from rsjax.policies.demos import Demos
     from rsjax.policies.learning import learn
     from rsjax.policies.run_data import RunData, sized_policy, synthetic_demos
     from rsjax.policies.trials import lift_simulators
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "policy_learning"
-    config, trials = sized_policy(options.size, options.steps), part(options, Trials)
-    synthetic = synthetic_demos(options.synthetic or options.run / "synthetic" / "clips", options.run)
+    config, learning, trials = sized_policy(options.size, options.steps), part(options, Learning), part(options, Trials)
+    synthetic = Demos((), 1)
+    if any(cell.synthetic for cell in learning.chosen()):
+        synthetic = synthetic_demos(options.synthetic or options.run / "synthetic" / "clips", options.run)
     real = run.demos(seed=options.seed)
     with lift_simulators(run.simulator, trials) as simulator:
-        learn(part(options, Learning), config, real, synthetic, simulator, trials, out)
+        learn(learning, config, real, synthetic, simulator, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 
 

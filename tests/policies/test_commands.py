@@ -1,4 +1,6 @@
 import importlib
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +9,16 @@ import pytest
 from experiments.cli import parse_options, part
 from rsjax.config import ConfigError
 from rsjax.errors import UserError
+from rsjax.files import write_file
+from rsjax.policies import learning as learning_module
+from rsjax.policies import training as training_module
+from rsjax.policies import trials as trials_module
 from rsjax.policies.improvement import Improvement
 from rsjax.policies.learning import Learning
+from rsjax.policies.run_data import RunData
 from rsjax.policies.synthesize import Synthesis
 from rsjax.policies.trials import Trials
+from tests.policies.toy import demo_store, demos
 
 
 def parsed(command: str, *words: str) -> Any:
@@ -43,3 +51,45 @@ def test_options_become_the_settings_of_each_part() -> None:
 def test_impossible_options_are_named(command: str, words: tuple[str, ...], message: str) -> None:
     with pytest.raises((ConfigError, UserError), match=message):
         parsed(command, "runs/a", *words)
+
+
+def called(command: str, monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
+    module = importlib.import_module(f"experiments.{command}")
+    monkeypatch.setattr(module, "tune_process", lambda: None)  # it would start the tests over
+    monkeypatch.setattr(sys, "argv", [command, *map(str, words)])
+    module.main()
+
+
+def test_only_cells_of_synthetic_demonstrations_need_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(RunData, "demos", lambda self, seed: demos(2))
+    monkeypatch.setattr(RunData, "simulator", None)
+    monkeypatch.setattr(trials_module, "lift_simulators", lambda config, trials: nullcontext())
+
+    def learn(settings: Learning, config: Any, real: Any, synthetic: Any, world: Any, trials: Any, out: Path) -> None:
+        assert (len(real), len(synthetic)) == (2, 0)
+        write_file(out / "results.md", b"learnt")
+
+    monkeypatch.setattr(learning_module, "learn", learn)
+    words = (tmp_path / "run", "--size", "toy", "--counts", 2, "--cells")
+    called("policy_learning", monkeypatch, *words, "real-2", "real-2-repeated")
+    assert "learnt" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        called("policy_learning", monkeypatch, *words, "real-2", "synthetic-2")
+    assert "make synthetic demonstrations with" in capsys.readouterr().err
+
+
+def test_improve_refuses_recordings_before_it_trains_a_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(RunData, "clips", demo_store(tmp_path / "store"))
+    monkeypatch.setattr(RunData, "world", lambda self, count, judge: None)
+
+    def train(*inputs: Any) -> None:
+        raise AssertionError("a policy is trained")
+
+    monkeypatch.setattr(training_module, "train_policy", train)
+    with pytest.raises(SystemExit):
+        called("improve", monkeypatch, tmp_path / "run", "--size", "toy", "--demos", 1)
+    assert "clips of write_store; policies are tried in the simulated Lift" in capsys.readouterr().err
