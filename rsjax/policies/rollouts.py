@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, UInt8
 from rsjax.clip import Video
 from rsjax.config import content_key
 from rsjax.policies.actions import checked_actions
+from rsjax.policies.continuing import imagination
 from rsjax.policies.keys import arrays_key, judge_key, model_key
 from rsjax.policies.simulator import UNIT, Episode
 from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
@@ -118,7 +119,7 @@ class Imagined:
     """
 
     def __init__(self, trained: Any, count: int, judge: Judge, low: np.ndarray, high: np.ndarray) -> None:
-        self._imagination = trained.model.imagine(trained.params, trained.assets, count)
+        self._imagination = imagination(trained, count)
         self._count, self._judge, self._low, self._high = count, judge, low, high
         self.key = content_key("imagined", model_key(trained), judge_key(judge), arrays_key(low, high))
         self.validation = getattr(judge, "validation", None)

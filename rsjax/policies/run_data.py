@@ -10,7 +10,6 @@ from rsjax.config.policy import PolicyConfig, policy_preset
 from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
-from rsjax.models.base import WorldModel, create_model
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
@@ -81,16 +80,10 @@ class RunData:
         """Checks, without loading weights, that policies can act in the run's model, on clips like another run's.
 
         Raises:
-            UserError: it is unfinished, takes no actions, its family cannot generate frame by frame, or frames or
-                actions differ.
+            UserError: it is unfinished, takes no actions, or frames or actions differ.
         """
         check_takes_actions(self.config.model, f"{self.run}: the model")
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
-        if type(create_model(self.config)).imagine is WorldModel.imagine:
-            raise UserError(
-                f"{self.run}: a model of family {self.config.model.family!r} cannot generate frame by frame, so no "
-                f"policy can act in it; leave this run out"
-            )
         if shapes[0] != shapes[1]:
             raise UserError(
                 f"{self.run}: frames of {shapes[0][0]} pixels and actions of {shapes[0][1]} numbers, {like.run} has "

@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rsjax.clip import Video
 from rsjax.errors import UserError
+from rsjax.models.base import WorldModel
 from rsjax.policies.actions import ActionError
 from rsjax.policies.keys import arrays_key
-from rsjax.policies.rollouts import FirstFrame, run_together
+from rsjax.policies.rollouts import FirstFrame, Imagined, run_together
 from rsjax.policies.simulator import Episode
 from rsjax.policies.trials import Trials, first_frames, try_policy
 from tests.policies.toy import picture
-from tests.policies.worlds import ToyPolicy, imagined, simulated
+from tests.policies.worlds import ToyPolicy, imagined, judge, simulated
 
 STARTS = [0, 3, 1]  # seeds; the dot begins in that column and is done in column 10
 
@@ -36,6 +38,40 @@ def test_episodes_end_when_each_succeeds(kind: str) -> None:
             np.testing.assert_array_equal(frame, picture(begins + 2 * step))
     slow = run_together(world, ToyPolicy(0.1).actor(), starts, 4)
     assert [len(one.rgb) for one in slow] == [5, 5, 5] and not any(one.success.any() for one in slow)
+
+
+def test_a_family_that_generates_whole_videos_goes_on_from_its_last_frames() -> None:
+    calls: list[Any] = []
+
+    class Whole:
+        """Brightens the last given frame by the last action; its frames are even numbers, as it sees them."""
+
+        imagine = WorldModel.imagine
+
+        def reconstruct(self, assets: Any, video: Video) -> Video:
+            return Video(video.rgb // 2 * 2)
+
+        def generate(self, params: Any, assets: Any, prompt: Video, actions: Any, *, index: Any, depth: bool) -> Video:
+            calls.append((prompt.rgb.shape[1], actions[0, :, 0].tolist(), index.tolist()))
+            last = prompt.rgb[:, -1:] + actions[:, -1, 0].astype(np.uint8)[:, None, None, None, None]
+            return Video(np.concatenate([prompt.rgb, last], axis=1))
+
+    config = SimpleNamespace(prompt_frames=2, clips=SimpleNamespace(action_dim=6), tokenizer=None, model=None)
+    assets = SimpleNamespace(normalization=None, tokenizer=None)
+    trained = SimpleNamespace(config=config, model=Whole(), params={}, assets=assets)
+    world = Imagined(trained, 3, judge, np.full(6, -9.0), np.full(6, 9.0))  # one more than needed
+    given = iter(range(1, 9))
+    for _ in range(2):  # the second time nothing of the first is left
+        calls.clear()
+        starts = [FirstFrame(np.full((16, 16, 3), level, np.uint8), None, level) for level in (11, 20)]
+        one, other = run_together(world, lambda rgb: np.full((2, 6), next(given), np.float32), starts, 4)
+        steps = one.actions[:, 0].tolist()
+        assert one.rgb[:, 0, 0, 0].tolist() == (10 + np.cumsum(steps)).tolist()
+        assert other.rgb[:, 0, 0, 0].tolist() == (20 + np.cumsum(steps)).tolist()
+        assert [length for length, _, _ in calls] == [1, 2, 2, 2]
+        assert [rows for _, rows, _ in calls] == [steps[:2], steps[:3], steps[1:4], steps[2:]]
+        assert len({number for _, _, index in calls for number in index[:2]}) == 8  # draws of its own for each frame
+        assert calls[0][2] == [11, 20, 20]
 
 
 @pytest.mark.parametrize("kind", ["simulated", "imagined"])
