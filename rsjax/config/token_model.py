@@ -1,7 +1,7 @@
 """Settings of the families that predict tokens, RoboScape and Genie: masking, sampling, losses and the network."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
@@ -228,7 +228,9 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     def check(self, clips: ClipShape) -> None:
         require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
-        require_range(self.mask, "model.mask", 0, 1, "own_frames")
+        require_range(
+            self.mask, "model.mask", 0, 1, *(f.name for f in fields(MaskConfig) if f.name != "own_frames_after")
+        )
         require_range(self.mask, "model.mask", 0, math.inf, "own_frames_after")
         require(
             clips.frames <= self.frames(clips),

@@ -125,3 +125,9 @@ def test_own_frames_need_whole_frames_and_are_a_share() -> None:
         replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames=1.5)))
     with pytest.raises(ConfigError, match="model.mask.own_frames_after is -1; it must be at least 0"):
         replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames_after=-1)))
+
+
+@pytest.mark.parametrize("name", ["random_token_rate", "corruption_probability", "corruption_decay", "visible_prefix"])
+def test_rates_of_masks_are_shares_not_percentages(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"model.mask.{name} is 20; it must be 0 … 1"):
+        replace(DEBUG, model=RoboScapeConfig(mask=MaskConfig(**{name: 20})))  # type: ignore[arg-type]
