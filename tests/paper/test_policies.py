@@ -13,7 +13,7 @@ from rsjax.config.leaves import with_values
 from rsjax.paper.claim import claims
 from rsjax.paper.claims import policies
 from rsjax.paper.claims.policies import Size
-from rsjax.paper.measurements import measure, read_scores, seconds_of
+from rsjax.paper.measurements import measure, measured, read_scores, seconds_of
 from rsjax.pipeline.run import Run
 from tests.policies.toy import demos
 
@@ -118,6 +118,17 @@ def test_sizes_and_estimates_shrink_with_the_cell() -> None:
     for comparison in (each for name in NAMES for each in claims()[name].comparisons):
         seconds = [seconds_of(comparison.measurement, _with_clips(clips)) for clips in (50, 100)]
         assert seconds[0] == pytest.approx(seconds[1] / 2, rel=0.05)
+
+
+def test_cells_on_other_simulators_than_lift_train_no_judge_and_cost_nothing(tmp_path: Path) -> None:
+    run = Run(presets.get("multitask"), tmp_path / "cell", tmp_path)
+    for name in dict.fromkeys(each.measurement for claim in NAMES for each in claims()[claim].comparisons):
+        measure(run, name)
+        assert measured(run, name), "not to be tried again"
+        scores, reason = read_scores(run, name)
+        assert not scores and reason.startswith("policies are tried in the simulated Lift alone")
+        assert seconds_of(name, run.config) == 0
+    assert [path.name for path in run.directory.iterdir()] == ["measured"]
 
 
 def _with_clips(clips: int) -> Config:

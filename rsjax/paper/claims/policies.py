@@ -10,6 +10,7 @@ import numpy as np
 
 from rsjax.config import Config, content_key, presets
 from rsjax.config.policy import PolicyConfig
+from rsjax.evaluation.registry import Unavailable
 from rsjax.files import making
 from rsjax.paper.claim import Arm, Claim, Comparison, register
 from rsjax.paper.measurements import FOLDER, Scores, measurement
@@ -65,6 +66,8 @@ def _seconds(policies: float = 0, trials: float = 0, decisions: float = 0) -> Ca
     """Returns an estimate of the seconds of so many trainings, tries of a policy, and planned episodes' decisions."""
 
     def seconds(config: Config) -> float:
+        if not _in_lift(config):
+            return 0.0
         size = Size.of(config)
         acting = size.trials.episodes * (trials * EPISODE + decisions * DECISION)
         return JUDGE_STEP * size.judge + policies * POLICY_STEP * size.policy.train.steps + acting
@@ -72,8 +75,18 @@ def _seconds(policies: float = 0, trials: float = 0, decisions: float = 0) -> Ca
     return seconds
 
 
+def _in_lift(config: Config) -> bool:
+    return not config.data.key and config.sim.env == "lift"
+
+
 def _judged(run: Run, size: Size) -> RunData:
-    """Returns a run's data, with a judge in its directory."""
+    """Returns a run's data, with a judge in its directory.
+
+    Raises:
+        Unavailable: its clips are not of Lift.
+    """
+    if not _in_lift(run.config):
+        raise Unavailable(f"policies are tried in the simulated Lift alone; the clips are of {run.config.sim.env}")
     if not (run.directory / JUDGE).exists():
         make_judge(run.directory, run.data_directory, settings=JudgeSettings(steps=size.judge))
     return RunData(run.directory, run.data_directory)
