@@ -193,7 +193,8 @@ class RoboScape(WorldModel[Batch]):
         if self.config.mask.own_frames:
             own = masking.reads_own_frames(self.config.mask, key, context.step)
             fixed = {"params": jax.lax.stop_gradient(params)}
-            previous = previous_frames(lambda: apply(fixed, *inputs)[0], masked.tokens, arch.code_bits, own)
+            predict = lambda: apply(fixed, *inputs)[0]  # noqa: E731
+            previous = previous_frames(predict, masked.tokens, arch.code_bits, own, self.prompt_frames)
         logits, _ = apply({"params": params}, *inputs, previous=previous)
         predictions = Predictions(self, logits, clean, mask, batch)
         terms = {name: TERMS[name](predictions) for name in TERMS if name in self.loss_weights}

@@ -8,6 +8,7 @@ Axes: B clips, T frames, S cells, D code bits.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,21 +26,24 @@ def previous_frames(
     tokens: dict[str, Int[Array, "B T H W"]],
     code_bits: int,
     own: Bool[Array, ""] | bool,
+    prompt_frames: int,
 ) -> Previous:
     """Returns the codes of the frame before each frame: the true ones, or if ``own`` the model's mean codes.
 
-    The first frame stays true, as in a rollout. No gradient flows into the predictions.
+    The prompt's frames stay true, as in a rollout. No gradient flows into the predictions.
 
     Args:
         predict: returns the logits of all frames, each from the true frames before it; not computed unless ``own``.
         tokens: of the true frames, by branch.
         own: the same on all devices.
+        prompt_frames: those that generation starts from.
     """
     true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}
 
     def predicted() -> Previous:
         means = {name: lfq.mean_codes(logits, code_bits) for name, logits in predict().items()}
-        return {name: jnp.concatenate([true[name][:, :1], mean[:, 1:]], axis=1) for name, mean in means.items()}
+        joined = partial(jnp.concatenate, axis=1)
+        return {name: joined([true[name][:, :prompt_frames], mean[:, prompt_frames:]]) for name, mean in means.items()}
 
     read: Any = jax.lax.cond(own, predicted, lambda: true)
     return {name: jax.lax.stop_gradient(shifted(codes)) for name, codes in read.items()}

@@ -12,6 +12,7 @@ import pytest
 from rsjax.config import MaskConfig, RoboScapeConfig
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.own_frames import previous_frames
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import lfq
 from rsjax.trainable import StepContext, combine
@@ -60,13 +61,23 @@ def test_a_step_on_own_frames_reads_the_mean_codes_of_a_pass_on_true_ones(monkey
     assert cells == batch.weight.sum() * 3 * 4
 
     # The gradient is that of the second pass, with what it reads held fixed.
-    def fixed(predict: Any, tokens: Any, code_bits: int, own_step: Any) -> Any:
+    def fixed(predict: Any, tokens: Any, code_bits: int, own_step: Any, prompt_frames: int) -> Any:
+        assert prompt_frames == 1
         return {name: jnp.asarray(codes) for name, codes in own.items()}
 
     here = gradient(model_of(1.0), params, batch, jnp.int32(0))
     monkeypatch.setattr("rsjax.models.roboscape.model.previous_frames", fixed)
     there = gradient(model_of(0.5), params, batch, jnp.int32(0))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), here, there)
+
+
+@pytest.mark.parametrize("prompt", [1, 3])
+def test_the_prompts_frames_stay_true(prompt: int) -> None:
+    tokens = {"rgb": jnp.full((1, 5, 1, 1), 15)}  # all bits 1
+    zeros = {"rgb": jnp.zeros((1, 5, 1, 2, 4))}  # so that all mean codes are 0
+    read = previous_frames(lambda: zeros, tokens, 4, True, prompt)["rgb"]
+    true = [1.0] * (prompt + 1)  # frame 0 reads itself
+    np.testing.assert_array_equal(read[0, :, 0, 0], (true + [0.0] * 5)[:5])
 
 
 def test_before_its_first_own_frames_a_step_is_the_one_on_true_frames() -> None:
