@@ -87,7 +87,8 @@ class PlanningActor:
         self._frames.append(frame)
         kept = 1 if len(self._frames) < MEMORY else MEMORY  # two shapes, so that two programs are compiled
         frames = self._frames[-kept:]
-        depth = np.stack([each["depth"] for each in frames]) if self._depth else None
+        # An episode that began with a picture has no depth, whatever the model generates.
+        depth = np.stack([each["depth"] for each in frames]) if self._depth and "depth" in frame else None
         seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
         action = self._planner(seen).astype(np.float32)
         self._actions.append(action)

@@ -1,7 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -98,6 +98,25 @@ def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
 def model(tmp_path_factory: pytest.TempPathFactory) -> TrainedModel:
     store: Store = toy.store(tmp_path_factory.mktemp("plan") / "clips")
     return toy.trained(store)
+
+
+def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
+    asked: list[Seen] = []
+
+    def plan(seen: Any) -> np.ndarray:
+        asked.append(seen)
+        return np.full(2, len(asked))
+
+    for depths in ({"depth": np.ones((4, 4), np.float32)}, {}):
+        asked.clear()
+        act = planning.PlanningActor(cast(Planner, plan), 2, depth=True)
+        for _ in range(3):
+            act({"rgb": np.zeros((4, 4, 3), np.uint8)} | depths)
+        assert [len(seen.rgb) for seen in asked] == [1, 2, 2]
+        assert [None if seen.depth is None else len(seen.depth) for seen in asked] == (
+            [1, 2, 2] if depths else [None] * 3
+        )
+        assert [seen.actions[-1, 0] for seen in asked] == [0, 1, 2]
 
 
 def test_energies_are_scores_of_what_a_model_generates() -> None:
