@@ -52,7 +52,8 @@ def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
             f"scenes never seen, {count} episodes of each kind",
             lambda report: collect_unseen(sim, store, count, report),
         )
-    if needed <= sim.frames or _lacking(store.splits, protocol.splits):
+    known = not _lacking(store.splits, protocol.splits)
+    if needed <= sim.frames or not known or chosen_splits(store, protocol.splits) != ["test"]:
         return store
     longer = longer_episodes(sim, needed, protocol.clips)
     path = run.data_directory / f"{sim.env}-{collection_key(longer)}"

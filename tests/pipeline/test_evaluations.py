@@ -304,6 +304,8 @@ def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says:
         (("unseen_camera", "tset"), FRAMES, None),
         (("unseen_camera",), FRAMES, "unseen"),
         (("unseen*",), FRAMES + 9, "unseen"),
+        (("train",), FRAMES + 9, None),
+        (("train", "test"), FRAMES + 9, None),
     ],
 )
 def test_only_splits_that_there_can_be_are_simulated(
