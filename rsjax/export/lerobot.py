@@ -132,10 +132,12 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
     fps = options.fps or frame_rate(clip, store.manifest)
     if not fps:
         raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
-    fps = float(video_rate(fps))  # timestamps of a long video of many episodes have to be those of its frames
     size = clip["rgb"].shape[1]
-    if size % 2 or not 0 < fps <= 1000:
-        raise UserError(f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0 to 1000 Hz")
+    if size % 2 or not 0.001 <= fps <= 1000:
+        raise UserError(
+            f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0.001 to 1000 Hz"
+        )
+    fps = float(video_rate(fps))  # timestamps of a long video of many episodes have to be those of its frames
     width = clip["actions"].shape[1]
     states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
     video = VideoSettings(options.codec, options.crf, fps, size)

@@ -204,6 +204,9 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
         export_lerobot(toy_store(tmp_path / "still", fps=None), tmp_path / "a")
     with pytest.raises(UserError, match="33 × 33 pixels"):
         export_lerobot(toy_store(tmp_path / "odd", size=33), tmp_path / "b")
+    for fps in (float("inf"), -1.0, 1e-9):
+        with pytest.raises(UserError, match=r"32 × 32 pixels at .* Hz; videos need even sides and 0.001 to 1000 Hz"):
+            export_lerobot(toy_store(tmp_path / f"{fps}"), tmp_path / "f", LeRobotOptions(fps=fps))
     for fields in ({"crf": 64}, {"crf": 52, "codec": "h264"}, {"crf": -3}):
         with pytest.raises(UserError, match=r"export.crf is .*; it must be 0 … "):
             LeRobotOptions(**fields)  # type: ignore[arg-type]
