@@ -16,7 +16,7 @@ class Agreement:
     """Agreement of predicted success rates y and true ones x, over policies.
 
     Attributes:
-        pearson: r with its Fisher interval (None with fewer than 4 policies).
+        pearson: r with its Fisher interval (None with fewer than 4 policies, or where all lie on a line).
         r2_line: R² of the line that fits best, which is r².
         r2_identity: R² of the line y = x, 1 - Σ(y - x)² / Σ(y - ȳ)², comparable with ``r2_line``: of the spread of y.
         r2_prediction: R² of y as a prediction of x, 1 - Σ(y - x)² / Σ(x - x̄)². Where the spreads differ, one may be
@@ -65,14 +65,14 @@ def correlation(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"]) -> float
     """Returns Pearson's r; NaN where one does not vary."""
     a, b = x - x.mean(), y - y.mean()
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
-    return float(np.sum(a * b)) / size if size > 1e-12 else float("nan")
+    return float(np.clip(np.sum(a * b) / size, -1, 1)) if size > 1e-12 else float("nan")
 
 
 def fisher(r: float, count: int, level: float = 0.95) -> Estimate:
-    """Returns r with the interval of Fisher's z transform."""
+    """Returns r with the interval of Fisher's z transform, which ±1, up to rounding, does not have."""
     from scipy.special import ndtri
 
-    if count < 4 or not abs(r) < 1:
+    if count < 4 or not abs(r) < 1 - 1e-12:
         return Estimate(r, None, None)
     half = float(ndtri((1 + level) / 2)) / np.sqrt(count - 3)
     return Estimate(r, float(np.tanh(np.arctanh(r) - half)), float(np.tanh(np.arctanh(r) + half)))

@@ -41,6 +41,9 @@ def test_a_perfect_predictor_and_a_shifted_one(pairs: list[tuple[int, int]]) -> 
         assert perfect.r2_identity == pytest.approx(1)
         assert perfect.r2_prediction == pytest.approx(1)
         assert shifted.r2_line == pytest.approx(1) and shifted.r2_identity < 1
+        for found in (perfect, shifted):  # rounding is no interval of width 0, and no correlation above 1
+            assert found.pearson.low is None and found.pearson.high is None
+            assert max(found.pearson.value, found.spearman, found.r2_line) <= 1
 
 
 def test_the_line_y_x_and_the_prediction_of_x_have_different_spreads() -> None:
