@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsjax.compare.groups import parse_group, read_groups
+from rsjax.compare.groups import noted, parse_group, read_groups
 from rsjax.compare.page import ComparedClip, strips, write_page
 from rsjax.compare.published import published_name
 from rsjax.compare.table import as_csv, as_json, as_markdown, compare
@@ -264,6 +264,14 @@ def test_runs_of_a_group_differ_in_their_seed_alone(make: Make, changes: dict, s
         return
     with pytest.raises(UserError, match=f"a: runs/0.0 and runs/0.0 .*{re.escape(says)}"):
         read_groups([group], None)
+
+
+@pytest.mark.parametrize("reads", [False, True])
+def test_a_setting_of_sampling_that_came_later_is_noted_only_where_it_differs(make: Make, reads: bool) -> None:
+    old, new = toy.result(0.0), toy.result(1.0, sampling={"steps": 2, "read_means": reads})
+    notes = noted(read_groups([make("a", old), make("b", new)], None))
+    line = "a and b: sampling.read_means is False in the first, True in the other"
+    assert notes == ([line] if reads else [])
 
 
 def test_rows_of_the_paper() -> None:
