@@ -154,7 +154,7 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(improvement, "train_policy", train)
     settings = Improvement(rounds=2, imagined=10, max_steps=4, steps=7, share=0.5, learning_rate=0.5)
     starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
-    model = imagined(5)
+    model: Any = imagined(5)
     inputs: Any = (ToyPolicy(0.8), demos(3), starts, model, simulated(5), settings, TRIALS, tmp_path)
     results = improve(*inputs)
     draws = model._imagination.draws
@@ -176,7 +176,7 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     assert "| 2 | 10 | 4 | 0 % | imagined | 60 % |" in (tmp_path / "results.md").read_text()
     count = len(draws)
     assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
-    other = imagined(5, pace=0.5)  # a model of other weights imagines anew
+    other: Any = imagined(5, pace=0.5)  # a model of other weights imagines anew
     made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1")
     assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(other._imagination.draws) == 2
 
