@@ -91,11 +91,16 @@ def scale(preset: Config, seconds: float) -> Scale:
     }
     base = with_values(preset, values)
     steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
-    base = with_values(base, {"train.steps": min(preset.train.steps, max(LEAST_STEPS, _round(steps)))})
-    if isinstance(base.model, TokenModelConfig):
-        begin = base.model.mask.own_frames_after * base.train.steps // preset.train.steps
-        base = with_values(base, {"model.mask.own_frames_after": begin})
+    base = with_steps(base, min(preset.train.steps, max(LEAST_STEPS, _round(steps))))
     return Scale(seconds, base)
+
+
+def with_steps(config: Config, steps: int) -> Config:
+    """Returns the configuration with so many steps of the world model; own frames begin at the same share of them."""
+    values = {"train.steps": steps}
+    if isinstance(config.model, TokenModelConfig):
+        values["model.mask.own_frames_after"] = config.model.mask.own_frames_after * steps // config.train.steps
+    return with_values(config, values)
 
 
 def _round(number: float) -> int:

@@ -176,7 +176,7 @@ def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alon
     if alone:
         return budget.cut(config, whole / (tokenizer + model))
     steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
-    return with_values(config, {"train.steps": steps})
+    return budget.with_steps(config, steps)
 
 
 def _small(arm: Arm, base: Config) -> Config:

@@ -70,11 +70,12 @@ def test_a_small_preset_keeps_its_own_sizes() -> None:
     assert Run(scale(presets.debug(), 3 * HOUR).base, Path(), DATA).keys() == whole
 
 
-def test_own_frames_begin_at_the_same_share_of_fewer_steps() -> None:
-    whole, small = TINY, scale(TINY, 3 * HOUR).base
-    begins = [each.model.mask.own_frames_after / each.train.steps for each in (whole, small)]  # type: ignore[attr-defined]
-    assert small.train.steps < whole.train.steps and begins[0] > 0
-    assert begins[1] == pytest.approx(begins[0], abs=0.01)
+def test_own_frames_begin_at_the_same_share_of_fewer_and_more_steps(three_hours: Plan) -> None:
+    small = scale(TINY, 3 * HOUR).base
+    genie = three_hours.of("table1", "Genie")[0].config
+    assert genie.train.steps > small.train.steps < TINY.train.steps
+    whole, *others = [each.model.mask.own_frames_after / each.train.steps for each in (TINY, small, genie)]  # type: ignore[attr-defined]
+    assert whole > 0 and others == pytest.approx([whole] * 2, abs=0.01)
 
 
 def test_a_presets_curriculum_does_not_set_the_steps_of_a_budget() -> None:
