@@ -120,6 +120,16 @@ def test_sizes_and_estimates_shrink_with_the_cell() -> None:
         assert seconds[0] == pytest.approx(seconds[1] / 2, rel=0.05)
 
 
+def test_policies_are_judged_in_every_family_with_actions() -> None:
+    """As in Fig. 5, which has iVideoGPT and IRASim; these generate a video for each frame, and take longer."""
+    claim = claims()["policy-evaluation"]
+    assert [arm.model or arm.preset for arm in claim.arms] == ["", "genie", "ivideogpt", "irasim"]
+    compared = {(each.metric, each.than) for each in claim.comparisons}
+    assert {(metric, arm.name) for arm in claim.arms[1:] for metric in ("correlation", "same_outcome")} < compared
+    seconds = [seconds_of("policies judged", presets.get(name)) for name in ("tiny", "ivideogpt_tiny", "irasim_tiny")]
+    assert seconds[0] < seconds[1] < seconds[2]
+
+
 def test_cells_on_other_simulators_than_lift_train_no_judge_and_cost_nothing(tmp_path: Path) -> None:
     run = Run(presets.get("multitask"), tmp_path / "cell", tmp_path)
     for name in dict.fromkeys(each.measurement for claim in NAMES for each in claims()[claim].comparisons):
