@@ -31,7 +31,7 @@ def success_curves(series: Mapping[str, Sequence[tuple[float, Estimate]]], label
 
 def scatter(points: Mapping[str, tuple[Sequence[Estimate], Sequence[Estimate]]], titles: Mapping[str, str]) -> bytes:
     """Returns a panel for each world model: true success across, imagined success up, a cross for each policy."""
-    figure = Figure(figsize=(3.8 * len(points), 4.0), layout="constrained")
+    figure = Figure(figsize=(3.8 * len(points), 4.4), layout="compressed")
     panels = figure.subplots(1, len(points), squeeze=False)[0]
     for axes, (name, (true, imagined)) in zip(panels, points.items(), strict=True):
         axes.plot([0, 1], [0, 1], color=COLORS[4], linewidth=0.8, linestyle="--")
