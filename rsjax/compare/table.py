@@ -171,7 +171,7 @@ def as_markdown(comparison: Comparison) -> str:
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    texts = [list(head), *([cell.replace("|", r"\|") for cell in row] for row in rows)]
+    texts = [[cell.replace("|", r"\|") for cell in row] for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     texts.insert(1, ["-" * width for width in widths])
     lines = [" | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) for line in texts]

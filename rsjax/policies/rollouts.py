@@ -17,6 +17,7 @@ from rsjax.policies.continuing import imagination
 from rsjax.policies.keys import arrays_key, judge_key, model_key
 from rsjax.policies.simulator import UNIT, Episode
 from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
+from rsjax.progress import note
 
 Acts = Callable[[UInt8[np.ndarray, "B S S 3"]], Float32[np.ndarray, "B A"]]
 FIRST_SEED = 2**31  # of the test episodes: collections draw theirs from anywhere, few of which will be these
@@ -71,6 +72,8 @@ class World(Protocol):
 class Simulated:
     """Episodes in simulator environments, which start from seeds.
 
+    An episode whose simulation diverges stays as it was before, with a note, and does not succeed.
+
     Args:
         envs: environments like :class:`rsjax.policies.simulator.LiftEnv`.
         key: of their settings.
@@ -88,15 +91,22 @@ class Simulated:
 
     def restart(self, starts: Sequence[int]) -> Seen:
         self._last = [env.reset(seed=int(seed)) for env, seed in zip(self._envs, starts, strict=False)]
-        self._clipped = np.zeros(len(starts), int)
+        self._clipped, self._diverged = np.zeros(len(starts), int), set[int]()
         width = self._envs[0].action_space.shape[0]
         return self._seen(np.zeros((len(starts), width), np.float32))
 
     def step(self, actions: Float32[np.ndarray, "B A"], over: Bool[np.ndarray, " B"]) -> Seen:
         done = np.zeros((len(self._last), self._envs[0].action_space.shape[0]), np.float32)
-        for number in np.flatnonzero(~over):
-            seen, _, _, _, info = self._envs[number].step(actions[number])
-            self._last[number], done[number] = (seen, info), info["action"]
+        for number in np.flatnonzero(~over).tolist():
+            if number in self._diverged:
+                continue
+            try:
+                seen, _, _, _, info = self._envs[number].step(actions[number])
+            except ArithmeticError as error:
+                self._diverged.add(number)
+                note(f"{error}; the episode stays as it was, and does not succeed")
+            else:
+                self._last[number], done[number] = (seen, info), info["action"]
         return self._seen(done)
 
     def _seen(self, done: Float32[np.ndarray, "B A"]) -> Seen:

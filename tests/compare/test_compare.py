@@ -107,6 +107,13 @@ def test_results_that_do_not_say_their_rate_compare_with_any(make: Make) -> None
     assert len(read_groups([make("new", new), make("old", old, old), make("unknown", unknown)], None)) == 3
 
 
+def test_names_with_a_bar_keep_the_columns(make: Make) -> None:
+    text = as_markdown(compare(read_groups([make("a|b", toy.result(0.0)), make("c", toy.result(1.0))], None), ["psnr"]))
+    scores = [line for line in text.split("\n\n")[1].splitlines() if line.startswith("|")]
+    assert any(r"a\|b" in line for line in scores)
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in scores}) == 1
+
+
 def test_files_have_published_numbers_apart_and_reasons(make: Make, tmp_path: Path) -> None:
     genie = toy.result(1.0, model={"run": "g", "family": "genie", "trained_on": "less"})
     found = compare(read_groups([make("ours", toy.result(0.0)), make("theirs", genie)], None))

@@ -94,6 +94,21 @@ def test_answers_of_another_shape_are_named(kind: str, shape: tuple[int, ...]) -
         run_together(world, lambda rgb: np.zeros(shape, np.float32), starts, 3)
 
 
+def test_a_simulation_that_diverges_ends_no_other_episode(capsys: pytest.CaptureFixture[str]) -> None:
+    world = simulated(2)
+
+    def diverge(action: np.ndarray) -> None:
+        raise ArithmeticError("the simulation diverged")
+
+    world._envs[1].step, whole = diverge, world._envs[1].step
+    one, other = run_together(world, ToyPolicy(1.0).actor(), [0, 3], 9)
+    assert one.success[-1] and not other.success.any()
+    np.testing.assert_array_equal(other.rgb, np.repeat(picture(3)[None], 10, 0))
+    assert capsys.readouterr().out.count("the simulation diverged; the episode stays as it was") == 1
+    world._envs[1].step = whole
+    assert all(each.success[-1] for each in run_together(world, ToyPolicy(1.0).actor(), [0, 3], 9))
+
+
 def test_the_worlds_begin_with_the_same_frames(tmp_path: Path) -> None:
     world, model = simulated(2), imagined(2)
     found = first_frames(world, STARTS, tmp_path / "starts.npz")
