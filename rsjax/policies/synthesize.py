@@ -56,8 +56,8 @@ class Synthesis:
     fps: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.fps <= 1000:
-            raise UserError(f"--fps {self.fps}: frames per second, up to 1000; 0: as the clips say")
+        if self.fps and not 0.001 <= self.fps <= 1000:
+            raise UserError(f"--fps {self.fps:g}: frames per second, 0.001 to 1000; 0: as the clips say")
         if self.demos < 1 or self.batch < 1 or not 0 <= self.noise < float("inf"):
             raise UserError(f"--demos {self.demos}, --batch {self.batch}, --noise {self.noise}: 1, 1 and 0 at least")
 

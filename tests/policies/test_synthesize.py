@@ -148,5 +148,6 @@ def test_clips_without_a_frame_rate_need_one_before_anything_is_generated(tmp_pa
     with pytest.raises(UserError, match="both: its clips have several frame rates, such as . Hz; give --fps"):
         choose_clips(both, Synthesis(8))
     assert len(choose_clips(both, Synthesis(8, fps=5))) == 6
-    with pytest.raises(UserError, match="--fps -1: frames per second"):
-        Synthesis(fps=-1)
+    for fps in (-1, 1e-4, float("nan")):
+        with pytest.raises(UserError, match=f"--fps {fps:g}: frames per second, 0.001 to 1000"):
+            Synthesis(fps=fps)
