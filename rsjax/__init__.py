@@ -5,7 +5,7 @@
 >>> clips = rsjax.open_store("data/lift-5f1bcdd16386361c").source("test")
 >>> video = model.generate(clips[0]["rgb"][:1], clips[0]["actions"])
 
-``docs/api.md`` shows all of it.
+``docs/api.md`` describes the whole API.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ __all__ = ["__version__", "load", "open_store", "write_store"]
 
 
 def load(run: "Path | str") -> "TrainedModel":
-    """Loads the trained world model of a run directory, as ``experiments.train`` makes it.
+    """Loads the trained world model from a run directory that ``experiments.train`` made.
 
     Args:
         run: the directory, such as ``"runs/tiny"``.
@@ -40,7 +40,7 @@ def load(run: "Path | str") -> "TrainedModel":
 
 
 def open_store(path: "Path | str") -> "Store":
-    """Opens a store of clips, as ``experiments.train`` and ``experiments.ingest`` make them.
+    """Opens a store of clips, such as ``experiments.train`` and ``experiments.ingest`` write.
 
     Args:
         path: the store's directory.
@@ -58,26 +58,26 @@ def open_store(path: "Path | str") -> "Store":
 
 
 def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]", *, test_share: float = 0.1) -> "Store":
-    """Writes a store of clips, on which ``experiments.train PRESET --store PATH`` trains.
+    """Writes a store of clips, on which ``experiments.train PRESET --store PATH`` can train.
 
     Args:
         path: the store's directory; an older store there is replaced once the new one is complete.
-        clips: read once, one at a time; all of one shape. Each is a :class:`rsjax.clip.Clip` or a dict with
+        clips: read once, one at a time; all have the same shape. Each is a :class:`rsjax.clip.Clip` or a dict with
 
             - ``rgb``: uint8 (T, S, S, 3), RGB, upright;
             - ``actions``: (T, A), where row t led from frame t-1 into frame t, and row 0 is zeros;
             - ``depth``, if it is known: z-depth in metres, (T, S, S), above 0;
             - ``tracks`` and ``visible``, if they are known: (N, T, 2), x and y from 0 to 1 across the image, and
-              (N, T), bool; of all clips or of none;
-            - ``success``: bool, or one for each frame; ``fps``: frames per second, above 0;
-            - ``task``, ``difficulty``, ``scene``, ``segment``, ``skill``: texts, by which a curriculum or a split
+              (N, T), bool; given for all clips or for none;
+            - ``success``: one bool, or one for each frame; ``fps``: frames per second, above 0;
+            - ``task``, ``difficulty``, ``scene``, ``segment``, ``skill``: strings by which a curriculum or a split
               chooses clips;
             - ``episode``: a name; all clips of one episode are in one split. By default each clip is an episode;
             - ``provenance``: further JSON-ready values.
 
-            Only ``rgb`` and ``actions`` have to be there.
-        test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split. With 0 that
-            is empty, and training a world model on the store refuses.
+            Only ``rgb`` and ``actions`` are required.
+        test_share: share of the episodes, chosen by a hash of their names, whose clips are the test split. With 0 the
+            test split is empty, and ``experiments.train`` refuses to train a world model on the store.
 
     Returns:
         The store, opened.
@@ -85,7 +85,7 @@ def write_store(path: "Path | str", clips: "Iterable[Mapping[str, Any] | Clip]",
     Raises:
         rsjax.data.store.StoreError: a clip lacks a field or has a wrong one (the message names its number), or ``path``
             holds something that is not a store.
-        rsjax.files.FileError: the disk is full or refuses.
+        rsjax.files.FileError: the disk is full, or ``path`` is not writable.
     """
     from rsjax.data import build
 

@@ -14,7 +14,7 @@ UNKNOWN = "unknown"  # the task or label of a clip whose data set does not name 
 
 
 def words_of(value: object) -> str:
-    """Returns a text of a data set without blanks around it; "" for null, which some write as NaN."""
+    """Returns a data set's text without surrounding blanks; "" for null, which some data sets write as NaN."""
     return "" if value is None or value != value else str(value).strip()
 
 

@@ -17,14 +17,14 @@ UNREAD = 128 + signal.SIGPIPE  # the exit status of a process that SIGPIPE ends
 
 
 def refuse_repeated(argv: Sequence[str], repeatable: Collection[str] = ()) -> None:
-    """Refuses an option that is given twice; parsers would take the last one without a word.
+    """Refuses an option that is given twice; parsers would silently take the last one.
 
     Args:
         argv: the arguments of a command. ``--no-x`` and ``--x`` are one option.
         repeatable: names of options that add up, without dashes in front.
 
     Raises:
-        UserError: one is repeated.
+        UserError: an option is repeated.
     """
     given: set[str] = set()
     for word in argv:
@@ -40,17 +40,18 @@ def refuse_repeated(argv: Sequence[str], repeatable: Collection[str] = ()) -> No
 def main_errors() -> Iterator[None]:
     """Turns errors that the user can cure into one line on standard error and an exit status, without a traceback.
 
-    Around a command's main function, as a decorator or in a ``with``. Exits with 2 for most :class:`UserError`, a full
-    disk or a missing permission, with 130 for an interrupt, with 75 (to be started again) for SIGTERM, and with 141 and
-    no message if nobody reads its output any more (``| head``). Any other exception is a bug and keeps its traceback.
+    Wraps a command's main function, as a decorator or in a ``with`` statement. Exits with 2 for most
+    :class:`UserError`, a full disk or a missing permission, with 130 for an interrupt, with 75 (start the command
+    again) for SIGTERM, and with 141 and no message if nobody reads the output any more (``| head``). Any other
+    exception is a bug and keeps its traceback.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
-    os.environ["MPLBACKEND"] = "agg"  # figures only go to files; the import fails with a backend that it does not know
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be valid text
+    os.environ["MPLBACKEND"] = "agg"  # figures only go to files; importing matplotlib fails on unknown backends
     with stop_signals() as received:
         try:
             yield
-            if sys.stdout is not None:  # closed by the shell's >&-
+            if sys.stdout is not None:  # None if the shell closed it with >&-
                 sys.stdout.flush()
         except (Exception, KeyboardInterrupt) as error:
             if isinstance(error, BrokenPipeError) and _unread():
@@ -62,7 +63,7 @@ def main_errors() -> Iterator[None]:
 
 
 def _unread() -> bool:
-    """Says whether standard output is a pipe that was closed at its other end."""
+    """Says whether standard output is a pipe whose other end was closed."""
     try:
         output = sys.stdout.fileno()
     except (AttributeError, OSError, ValueError):  # closed, or not a file
@@ -74,14 +75,14 @@ def _unread() -> bool:
 
 def _answer(error: BaseException, received: list[int]) -> tuple[str | None, int]:
     """Returns the line that reports an error, None for a bug, and the exit status."""
-    # A signal may come out as another error, such as an ImportError where it hit an import.
+    # A signal may surface as another error, such as an ImportError if it arrived during an import.
     if isinstance(error, Preempted):
         return str(error), os.EX_TEMPFAIL
     if isinstance(error, KeyboardInterrupt) or signal.SIGINT in received:
         return INTERRUPTED, 130
     if signal.SIGTERM in received:
         return TERMINATED, os.EX_TEMPFAIL
-    if bad := _bad_variable(error):  # also where it came out as another error, such as one of a checkpoint
+    if bad := _bad_variable(error):  # also if it surfaced as another error, such as one from a checkpoint
         return f"error: {bad}", 2
     if isinstance(error, UserError):
         return f"error: {error}", error.status
@@ -96,18 +97,18 @@ def _cure(error: BaseException) -> str | None:
         return f"{cause}{where}; {cure}: the same command resumes"
     if isinstance(error, PermissionError) or getattr(error, "errno", None) == errno.EROFS:
         return f"no permission to write or read{where}; choose another directory or change its owner"
-    if where:  # a directory in place of a file, a file in place of a directory, a place where none can be made
+    if where:  # a directory where a file should be, or the reverse, or a path where nothing can be created
         return f"{error.strerror}{where}; choose another path"  # type: ignore[union-attr,attr-defined]
     return None
 
 
 def _bad_variable(error: BaseException | None) -> str:
-    """Says which of jax's variables asks for what there is not, if this is why an error was raised."""
+    """Says which of jax's environment variables is invalid if that caused the error; "" otherwise."""
     platforms, jax = os.environ.get("JAX_PLATFORMS"), sys.modules.get("jax")
     while error is not None:
         if (refused := _JAX_REFUSES.search(str(error))) and (value := os.environ.get(name := refused[1].upper())):
             return f"{name} is {value!r:.80}, which jax does not know; unset it"
-        # For a kind of device that it knows, jax raises an empty AssertionError.
+        # For a kind of device that it knows but does not find, jax raises an empty AssertionError.
         unknown = isinstance(error, AssertionError) or "Unable to initialize backend" in str(error)
         if platforms and jax is not None and unknown:
             try:
@@ -127,8 +128,8 @@ _JAX_REFUSES = re.compile(
 
 def _exit(line: str, status: int) -> None:
     print(" ".join(line.split()), file=sys.stderr)
-    # At exit, processes that stop wait for each other. One that failed would wait in vain for the others, and jax would
-    # then abort with a status of its own.
+    # At exit, the processes of a distributed run wait for each other. A process that failed would wait in vain, and jax
+    # would then abort with its own status.
     orderly = (os.EX_TEMPFAIL,) if _has_peers() else (UserError.status,)
     if status not in orderly:
         exit_now(status)
@@ -137,5 +138,5 @@ def _exit(line: str, status: int) -> None:
 
 def _has_peers() -> bool:
     jax = sys.modules.get("jax")
-    # A signal may have hit its import.
+    # A signal may have interrupted jax's import.
     return jax is not None and hasattr(jax, "distributed") and jax.distributed.is_initialized()

@@ -70,17 +70,17 @@ def _tokenizer(config: Config) -> Shapes:
 
 
 def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
-    """Counts parameters, operations and bytes, by flat names.
+    """Counts parameters, operations and bytes, and returns them by flat names.
 
-    - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch and the shared part, the model
-      without depth.
+    - ``params_…``: of each part and network; ``params_one_branch``: of the RGB branch and the shared part, that is, of
+      the model without depth.
     - ``flops_…``: matrix products and convolutions, 2 per multiply-add (``flops.py`` of model and tokenizer). Per
-      frame: a forward pass over a clip divided by its frames, about that of one frame with the cache. Training: three
-      forward passes, without what remat repeats.
+      frame: those of a forward pass over a clip, divided by its frames, which is about the cost of one frame with the
+      cache. Training: those of three forward passes, without what remat repeats.
     - ``bytes_train_state``: of the world model's parameters, optimizer state, averages and gradients, per device.
     - ``bytes_activations_per_clip``: what automatic differentiation keeps of forward pass and loss; the compiler may
-      keep less. ``…_remat``: each block's input, and all of the block that is being recomputed. The first is for
-      ``model.remat`` none, the second for blocks; products is between them.
+      keep less. ``…_remat``: each block's input, and everything of the block that is being recomputed. The first is for
+      ``model.remat`` "none", the second for "blocks"; "products" is between them.
     - ``bytes_cache_…``: keys and values that one rollout of a clip's length keeps, for a family with a cache.
     """
     model, world = create_model(config), modules["world_model"]

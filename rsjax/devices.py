@@ -24,7 +24,7 @@ def replicate(params: Tree) -> Tree:
 def divide(batch: Tree, params: Any) -> Tree:
     """Puts a batch where its parameters are: rows divided among their devices if they can be, else all rows on each.
 
-    Without :func:`replicate` before, the batch is returned as it is.
+    If :func:`replicate` did not place the parameters on several devices, the batch is returned as it is.
     """
     place = getattr(next(iter(jax.tree.leaves(params)), None), "sharding", None)
     if not isinstance(place, NamedSharding) or place.mesh.axis_names != (_ROWS,):

@@ -7,12 +7,12 @@ from collections.abc import Iterable
 
 
 class UserError(Exception):
-    """The user can fix it. The message is one line that names what is wrong and the cure.
+    """An error that the user can fix. The message is one line that names what is wrong and the cure.
 
     Not a :class:`ValueError`, because some libraries, such as the command-line parser, catch those.
 
     Attributes:
-        status: the exit status of a command that it ends.
+        status: the exit status of a command that the error ends.
     """
 
     status = 2
@@ -41,7 +41,7 @@ def first_line(error: object) -> str:
 def storage_limit(error: object) -> str:
     """Says which limit of a disk an error reports, and the cure; "" for none.
 
-    Libraries report these in errors of their own, which have the operating system's text somewhere.
+    Libraries report these limits in their own errors, which contain the operating system's text somewhere.
     """
     number, text = getattr(error, "errno", None), str(error)
     for limit, cure in _LIMITS.items():
@@ -60,6 +60,6 @@ _LIMITS = {
 class Preempted(KeyboardInterrupt):
     """The process was stopped by SIGTERM, with its work saved. The message says how to resume.
 
-    A :class:`KeyboardInterrupt`, as it may be raised anywhere, and error handlers there must not catch it: asyncio, in
-    which orbax saves and restores, logs and drops every other exception and would then wait for ever.
+    It is a :class:`KeyboardInterrupt` because it may be raised anywhere, and error handlers there must not catch it:
+    asyncio, in which orbax saves and restores, logs and drops every other exception and would then wait forever.
     """

@@ -19,8 +19,8 @@ from filelock import lock_descriptor
 from rsjax.errors import UserError, storage_limit
 from rsjax.progress import note
 
-_HEAD = 512  # bytes in which a file shows that it is something else
-LOCK_SECONDS = 0.25  # for which a free lock may look taken, while other processes look at it
+_HEAD = 512  # bytes at a file's start by which placeholders are recognised
+LOCK_SECONDS = 0.25  # for this long a free lock may look taken, while other processes check it
 
 
 class FileError(UserError):
@@ -106,10 +106,10 @@ def read_json_lines(path: Path, field: str, kind: type, cure: str = "delete the 
 
 
 def content_hash(path: Path, pattern: str = "*") -> str:
-    """Returns a hash of a file's content: 16 hex digits. That of a folder is of the files in it, with their names.
+    """Returns a hash of a file's content, or of a folder's files and their names, as 16 hex digits.
 
     Args:
-        pattern: of a folder's files that count; what is hidden never does.
+        pattern: which of a folder's files are hashed; hidden files never are.
 
     Raises:
         FileError: a file cannot be read.
@@ -130,10 +130,10 @@ def content_hash(path: Path, pattern: str = "*") -> str:
 
 
 def placeholder(content: Path | bytes) -> str:
-    """Says what lies in place of a data file, such as a Git-LFS pointer, and the cure; "" if nothing shows it.
+    """Says what stands in place of a data file, such as a Git-LFS pointer, and the cure; "" if it is no known one.
 
     Args:
-        content: the file, or its content. A file that cannot be read shows nothing.
+        content: the file, or its content. For a file that cannot be read, "" is returned.
     """
     if isinstance(content, Path):
         try:
@@ -152,7 +152,7 @@ def placeholder(content: Path | bytes) -> str:
 
 
 def safe_id(text: str) -> str:
-    """Returns a file name for any text: the text itself if it is one, otherwise what is left of it and a hash."""
+    """Returns a file name for any text: the text itself if valid, otherwise its valid characters and a hash."""
     kept = re.sub(r"[^A-Za-z0-9._-]+", "-", text).lstrip(".-")[:100]
     digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:8]
     return kept if kept and kept == text else f"{kept or 'episode'}-{digest}"
@@ -209,14 +209,14 @@ def disk_guard(path: Path) -> Iterator[None]:
 
 @contextmanager
 def lock(path: Path, wait: str = "", required: bool = True) -> Iterator[bool]:
-    """Takes the lock of this name and yields True, or yields False if another process keeps it (:func:`holder`).
+    """Takes the lock of this name and yields True, or yields False if another process holds it (:func:`holder`).
 
     The operating system releases the lock of a process that dies. The file stays: deleting it would let two processes
     take locks of one name.
 
     Args:
         wait: a message to print, with the holder, before waiting for another process. Empty: do not wait.
-        required: False goes on without a lock, and says so, where the file system has none.
+        required: if False, goes on without a lock, with a message, where the file system has no locks.
 
     Raises:
         FileError: the file system has no locks, or the file cannot be made.
@@ -244,7 +244,7 @@ def lock(path: Path, wait: str = "", required: bool = True) -> Iterator[bool]:
 
 
 def holder(path: Path) -> str:
-    """Returns who keeps the lock of this name, such as ``process 4711 on node3``."""
+    """Returns who holds the lock of this name, such as ``process 4711 on node3``."""
     with suppress(OSError):
         return path.read_text("utf-8", errors="replace") or "another process"
     return "another process"
@@ -252,10 +252,10 @@ def holder(path: Path) -> str:
 
 @contextmanager
 def making(path: Path, wait: bool) -> Iterator[None]:
-    """Keeps other processes from making the data set at ``path`` meanwhile; readers are not locked out.
+    """Keeps other processes from making the data set at ``path`` at the same time; readers are not locked out.
 
     Args:
-        wait: wait for another process that is making it, or raise.
+        wait: if another process is making it, True waits for that process and False raises.
 
     Raises:
         FileError: another process is making it.
@@ -273,14 +273,14 @@ def lock_file(path: Path) -> Path:
 
 
 def is_held(path: Path) -> bool:
-    """Returns whether another process keeps the lock of this name; makes no file."""
+    """Returns whether another process holds the lock of this name; makes no file."""
     if not path.exists():
         return False
-    # NFS locks only what is open for writing.
+    # NFS locks only files that are open for writing.
     handle = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
     try:
         return not _take(handle, path)
-    except FileError:  # without locks nobody keeps one
+    except FileError:  # without locks nobody holds one
         return False
     finally:
         os.close(handle)

@@ -1,7 +1,8 @@
 """Worker processes on this machine: the one way in which rsjax spreads work over cores.
 
-A worker does one item at a time. It may be killed, most often by the kernel for lack of memory, without the others
-noticing: another worker tries its item once more. Workers end with the process that started them, even by SIGKILL.
+A worker does one item at a time. If a worker is killed, most often by the kernel for lack of memory, the others carry
+on, and one of them tries its item once more. Workers end with the process that started them, even if that one is ended
+by SIGKILL.
 """
 
 import ctypes
@@ -21,7 +22,7 @@ from typing import Generic, NamedTuple, TypeVar
 from rsjax.errors import UserError
 
 MOST_PER_CORE = 4  # workers; more only take memory from each other
-MAX_DEATHS = 2  # of workers over one item; the second time it is the item and not the machine
+MAX_DEATHS = 2  # of workers over one item; the second death is blamed on the item and not on the machine
 _LOOK_SECONDS = 1.0  # between looks at who is alive: a dead worker's children may keep its pipe open
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -30,7 +31,7 @@ Result = TypeVar("Result")
 
 
 class WorkerDied(Exception):
-    """The workers that had an item are gone; most often they were killed for lack of memory."""
+    """The workers that were working on an item are gone; most often they were killed for lack of memory."""
 
     def __init__(self) -> None:
         super().__init__(f"{MAX_DEATHS} workers died over it, most likely for lack of memory; try fewer workers")
@@ -73,9 +74,10 @@ def run_items(
         make: called once in each worker, returns the function that does an item's work. Picklable, as are items and
             results.
         items: taken one by one, as workers become free.
-        workers: how many processes at most; each is started when there is an item for it. 0: this process does it all.
-        settle: called in this process with each item and its result, or with :class:`WorkerDied` where
-            :data:`MAX_DEATHS` workers died over it.
+        workers: the most processes to start; each is started when there is an item for it. 0: this process does all the
+            work.
+        settle: called in this process with each item and its result, or with :class:`WorkerDied` if
+            :data:`MAX_DEATHS` workers died over the item.
 
     Raises:
         Exception: whatever the work raised; a bug carries the worker's traceback as a note.
@@ -97,7 +99,7 @@ def run_items(
                 busy[worker.pipe] = worker, *entry
                 try:
                     worker.pipe.send(entry[0])
-                except OSError:  # it died while it was idle, which the next wait sees
+                except OSError:  # the worker died while it was idle; the next wait notices
                     worker.process.kill()
             if not busy:
                 return
@@ -125,12 +127,12 @@ def run_items(
 
 
 def _start(first_message: bytes, started: list[_Worker]) -> _Worker:
-    """Starts a worker and notes it in ``started``, also where Ctrl-C or SIGTERM comes in between."""
+    """Starts a worker and adds it to ``started``, even if Ctrl-C or SIGTERM arrives in between."""
     context = multiprocessing.get_context("spawn")  # a forked JAX, PyTorch or OpenGL does not work
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(os.getpid(), there))
-    resource_tracker.ensure_running()  # it would unblock the signals
-    # A worker inherits the blocked signals: Ctrl-C and SIGTERM are its parent's to answer, which then stops it.
+    resource_tracker.ensure_running()  # starting it later would unblock the signals
+    # A worker inherits the blocked signals: its parent answers Ctrl-C and SIGTERM, and then stops the worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     started.append(_Worker(process, here))
     try:
@@ -140,13 +142,13 @@ def _start(first_message: bytes, started: list[_Worker]) -> _Worker:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         here.send_bytes(first_message)
-    except OSError:  # it died already, which the next wait sees
+    except OSError:  # the worker has died already; the next wait notices
         process.kill()
     return started[-1]
 
 
 def _stop(workers: list[_Worker]) -> None:
-    """Kills workers: files that they are writing have temporary names."""
+    """Kills workers, which is safe: the files that they are writing have temporary names."""
     begun = [worker for worker in workers if worker.process.pid is not None]
     for worker in begun:
         worker.process.kill()
@@ -185,7 +187,7 @@ def _end_with(parent: int) -> None:
 
 
 class Helper(Generic[Item, Result]):
-    """One worker process that answers items in their order, for as long as the thread lives that starts it.
+    """One worker process that answers items in order, for as long as the thread that starts it lives.
 
     Args:
         make: called once in the process, returns the function that does an item's work. Picklable, as are items and
@@ -199,8 +201,8 @@ class Helper(Generic[Item, Result]):
         """Returns an item's result.
 
         Raises:
-            WorkerDied: the process is gone, or has not answered for so many seconds; it is killed then.
-            Exception: what the work raised.
+            WorkerDied: the process is gone, or did not answer within ``seconds`` and was killed.
+            Exception: whatever the work raised.
         """
         try:
             self._worker.pipe.send(item)

@@ -34,7 +34,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Shows how far a stage is, its rate, the time left and the latest scalars. A context manager around the work.
+    """Shows how far a stage has got, its rate, the time left and the latest scalars. A context manager around the work.
 
     Args:
         stage: name of the work.
@@ -44,7 +44,7 @@ class Progress:
         console: where to print; default: standard output.
         clock: returns seconds, monotonic.
         per_unit: the parts of a unit and their number, such as ``("tokens", 16384)``, for a second rate.
-        settle: number of first units that no rate includes, because workers are still starting.
+        settle: number of units at the start that the rates leave out, because workers are still starting.
     """
 
     def __init__(

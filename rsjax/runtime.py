@@ -1,4 +1,4 @@
-"""Settings of the process that come before JAX is imported, and the signals that stop it."""
+"""Settings of the process that must be made before JAX is imported, and the signals that stop the process."""
 
 import faulthandler
 import hashlib
@@ -20,29 +20,29 @@ from typing import Any, NoReturn
 from rsjax.errors import Preempted
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
-STOP_SECONDS = 20.0  # for which SIGTERM may go unanswered; Kubernetes and Slurm kill after 30
-REPEAT_SECONDS = 0.5  # within which two Ctrl-C are one: wrappers such as make pass on what the terminal sent already
+STOP_SECONDS = 20.0  # for this long SIGTERM may go unanswered; Kubernetes and Slurm kill after 30
+REPEAT_SECONDS = 0.5  # two Ctrl-C within this time are one: wrappers such as make repeat the one from the terminal
 INTERRUPTED = "interrupted; the same command resumes"
 TERMINATED = "stopped by SIGTERM; the same command resumes"
 ANSWERS = {signal.SIGINT: (INTERRUPTED, 130), signal.SIGTERM: (TERMINATED, os.EX_TEMPFAIL)}
 
-patient = threading.Event()  # set while SIGTERM may take longer, because steps are to be saved
+patient = threading.Event()  # set while stopping after SIGTERM may take longer, because steps must be saved first
 
 
 CACHE_DIRECTORY = "JAX_COMPILATION_CACHE_DIR"
 CACHE_SIZE = 4 * 2**30  # bytes of compiled programs that are kept
 BF16_UNITS = {"avx512_bf16", "amx_bf16", "bf16"}  # as x86 and Arm processors name them
 YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"  # the operations that XLA hands to this library
-KNOW_IT = ("0.10.", "0.11.", "0.12.")  # versions of jaxlib; an unknown flag would end the process
+KNOW_IT = ("0.10.", "0.11.", "0.12.")  # versions of jaxlib that have this flag; an unknown flag would end the process
 
 
 def tune_process() -> None:
-    """Chooses XLA's flags, keeps compiled programs from start to start, and restarts once for huge pages.
+    """Chooses XLA's flags, caches compiled programs between runs, and restarts the process once for huge pages.
 
-    Compiled programs are kept in ``~/.cache/rsjax``, or where the user's ``JAX_COMPILATION_CACHE_DIR`` says; if that is
-    empty, nowhere.
+    Compiled programs are cached in ``~/.cache/rsjax``, or in the user's ``JAX_COMPILATION_CACHE_DIR``; if that variable
+    is empty, they are not cached.
 
-    The restart has the same process id and arguments. XLA's CPU backend allocates fresh memory for every step, and
+    The restart keeps the process id and arguments. XLA's CPU backend allocates fresh memory for every step, and
     touching it 4 KiB at a time takes a third of a small model's step. glibc reads its tunables only when a process
     starts, hence the restart. Does not restart if the user has set this tunable, or off Linux.
     """
@@ -89,7 +89,7 @@ def answer_while_importing() -> None:
     """Lets Ctrl-C and SIGTERM end ``python -m`` with one line while a command's modules are imported.
 
     A package of commands calls this before it imports anything else; :func:`stop_signals` takes over. Does nothing
-    where another program imports the package.
+    if another program imports the package.
     """
     if sys.argv[:1] != ["-m"]:  # which Python sets while it looks for the module to run
         return
@@ -99,7 +99,7 @@ def answer_while_importing() -> None:
 
 
 def _cache_directory() -> Path | None:
-    """Returns the directory of compiled programs; None without a home.
+    """Returns the directory of compiled programs; None if the user has no home directory.
 
     Machines that share a home may have different processors, whose programs must not be mixed: hence one directory for
     each set of instructions.
@@ -113,22 +113,22 @@ def _cache_directory() -> Path | None:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Wraps a command; yields a list, to which each signal that asks it to stop is added.
+    """Wraps a command; yields a list, to which each signal that asks the command to stop is added.
 
     SIGTERM, by which schedulers end a process, raises :class:`Preempted`, and Ctrl-C raises :class:`KeyboardInterrupt`,
-    each once, and once more where Python ignores it: in finalizers and in jax's callback of garbage collections.
-    Training loops save first (:mod:`rsjax.training.preemption`). SIGUSR1 prints the stack of every thread.
+    each once, and once more if Python ignored the exception, as it does in finalizers and in jax's callback for garbage
+    collection. Training loops save first (:mod:`rsjax.training.preemption`). SIGUSR1 prints the stack of every thread.
 
-    Python raises in the main thread alone, and not while that is in C code, such as XLA's compiler. So a thread ends
-    the process at a second Ctrl-C, and :data:`STOP_SECONDS` after SIGTERM unless :data:`patient` is set. Nothing is
-    lost: all files are written atomically.
+    Python raises these exceptions in the main thread only, and not while that thread runs C code, such as XLA's
+    compiler. So another thread ends the process at a second Ctrl-C, and :data:`STOP_SECONDS` after SIGTERM unless
+    :data:`patient` is set. Nothing is lost: all files are written atomically.
 
     Does nothing off the main thread, the only one that may handle signals.
     """
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if number in received:  # cleaning up goes on
+        if number in received:  # let the clean-up go on
             return
         received.append(number)
         raise KeyboardInterrupt if number == signal.SIGINT else Preempted(TERMINATED)
@@ -145,7 +145,7 @@ def stop_signals() -> Iterator[list[int]]:
         yield received
         return
     faulthandler.register(signal.SIGUSR1, file=2)
-    # A command that a shell started in the background, or nohup, ignores Ctrl-C.
+    # A command that was started by nohup, or in a shell's background, ignores Ctrl-C.
     numbers = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN]
     readable, writable = os.pipe()
     os.set_blocking(writable, False)
@@ -167,7 +167,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 
 def _watch(pipe: int) -> None:
-    """Reads the numbers of signals, which the operating system's handler writes whatever the main thread is doing."""
+    """Reads signal numbers from a pipe, which Python's C handler fills whatever the main thread is doing."""
     interrupted = deadline = float("inf")
     while True:
         now = time.monotonic()
@@ -195,9 +195,9 @@ def _end(line: str, status: int) -> NoReturn:
 
 
 def exit_now(status: int) -> NoReturn:
-    """Ends the process after flushing its output, without the interpreter's exit, which crashes beside XLA's threads.
+    """Ends the process after flushing its output, without the interpreter's exit, which crashes when XLA's threads run.
 
-    Worker processes end with it.
+    Worker processes end with this one.
     """
     flush = threading.Thread(target=_flush, daemon=True)
     flush.start()

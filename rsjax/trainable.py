@@ -13,13 +13,13 @@ from jaxtyping import Array, Float, Int, Key
 Scalar: TypeAlias = Float[Array, ""]
 Term: TypeAlias = tuple[Scalar, Scalar]  # (weighted sum, weight); the term's value is their ratio over all devices
 Params: TypeAlias = dict[str, Any]  # a tree of arrays
-Extra: TypeAlias = dict[str, Any] | None  # a tree of arrays that is carried from step to step beside the parameters
+Extra: TypeAlias = dict[str, Any] | None  # a tree of arrays that is carried from step to step with the parameters
 
 B = TypeVar("B", contravariant=True)
 
 
 class StepContext(NamedTuple):
-    """Inputs of a loss beside parameters, batch and key.
+    """Inputs of a loss besides parameters, batch and key.
 
     Attributes:
         step: the number of steps before this one.
