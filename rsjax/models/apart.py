@@ -1,9 +1,9 @@
-"""Takes stacks over the blocks of a network apart, for loops that run the network many times.
+"""Splits stacks over the blocks of a network into the blocks' parts, for loops that run the network many times.
 
 Networks scan over their blocks, whose parameters and caches are stacked along a leading axis. A loop around the
-network, such as a rollout, then copies each block's part out of the stacks in every pass: that was more than half of
-the time in which iVideoGPT samples a token. XLA drops the slices of a stack whose parts it knows, so where the scan is
-fully unrolled, what is taken apart before the loop and stacked in it is read where it lies.
+network, such as a rollout, then copies each block's part out of the stacks in every pass: that took more than half of
+the time that iVideoGPT needs to sample a token. XLA removes the slices of a stack whose parts it knows. So where the
+scan is fully unrolled, parts that are split before the loop and stacked inside it are read in place, without a copy.
 """
 
 from typing import Any

@@ -30,7 +30,7 @@ W = TypeVar("W", bound="type[WorldModel[Any]]")
 
 @dataclass(frozen=True)
 class Assets:
-    """Data that a world model needs beside its own parameters, fixed before its training.
+    """Data that a world model needs besides its own parameters, fixed before its training.
 
     Attributes:
         normalization: of actions and depth, from the training split.
@@ -59,11 +59,11 @@ class Imagination(Protocol):
     """B clips that a model generates frame by frame while the actions come in; each begins when it is restarted."""
 
     def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " N"]) -> Video:
-        """Begins N of the clips anew.
+        """Restarts N of the clips.
 
         Args:
-            which: those clips.
-            first: their first frame each, (N, 1, …), with depth if the model generates it.
+            which: True for the clips to restart.
+            first: the first frame of each, (N, 1, …), with depth if the model generates it.
             index: decides their random draws, as for :meth:`WorldModel.generate`.
 
         Returns:
@@ -94,10 +94,10 @@ class WorldModel(Trainable[B], Protocol[B]):
 
     @classmethod
     def autoencoder(cls, config: Config) -> Autoencoder[Any]:
-        """Returns what the stage before the model's trains, for a family whose settings say ``uses_tokenizer``.
+        """Returns the autoencoder that the stage before the model's trains, for families with ``uses_tokenizer``.
 
-        By default the tokenizer of ``config.tokenizer``; :mod:`rsjax.tokenizers.autoencoder` says how a family has its
-        own.
+        By default this is the tokenizer of ``config.tokenizer``; :mod:`rsjax.tokenizers.autoencoder` says how a family
+        defines its own.
         """
         return TokenizerTraining.create(config)
 
@@ -197,15 +197,15 @@ class WorldModel(Trainable[B], Protocol[B]):
         Args:
             prompt: one clip's first P frames.
             actions: as for :meth:`generate`.
-            depth: likewise.
-            last: return only so many frames, the last ones; a family need not decode the others.
+            depth: as for :meth:`generate`.
+            last: return only this many frames, the last ones; a family need not decode the others.
         """
         repeated, alike = prompt[np.zeros(len(actions), int)], np.zeros(len(actions), int)
         video = self.generate(params, assets, repeated, actions, index=alike, depth=depth)
         return video if last is None else video.frames(-last)
 
     def imagine(self, params: Params, assets: Assets, clips: int) -> Imagination:
-        """Returns a number of clips to be generated frame by frame: those that :meth:`generate` gives at once.
+        """Returns clips that are generated frame by frame; they equal those that :meth:`generate` makes at once.
 
         Raises:
             UserError: the family does not implement it.
@@ -213,7 +213,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         raise UserError(f"{type(self).__name__} cannot generate frame by frame, so it cannot be an environment")
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> Branching:
-        """Returns what generates clips that branch.
+        """Returns a generator of clips that can branch at any frame.
 
         Args:
             has_depth: whether first frames have depth.
@@ -257,7 +257,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         return saved
 
     def cache_shapes(self, frames: int) -> Any:
-        """Returns the shapes of keys and values that a rollout of a clip of so many frames keeps; {}: no cache."""
+        """Returns the shapes of keys and values that a rollout of a clip of ``frames`` keeps; {} if it has no cache."""
         return {}
 
     def flops(self, frames: int) -> dict[str, int]:
@@ -288,7 +288,7 @@ def create_model(config: Config) -> WorldModel[Any]:
 
 
 def create_autoencoder(config: Config) -> Autoencoder[Any]:
-    """Returns what the stage "tokenizer" trains; the family must use one. Errors as in :func:`create_model`."""
+    """Returns the autoencoder of the stage "tokenizer"; the family must use one. Errors as in :func:`create_model`."""
     return _implementation(config).autoencoder(config)
 
 

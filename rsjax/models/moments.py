@@ -1,4 +1,4 @@
-"""The interface of models that go on from any frame of a clip, in several ways: what ``experiments.play`` needs."""
+"""The interface of models that can continue a clip from any frame, in several ways; ``experiments.play`` needs it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,8 +16,8 @@ class Decoding:
 
     Attributes:
         steps, temperature, guidance, top_k: as in :class:`rsjax.config.SampleConfig`.
-        seed, draw: decide the random draws together with the frame's number, each from 0 to 2³² - 1. With the seed of
-            the model's settings and a clip's number as draw, they are those of :meth:`WorldModel.generate`.
+        seed, draw: numbers from 0 to 2³² - 1, which with the frame's number decide the random draws. With the seed of
+            the model's settings and a clip's number as ``draw``, the draws are those of :meth:`WorldModel.generate`.
     """
 
     steps: int
@@ -29,21 +29,21 @@ class Decoding:
 
     @property
     def program(self) -> tuple[int, int, bool]:
-        """What frames must have in common to be made in one pass."""
+        """The settings that frames must have in common to be generated in one pass."""
         return self.steps, self.top_k, self.temperature > 0
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame of a clip, and what the next one is generated from.
+    """A frame of a clip, and the memory from which the next one is generated.
 
     Attributes:
         rgb: the frame.
         tokens: its tokens by branch, (S,).
         entropy: of each RGB token when it was decided, in nats, (S,); None for a first frame.
-        memory: the family's own; None if it was used up.
-        size: bytes of the part of it that :meth:`Branching.lightened` leaves out.
-        means: the mean codes by branch that the frame is decoded from, (S, D); empty: it is decoded from its tokens.
+        memory: in a form that only the family knows; None if it was used up.
+        size: bytes of the part of the memory that :meth:`Branching.lightened` leaves out.
+        means: the mean codes by branch that the frame is decoded from, (S, D); if empty, it is decoded from its tokens.
     """
 
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -55,7 +55,7 @@ class Moment:
 
 
 class Branching(Protocol):
-    """Generates clips frame by frame, each of which may go on from any of its frames in several ways."""
+    """Generates clips frame by frame; each clip may continue from any of its frames in several ways."""
 
     lanes: int  # clips that one pass generates
 
@@ -66,9 +66,9 @@ class Branching(Protocol):
     def advance(
         self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
     ) -> list[Moment]:
-        """Generates the frames after these, at most ``lanes``, and uses up their memories.
+        """Generates the next frame of each of these moments, at most ``lanes``, and uses up their memories.
 
-        A frame has the same bits whatever else is in its pass.
+        A frame has the same bits whichever other frames are generated in the same pass.
 
         Args:
             moments: with memories.
@@ -78,9 +78,9 @@ class Branching(Protocol):
         ...
 
     def lightened(self, moment: Moment) -> Moment:
-        """Returns a moment with a small memory, which :meth:`advance` does not use up, or with none.
+        """Returns the moment with a small memory, which :meth:`advance` does not use up, or with none.
 
-        A first frame has one, and later ones now and then; what follows has the same bits.
+        First frames have a small memory, and some later frames do. The frames that follow have the same bits.
         """
         ...
 

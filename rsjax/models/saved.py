@@ -12,11 +12,11 @@ M = TypeVar("M", bound=ModelConfig)
 
 
 def read_model(directory: Path, kind: type[M], part: str) -> M:
-    """Returns the model's settings of a directory.
+    """Returns the settings of a directory's model.
 
     Args:
-        kind: the family's settings.
-        part: whose weights there must be, "tokenizer" or "world_model".
+        kind: the class of the family's settings.
+        part: the network whose weights must be there, "tokenizer" or "world_model".
 
     Raises:
         UserError: the weights or their settings are missing, damaged, of another version or of another family.
@@ -41,7 +41,7 @@ def check_alike(directory: Path, saved: Any, own: Any, free: set[str], section: 
 
 
 def check_family(path: Path, settings: dict[str, Any], own: tuple[str, ...]) -> None:
-    """Raises :class:`UserError` if the settings in a ``config.json`` are of a model of another family than these."""
+    """Raises :class:`UserError` if the settings in a ``config.json`` are those of a family outside ``own``."""
     model = settings.get("model")
     name = model.get("family") if isinstance(model, dict) else None
     if name is not None and name not in own:
@@ -49,14 +49,14 @@ def check_family(path: Path, settings: dict[str, Any], own: tuple[str, ...]) -> 
 
 
 class Inputs(NamedTuple):
-    """What networks were made for: pixels per side of an image, and numbers in a frame's action (0: unknown)."""
+    """The sizes that networks were made for: pixels per side of an image, numbers in a frame's action (0: unknown)."""
 
     image_size: int
     action_dim: int
 
 
 def saved_inputs(directory: Path) -> Inputs:
-    """Returns what the networks of a directory were made for.
+    """Returns the sizes that the networks of a directory were made for.
 
     Raises:
         UserError: the settings are missing, damaged or of another version.
@@ -64,7 +64,7 @@ def saved_inputs(directory: Path) -> Inputs:
     path = directory / "config.json"
     settings = read_json(path, cure="make it with python -m rsjax.convert")
     try:
-        if "inputs" in settings:  # of python -m rsjax.convert
+        if "inputs" in settings:  # written by python -m rsjax.convert
             return Inputs(**{name: int(value) for name, value in settings["inputs"].items()})
         clips = from_dict(Config, settings).clips
         return Inputs(clips.image_size, clips.action_dim)

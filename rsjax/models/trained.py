@@ -42,8 +42,8 @@ class TrainedModel:
             actions: in the recording's units; row t leads into frame t, and row 0 is ignored. T may exceed the length
                 of the training clips.
             depth: z-depth of the frames in metres; None if unknown.
-            task: the robot's task in words, one for all clips or one for each; only CogVideoX reads it, and says so if
-                it has no text of the task.
+            task: the robot's task in words, one for all clips or one for each; only CogVideoX reads it. If that has no
+                text of the task, it prints a note and uses the empty text.
 
         Returns:
             All T frames with their depth (None without a depth branch or ``depth``); without a leading axis for one
@@ -128,7 +128,7 @@ class TrainedModel:
         return actions.astype(np.float32)
 
     def _prompt(self, frames: Any, depth: Any, task: str | Sequence[str] | None) -> tuple[Video, bool]:
-        """Returns :meth:`_video` with its tasks."""
+        """Returns :meth:`_video` with the clips' tasks."""
         prompt, single = self._video(frames, depth)
         if task is None:
             return prompt, single
