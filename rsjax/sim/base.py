@@ -1,4 +1,4 @@
-"""What the simulators share: camera, pictures, and the exact pose of every body of a MuJoCo scene."""
+"""The simulators' base class: a camera, pictures, and the exact pose of every body of a MuJoCo scene."""
 
 from typing import Any, Self
 
@@ -16,7 +16,7 @@ OwnCamera = tuple[str, tuple[float, float, float], tuple[float, float, float], f
 class MujocoSim:
     """A MuJoCo scene seen by one camera. A subclass sets the attributes. Use as a context manager, or :meth:`close` it.
 
-    A renderer left to the interpreter's exit prints errors.
+    A renderer that is freed only when the interpreter exits prints errors.
     """
 
     _env: Any  # the simulator's own environment
@@ -63,7 +63,7 @@ class MujocoSim:
 
 
 def choose_camera(model: Any, name: str, own: OwnCamera) -> int:
-    """Returns a camera's number; our own takes the place of the scene's first one.
+    """Returns the id of the named camera; our own camera replaces the scene's first one.
 
     Raises:
         ConfigError: there is no such camera.

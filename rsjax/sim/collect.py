@@ -1,7 +1,7 @@
 """Collects simulated episodes in parallel processes into a store of clips.
 
-Each finished episode is a file in ``<out>.partial``, so that an interrupted collection resumes; at the end they are
-packed into one store. An episode that the simulator fails at is left out and named in the manifest.
+Each finished episode is a file in ``<out>.partial``, so that an interrupted collection resumes; at the end these files
+are packed into one store. An episode on which the simulator fails is left out and named in the manifest.
 """
 
 import functools
@@ -25,8 +25,8 @@ from rsjax.sim.episode import EpisodePlan, Simulators, run_episode, source_name,
 from rsjax.sim.expert import difficulty
 from rsjax.sim.gl import GLError, choose_gl
 
-RECIPES = {"lift": 6, "metaworld": 2}  # to raise when the same configuration gives other episodes
-MAX_FAILURES = 0.1  # share of the episodes; more failures mean a broken installation
+RECIPES = {"lift": 6, "metaworld": 2}  # raise when the same configuration gives different episodes
+MAX_FAILURES = 0.1  # share of the episodes; more failures than this mean a broken installation
 Report = Callable[[int, int], None]  # called with (episodes done, episodes in all)
 
 
@@ -36,13 +36,13 @@ class CollectError(UserError):
 
 @dataclass(frozen=True)
 class Collection:
-    """What a store of simulated episodes holds.
+    """The contents of a store of simulated episodes.
 
     Attributes:
-        key: its content key.
-        config: the simulator's.
+        key: the store's content key.
+        config: the simulator's configuration.
         splits: the episodes of each split.
-        meta: fields of the manifest that replace those counted in the train split.
+        meta: manifest fields that replace those computed from the clips.
     """
 
     key: str
@@ -62,16 +62,16 @@ def collection_key(config: SimConfig) -> str:
 
 
 def collect(config: SimConfig, out: Path, report: Report) -> None:
-    """Collects ``config.episodes`` episodes into a store at ``out``; its test split is the last ``test_episodes``.
+    """Collects ``config.episodes`` episodes into a store at ``out``; the last ``test_episodes`` form its test split.
 
-    Returns at once if ``out`` is a store made by the same configuration, and waits for another process that makes it.
+    Returns at once if ``out`` is a store made by the same configuration, and waits if another process is making it.
 
     Args:
-        report: called as they finish.
+        report: called as episodes finish.
 
     Raises:
         GLError: there is no usable OpenGL library.
-        MetaworldError: it is chosen and not installed.
+        MetaworldError: Meta-World is chosen but not installed.
         FileError: ``out`` cannot be written, e.g. on a full disk.
         CollectError: two worker processes die over an episode, or more than ``MAX_FAILURES`` of the episodes fail.
     """
@@ -91,7 +91,7 @@ def make_store(what: Collection, out: Path, report: Report) -> None:
     if what.config.env == "metaworld":
         metaworld.load_metaworld()
     with making(out, wait=True):
-        if complete_key(out) == what.key:  # that one has made it
+        if complete_key(out) == what.key:  # another process made it in the meantime
             report(total, total)
         else:
             _make(what, out, report)
@@ -116,7 +116,7 @@ def _make(what: Collection, out: Path, report: Report) -> None:
 
 
 def _prepare(partial: Path, key: str) -> None:
-    """Makes the directory of finished episodes and removes those of another configuration."""
+    """Creates the directory of finished episodes and removes episodes of another configuration."""
     marker = partial / "key"
     if not marker.exists() or marker.read_text() != key:
         shutil.rmtree(partial, ignore_errors=True)
@@ -137,24 +137,24 @@ def _simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: 
         done += 1
         report(done, total)
 
-    in_turn = sorted(todo, key=lambda plan: plan.task)  # a worker opens each task's scene once
+    in_turn = sorted(todo, key=lambda plan: plan.task)  # so that a worker opens each task's scene once
     run_items(functools.partial(_open_simulator, config, partial, workers), in_turn, workers, settle)
 
 
 def _open_simulator(config: SimConfig, partial: Path, workers: int) -> Callable[[EpisodePlan], None]:
-    """Opens a worker's simulators, on its share of the cores: more threads of Mesa's renderer would be in the way."""
+    """Opens a worker's simulators and limits Mesa's renderer to the worker's share of the cores."""
     os.environ.setdefault("LP_NUM_THREADS", str(max(1, count_cores() // workers)))
     return functools.partial(_work, Simulators(config), config, partial)
 
 
 def _work(simulators: Simulators, config: SimConfig, partial: Path, plan: EpisodePlan) -> None:
-    """Simulates one episode and leaves its clip, or why there is none, in ``partial``."""
+    """Simulates one episode and writes its clip, or the simulator's error, into ``partial``."""
     sim = simulators(plan.task)
     try:
         payload = encode(encode_clip(run_episode(sim, config, plan)))
     except (GLError, OSError, MemoryError):
         raise
-    except Exception as error:  # whatever the simulator throws costs this episode only
+    except Exception as error:  # any error of the simulator costs this episode only
         write_atomically(_error_file(partial, plan.name), f"{type(error).__name__}: {error}".encode())
     else:
         write_atomically(_clip_file(partial, plan.name), payload)
@@ -203,7 +203,7 @@ def _clips(paths: list[Path]) -> Iterator[Record]:
 
 
 def _units(train: list[Path]) -> dict[str, Any]:
-    """Returns fields of the manifest: depth range in metres, mean and standard deviation of the actions.
+    """Returns manifest fields: depth range in metres, mean and standard deviation of the actions.
 
     Frame 0 has no action.
     """
@@ -217,7 +217,7 @@ def _units(train: list[Path]) -> dict[str, Any]:
 
 
 def _summary(paths: list[Path]) -> dict[str, Any]:
-    """Returns fields of the manifest: tasks, expert modes, the shares of clips that end in success and ever succeed."""
+    """Returns manifest fields: tasks, expert modes, and the shares of clips that end in success or ever succeed."""
     modes, final, ever, tasks = Counter[str](), [], [], set[str]()
     for record in _clips(paths):
         tasks.add(record["task"])

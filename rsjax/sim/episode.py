@@ -20,7 +20,7 @@ from rsjax.sim.tracks import Snapshot, grid_pixels, object_pixels, track
 
 
 class Simulator(Protocol):
-    """What an episode needs of a simulator; lengths in metres, in the world."""
+    """The interface that an episode needs from a simulator; lengths in metres, in world coordinates."""
 
     def reset(self, seed: int, variation: Variation = ..., /) -> None: ...
     def step(self, action: Float[np.ndarray, " C"], /) -> None: ...
@@ -42,16 +42,16 @@ class Simulator(Protocol):
     @property
     def object_width(self) -> float: ...
     @property
-    def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # of the main object and the gripper, in this order
+    def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # positions of main object and gripper, in this order
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Recorded actions to repeat in place of an expert's.
+    """Recorded actions that an episode repeats instead of following an expert.
 
     Attributes:
-        actions: of a clip, of which frame 0's lead to no frame.
-        jitter: standard deviation of the noise on each number; the sum is cut to [-1, 1].
+        actions: the actions of a clip; those of frame 0 lead into no frame and are not repeated.
+        jitter: standard deviation of the noise added to each number; the sum is clipped to [-1, 1].
     """
 
     actions: Float[np.ndarray, "T A"]
@@ -60,14 +60,14 @@ class Replay:
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """What one episode is.
+    """Describes one episode to simulate.
 
     Attributes:
-        name: of its file while a store is collected.
-        episode: its number; with the seed it decides everything but ``change``.
-        task: of Meta-World; empty in Lift.
-        change: what looks otherwise than in training.
-        replay: actions that take the place of the expert's.
+        name: name of the episode's file while a store is collected.
+        episode: its number; together with the seed it determines everything except the other fields.
+        task: the Meta-World task; empty in Lift.
+        change: what looks different from training.
+        replay: actions that replace the expert's.
     """
 
     name: str
@@ -78,14 +78,14 @@ class EpisodePlan:
 
 
 class Simulators:
-    """The simulator of each task, one of them open at a time. Call :meth:`close` when done."""
+    """The simulators of all tasks, of which one is open at a time. Call :meth:`close` when done."""
 
     def __init__(self, config: SimConfig) -> None:
         self._config, self._task = config, ""
         self._sim: Simulator | None = None
 
     def __call__(self, task: str) -> Simulator:
-        """Returns the simulator of a task; the one of another task is closed."""
+        """Returns the simulator of a task and closes that of any other task."""
         if self._sim is None or task != self._task:
             self.close()
             cfg = self._config
@@ -102,7 +102,10 @@ class Simulators:
 
 
 def task_of(config: SimConfig, episode: int) -> str:
-    """Returns the task of an episode: each training task once, in random order, then each again; empty in Lift."""
+    """Returns the task of an episode; empty in Lift.
+
+    Successive episodes go through all training tasks in random order, then through all of them in a new order.
+    """
     tasks = config.train_tasks
     if not tasks:
         return ""
@@ -111,9 +114,9 @@ def task_of(config: SimConfig, episode: int) -> str:
 
 
 def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
-    """Simulates one episode, which depends on nothing but the configuration's seed and the plan.
+    """Simulates one episode, which depends only on the configuration and the plan.
 
-    Frame 0 is the start; ``config.control_steps`` control steps lead to each later frame.
+    Frame 0 is the initial state; ``config.control_steps`` control steps lead to each later frame.
     """
     episode = plan.episode
     rng = np.random.default_rng([config.seed, episode])
@@ -160,7 +163,7 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
 
 
 def source_name(config: SimConfig) -> str:
-    """Returns the name of the simulator, robot included."""
+    """Returns the name of the simulator and its robot."""
     return "robosuite/Lift/Panda" if config.env == "lift" else "metaworld/Sawyer"
 
 
@@ -179,7 +182,7 @@ def _origin(config: SimConfig, episode: int) -> dict[str, Any]:
 
 
 def _expert(sim: Any, rng: np.random.Generator) -> tuple[Callable[[Any], Float[np.ndarray, " C"]], Any]:
-    """Returns the policy of an episode, and its manner."""
+    """Draws an episode's manner and returns the policy with it."""
     if isinstance(sim, metaworld.MetaworldSim):
         manner = metaworld.draw_manner(rng)
         return metaworld.Expert(sim.policy, manner, rng).act, manner
@@ -188,14 +191,14 @@ def _expert(sim: Any, rng: np.random.Generator) -> tuple[Callable[[Any], Float[n
 
 
 def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callable[[Any], Float[np.ndarray, " C"]]:
-    """Returns a policy that repeats recorded actions with jitter, whatever it observes."""
+    """Returns a policy that repeats recorded actions with jitter and ignores its observations."""
     recorded = replay.actions[1:].reshape(-1, controls)
     steps = iter(np.clip(recorded + replay.jitter * rng.standard_normal(recorded.shape), -1, 1))
     return lambda state: next(steps)
 
 
 def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]]], width: float) -> dict[str, Any]:
-    """Returns where object and gripper are in each frame, as (x, y) like tracks, and the object's width in frame 0."""
+    """Returns (x, y) of object and gripper in each frame, in the units of tracks, and the object's width in frame 0."""
     names = list(places[0])
     xy, depth = camera.project(np.array([[place[name] for name in names] for place in places]))
     seen = {name: xy[:, k].tolist() for k, name in enumerate(names)}
@@ -205,7 +208,10 @@ def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]
 def _track_pixels(
     config: SimConfig, sim: Simulator, bodies: Int32[np.ndarray, "S S"], rng: np.random.Generator
 ) -> Int[np.ndarray, "N 2"]:
-    """Returns the pixels to track. The generator is their own: the episode does not depend on where tracks start."""
+    """Returns the pixels to track.
+
+    ``rng`` serves this choice alone, so that the episode does not depend on where tracks start.
+    """
     if config.track_points == "grid":
         return grid_pixels(config.image_size, config.tracks, rng)
     return object_pixels(bodies, sim.movable, sim.object_bodies, config.tracks, rng)

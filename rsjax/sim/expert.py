@@ -1,7 +1,7 @@
-"""A scripted expert for Lift that often fails on purpose, as a world model has to see more than success.
+"""A scripted expert for Lift that often fails on purpose, because a world model must see more than success.
 
-Every episode draws a mode and its own manner: most lift the cube, others let it fall, grasp beside or above it, or move
-about without a goal.
+Every episode draws a mode and its own manner: in most episodes the expert lifts the cube, in others it drops the cube,
+closes the gripper beside or above it, or moves about without a goal.
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ class Manner:
         delay: steps of standing still at the beginning.
         hover: height above the cube from which the gripper descends.
         offset: from the cube's centre to the point where the gripper closes.
-        squeeze: steps from beginning to close to beginning to lift.
-        carry: the cube's way from where it is grasped.
+        squeeze: steps from the start of closing to the start of lifting.
+        carry: displacement of the cube from where it is grasped.
         release: step after the grasp at which the gripper opens again; -1: never.
     """
 
@@ -73,9 +73,9 @@ def draw_manner(rng: np.random.Generator) -> Manner:
 
 
 def difficulty(provenance: dict[str, Any]) -> str:
-    """Returns a clip's difficulty for a curriculum: its task's; else simple or difficult by its expert's mode.
+    """Returns a clip's difficulty for a curriculum: that of its task, or else "simple" or "difficult" by expert mode.
 
-    Unknown without either.
+    "unknown" if the clip has neither.
     """
     if "difficulty" in provenance:
         return str(provenance["difficulty"])
@@ -93,7 +93,7 @@ class Expert:
         rng: generator of the action noise and of aimless motion.
     """
 
-    GAIN = 20.0  # action per metre of error: full speed until the goal is 5 cm before the target
+    GAIN = 20.0  # action per metre of error: full speed until the goal is within 5 cm of the target
     TURN_GAIN = 1.5  # action per radian
 
     def __init__(self, manner: Manner, rng: np.random.Generator) -> None:
@@ -149,7 +149,7 @@ class Expert:
         return targets.get(self._phase, self._goal), CLOSE if self._phase in ("grasp", "carry") else OPEN
 
     def _wander(self) -> tuple[Float[np.ndarray, " 3"], float]:
-        """Returns a random target over or on the table, another every half second or so, and a finger action."""
+        """Returns a random target over or on the table, which changes every half second or so, and a finger action."""
         if self._step >= self._until:
             self._until = self._step + int(self._rng.integers(6, 18))
             low = (-0.15, -0.2, TABLE_HEIGHT + 0.015)

@@ -8,7 +8,7 @@ from rsjax.errors import UserError
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}  # in order of preference
 
-# What a bare Debian 12 or 13 lacks: libEGL alone finds no driver, and PyOpenGL's OSMesa wants libGL beside it.
+# The packages that a bare Debian 12 or 13 lacks: libEGL alone finds no driver, and PyOpenGL's OSMesa also needs libGL.
 CURE = "install one with `make setup` or `apt-get install libegl1 libgl1 libgl1-mesa-dri libosmesa6`"
 
 

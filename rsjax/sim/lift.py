@@ -15,7 +15,7 @@ from rsjax.sim.render import Renderer
 from rsjax.sim.scenery import SEEN, Scenery, Variation
 
 TASK = "lift the red cube"
-ANY_TASK = "lift the cube"  # of another colour
+ANY_TASK = "lift the cube"  # the task where the cube has another colour
 CENTRE = (0.0, 0.0, 0.85)  # of the workspace, metres
 CUBE_BODY = "cube_main"
 # Our own camera: position and the point it looks at in metres, vertical field of view in degrees. The cube is 9 of 64
@@ -23,7 +23,7 @@ CUBE_BODY = "cube_main"
 NEAR = ("near", (0.55, 0.25, 1.15), (0.01, 0.0, 0.925), 32.0)
 STEP = 0.015  # metres by which an action of 1 moves the goal: 0.3 m/s
 TURN = 0.15  # radians, likewise
-REACH = np.array([[-0.35, -0.4, 0.8], [0.3, 0.4, 1.3]])  # of goals, metres
+REACH = np.array([[-0.35, -0.4, 0.8], [0.3, 0.4, 1.3]])  # bounds of the goal position, metres
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class State:
     """The expert's observation: positions in metres in the world, yaws in radians about the vertical.
 
     Attributes:
-        gripper: where the gripper is.
-        goal: where the actions so far have sent it.
+        gripper: position of the gripper.
+        goal: position to which the actions so far have sent it.
     """
 
     gripper: Float[np.ndarray, " 3"]
@@ -60,15 +60,15 @@ def _yaw(rotation: Float[np.ndarray, "3 3"]) -> float:
 class LiftSim(MujocoSim):
     """The Lift environment: 20 Hz, 7-D actions in [-1, 1] (6-D change of the goal pose, gripper; +1 closes).
 
-    robosuite's OSC_POSE controller pulls the gripper to a goal pose. Its own actions set the goal relative to the pose
-    that is reached, which the arm, always behind, leaves short: their sum does not tell where the arm is. Here they
-    move the goal, so that the sum does (docs/results/miniature.md).
+    robosuite's OSC_POSE controller pulls the gripper to a goal pose. Its own actions set the goal relative to the
+    current pose. The arm always lags behind its goal, so the sum of those actions does not tell where the arm is. Here
+    the actions move the goal itself, so that their sum does (docs/results/miniature.md).
 
-    An episode depends on nothing but the seed of :meth:`reset`. Use as a context manager, or call :meth:`close`: a
-    renderer left to the interpreter's exit prints errors.
+    An episode depends only on the arguments of :meth:`reset`. Use as a context manager, or call :meth:`close`: a
+    renderer that is freed only when the interpreter exits prints errors.
 
     Args:
-        camera: "near", our own, or the name of one of robosuite's cameras.
+        camera: "near" (our own camera), or the name of one of robosuite's cameras.
         image_size: S, pixels along each side.
 
     Raises:
@@ -78,7 +78,8 @@ class LiftSim(MujocoSim):
 
     def __init__(self, camera: str = "agentview", image_size: int = 64) -> None:
         robosuite = _load_robosuite()
-        # robosuite draws the cube's size when it builds the scene: fix it, or episodes would depend on the process.
+        # robosuite draws the cube's size when it builds the scene. Without a fixed seed, episodes would depend on the
+        # process.
         with global_seed(0):
             self._env = robosuite.make(
                 "Lift",
@@ -101,7 +102,7 @@ class LiftSim(MujocoSim):
         self._renderer = Renderer(self._model, self._camera_id, image_size)
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
-        """Begins an episode; the arm's start and the cube's place follow from the seed (0 … 2³² - 1)."""
+        """Begins an episode; the seed (0 … 2³² - 1) determines the initial poses of the arm and the cube."""
         self._scenery.apply(variation)
         with global_seed(seed):
             self._env.reset()
@@ -139,7 +140,7 @@ class LiftSim(MujocoSim):
 
     @property
     def success(self) -> bool:
-        """Returns robosuite's own predicate: the cube is more than 4 cm above the table."""
+        """Returns robosuite's own success criterion: the cube is more than 4 cm above the table."""
         return bool(self._env._check_success())
 
     @property
@@ -160,9 +161,10 @@ class LiftSim(MujocoSim):
 
 
 def _compute_once(sim: Any) -> None:
-    """Makes robosuite's ``sim`` compute the kinematics of each state once: it asks before, in and after its controller.
+    """Makes robosuite's ``sim`` compute the kinematics of each state only once.
 
-    MuJoCo's step is the two halves used here (for its integrators but Runge-Kutta), so the physics stay the same.
+    robosuite asks for them before, in and after its controller. A step of MuJoCo consists of the two halves that are
+    used here (with every integrator except Runge-Kutta), so the physics stays the same.
     """
     import mujoco
 

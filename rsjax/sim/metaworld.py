@@ -17,12 +17,12 @@ CONTROL_HZ = 80
 CENTRE = (0.0, 0.66, 0.1)  # of the workspace, metres
 # Our own camera, which sees no sky: position and the point it looks at in metres, vertical field of view in degrees.
 NEAR = ("near", (0.96, 0.07, 1.36), (0.0, 0.66, 0.13), 28.0)
-OBJECT_WIDTH = 0.05  # metres; errors of the object's place are measured in it, a puck's or a handle's size
-STEPS = 10**9  # of an episode; Meta-World's own limit of 500 would be an error
+OBJECT_WIDTH = 0.05  # metres, the size of a puck or handle; the unit for errors of the object's place
+STEPS = 10**9  # limit of an episode; after its own limit of 500 steps Meta-World raises an error
 
 MODES = {"expert": 0.6, "interrupted": 0.2, "explore": 0.2}  # mode → probability
 NOISE_MEMORY = 0.95  # correlation of the action noise from one control step to the next
-REACH = ((-0.3, 0.45, 0.06), (0.25, 0.85, 0.3))  # metres, where aimless motion goes
+REACH = ((-0.3, 0.45, 0.06), (0.25, 0.85, 0.3))  # bounds of the targets of aimless motion, metres
 GAIN = 10.0  # action per metre of error
 
 
@@ -51,11 +51,11 @@ def load_metaworld() -> tuple[Any, Any]:
 class MetaworldSim(MujocoSim):
     """A task of Meta-World: 80 Hz, 4-D actions in [-1, 1] (position delta of up to 1 cm an axis, gripper; +1 closes).
 
-    An episode depends on nothing but the seed of :meth:`reset`. Use as a context manager, or call :meth:`close`.
+    An episode depends only on the arguments of :meth:`reset`. Use as a context manager, or call :meth:`close`.
 
     Args:
         task: one of :data:`rsjax.config.metaworld.TASKS`.
-        camera: "near", our own, or the name of one of Meta-World's cameras.
+        camera: "near" (our own camera), or the name of one of Meta-World's cameras.
         image_size: S, pixels along each side.
 
     Raises:
@@ -82,7 +82,7 @@ class MetaworldSim(MujocoSim):
         self.success = False
 
     def reset(self, seed: int, variation: Variation = SEEN) -> None:
-        """Begins an episode; the places of objects and goal follow from the seed (0 … 2³² - 1)."""
+        """Begins an episode; the seed (0 … 2³² - 1) determines the positions of the objects and the goal."""
         import mujoco
 
         self._scenery.apply(variation)
@@ -90,7 +90,7 @@ class MetaworldSim(MujocoSim):
         self._env._freeze_rand_vec = False
         self._env.seed(seed)
         self._env.reset()
-        self._env._freeze_rand_vec = True  # computes goals from where the first reset has put the objects
+        self._env._freeze_rand_vec = True  # the next reset computes goals from where the first one put the objects
         self._env.reset()
         mujoco.mj_forward(self._model, self._data)
         self.state = self._env._get_obs()
@@ -168,12 +168,12 @@ class Expert:
 
     def _expert(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that actions will be clipped
+            warnings.simplefilter("ignore")  # the policy warns that actions will be clipped
             action = np.array(self._policy.get_action(state), np.float64)
         return np.clip(action, -1, 1)
 
     def _wander(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
-        """Returns the way to a random place, another every third of a second or so, and a finger action."""
+        """Returns the action towards a random target, which changes every third of a second or so."""
         if self._step >= self._until:
             self._until = self._step + int(self._rng.integers(20, 45))
             self._goal, self._finger = self._rng.uniform(*REACH), 1.0 if self._rng.random() < 0.4 else -1.0

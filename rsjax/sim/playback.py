@@ -1,7 +1,7 @@
 """Renders recorded simulator states: a demo's MuJoCo model and one state of each frame.
 
-A model that comes from elsewhere may name files. Only those of the installed robosuite are loaded, whatever path the
-model has for them.
+A model that comes from elsewhere may name any file. Only files of the installed robosuite are loaded, whatever path the
+model gives for them.
 """
 
 import importlib.util
@@ -16,7 +16,7 @@ from rsjax.errors import UserError, first_line
 from rsjax.sim.gl import choose_gl
 from rsjax.sim.render import Renderer, View
 
-CAMERAS = ("agentview", "robot0_eye_in_hand")  # of robosuite's own; of other models all
+CAMERAS = ("agentview", "robot0_eye_in_hand")  # rendered of robosuite's own models; of other models, all cameras are
 _MOST_TEXT = 2**23  # characters of a model
 _MOST_PIXELS = 2**24  # of a texture or height field that the model describes instead of naming a file
 _REFUSED = ("include", "plugin", "extension", "model", "attach")  # elements that load other models or libraries
@@ -24,11 +24,11 @@ _FOLDERS = ("meshdir", "texturedir", "assetdir", "strippath")  # attributes of t
 
 
 class PlaybackError(UserError):
-    """A model cannot be rendered. The message says why, without the file and the cure."""
+    """A model cannot be rendered. The message gives the reason, but neither the file nor the cure."""
 
 
 def camera_names(model: str) -> tuple[str, ...]:
-    """Returns the cameras of a model that are worth rendering, the first one first.
+    """Returns the names of a model's cameras that are worth rendering, the preferred one first.
 
     Args:
         model: MJCF, as :func:`local_model` returns it.
@@ -44,8 +44,8 @@ def local_model(text: str) -> str:
         text: MJCF, as robosuite's recordings have it.
 
     Raises:
-        PlaybackError: it is no MJCF, robosuite is not installed or lacks one of its files, or the model would load
-            something else.
+        PlaybackError: ``text`` is not MJCF, robosuite is not installed or lacks one of the files, or the model would
+            load something else.
     """
     if len(text) > _MOST_TEXT or "<!" in text.replace("<!--", ""):
         raise PlaybackError("the model is too long, or declares entities")
@@ -73,7 +73,7 @@ def local_model(text: str) -> str:
 
 
 def _local_file(name: str, assets: Path) -> Path:
-    """Returns the installed file for a path that another machine's robosuite had."""
+    """Returns the installed file that corresponds to a path of another machine's robosuite."""
     _, found, inner = name.replace("\\", "/").rpartition("/models/assets/")
     path = (assets / inner).resolve()
     if not found or not path.is_relative_to(assets) or not path.is_file():
@@ -93,7 +93,7 @@ def _check_size(element: ElementTree.Element) -> None:
 
 
 class Playback:
-    """A model, rendered from one camera in whatever state it is put. Close it explicitly.
+    """Renders a model from one camera, in any state. Close it explicitly.
 
     Args:
         model: MJCF, as :func:`local_model` returns it.
@@ -126,7 +126,7 @@ class Playback:
         """Renders a state: time, joint positions (nq) and joint velocities (nv).
 
         Raises:
-            PlaybackError: the model has another number of joints, or a position is not finite.
+            PlaybackError: the state has the wrong length for the model, or a number in it is not finite.
         """
         positions, wanted = self._model.nq, 1 + self._model.nq + self._model.nv
         if len(state) != wanted or not np.isfinite(state).all():

@@ -1,8 +1,9 @@
 """A fast software renderer of MuJoCo scenes.
 
 robosuite renders RGB and depth at the target size with a shadow map, 4× multisampling and reflections: about 50 ms a
-frame on one CPU core. This renderer makes one pass at 3× the target size without any of these, in about 12 ms: RGB is
-the mean of 3×3 pixels (anti-aliased), depth is that of the middle one, whose ray is the target pixel's centre ray.
+frame on one CPU core. This renderer makes one pass at 3× the target size without any of these, in about 12 ms. RGB is
+the mean of 3×3 pixels (anti-aliased); depth is that of the middle pixel, whose ray passes through the target pixel's
+centre.
 """
 
 from dataclasses import dataclass
@@ -70,10 +71,10 @@ class View:
 
 
 class Renderer:
-    """A renderer of a MuJoCo model from one fixed camera. Close it explicitly.
+    """Renders a MuJoCo model from one fixed camera. Close it explicitly.
 
     Args:
-        model: a ``mujoco.MjModel``; its rendering quality and buffer size are set.
+        model: a ``mujoco.MjModel``; the renderer changes its rendering quality and buffer size.
         camera_id: number of the camera in the model.
         size: S, pixels along each side.
         hidden: groups of geoms that are left out, such as collision shapes (group 0 in robosuite).

@@ -1,6 +1,6 @@
-"""Changes of a scene's looks that training never sees: another place of the camera, other colours of the objects.
+"""Changes of a scene's appearance that training never sees: a moved camera, or objects in other colours.
 
-They leave the physics alone, so an episode with such a change is the same episode, seen otherwise.
+They do not affect the physics, so an episode with such a change is the same episode with a different appearance.
 """
 
 import colorsys
@@ -14,20 +14,20 @@ from jaxtyping import Float
 from rsjax.config import require
 
 Change = Literal["camera", "color"]
-YAW, PITCH = (10.0, 25.0), (-4.0, 8.0)  # degrees: to either side about the vertical, and upwards
-TURN = (0.25, 0.75)  # of the circle of hues
-DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, for which it takes the material's
-SATURATION, VALUE = 0.6, 0.5  # at least, so that grey objects get a hue too
+YAW, PITCH = (10.0, 25.0), (-4.0, 8.0)  # ranges in degrees: to either side about the vertical, and upwards
+TURN = (0.25, 0.75)  # range of the change of hue, as a share of the hue circle
+DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's; a geom of this colour is drawn in its material's
+SATURATION, VALUE = 0.6, 0.5  # minima of a changed colour, so that grey objects get a hue too
 
 
 @dataclass(frozen=True)
 class Variation:
-    """A change of a scene's looks; none by default.
+    """A change of a scene's appearance; none by default.
 
     Attributes:
         yaw: angle in degrees by which the camera moves about the vertical through the point that it looks at.
-        pitch: likewise upwards.
-        turn: share of the circle of hues by which the objects' colours turn.
+        pitch: angle in degrees by which the camera moves upwards about that point.
+        turn: change of the objects' hues, as a share of the hue circle.
     """
 
     yaw: float = 0.0
@@ -35,11 +35,11 @@ class Variation:
     turn: float = 0.0
 
 
-SEEN = Variation()  # none
+SEEN = Variation()  # no change: the scene as training sees it
 
 
 def draw_variation(change: Change, rng: np.random.Generator) -> Variation:
-    """Draws a change of the camera's place or of the objects' colours."""
+    """Draws a change of the camera's position or of the objects' colours."""
     if change == "color":
         return Variation(turn=float(rng.uniform(*TURN)))
     side = 1 if rng.random() < 0.5 else -1
@@ -47,13 +47,14 @@ def draw_variation(change: Change, rng: np.random.Generator) -> Variation:
 
 
 class Scenery:
-    """The looks of a MuJoCo model, to change and to restore.
+    """Changes and restores the appearance of a MuJoCo model.
 
     Args:
         model: a ``mujoco.MjModel``.
         camera_id: number of the camera that renders.
         bodies: the bodies whose colours change.
-        centre: a point in the workspace, in metres; the camera turns about the point of its axis nearest to it.
+        centre: a point in the workspace, in metres; the camera turns about the point of its optical axis that is
+            nearest to ``centre``.
     """
 
     def __init__(self, model: Any, camera_id: int, bodies: Sequence[int], centre: Sequence[float]) -> None:
@@ -63,10 +64,12 @@ class Scenery:
         self._materials, self._colors = model.geom_matid.copy(), model.geom_rgba.copy()
 
     def apply(self, variation: Variation) -> None:
-        """Gives the model the looks of a variation, whatever it looked like; kinematics have to be computed again.
+        """Gives the model the appearance of a variation, whatever its appearance was before.
+
+        Compute the kinematics again afterwards.
 
         Raises:
-            ConfigError: the camera is to move but rides on the arm.
+            ConfigError: the camera has to move but is mounted on the arm.
         """
         model = self._model
         model.cam_pos[self._camera], model.cam_quat[self._camera] = self._position, self._quaternion
@@ -95,7 +98,7 @@ class Scenery:
         self._model.cam_quat[self._camera] = quaternion
 
     def _color(self, geom: Any) -> Float[np.ndarray, " 4"]:
-        """Returns colour and opacity of a geom, 0 … 1; of a textured one the mean colour."""
+        """Returns a geom's colour and opacity, 0 … 1; the mean colour if it has a texture."""
         model, material, own = self._model, self._materials[geom], np.array(self._colors[geom], np.float64)
         if material < 0:
             return own
@@ -109,7 +112,7 @@ class Scenery:
 
 
 def aim(model: Any, camera_id: int, position: Sequence[float], target: Sequence[float], fovy: float) -> None:
-    """Moves a camera of a MuJoCo model to a position, upright, to look at a target, both in metres in its frame."""
+    """Moves a camera to a position and points it, upright, at a target, both in metres in the camera body's frame."""
     import mujoco
 
     backward = np.array(position) - np.array(target)
@@ -127,5 +130,5 @@ def _turned(color: Float[np.ndarray, " 3"], turn: float) -> tuple[float, float, 
 def _rotation(axis: Float[np.ndarray, " 3"], degrees: float) -> Float[np.ndarray, "3 3"]:
     """Returns the rotation about a unit axis (Rodrigues)."""
     angle = np.radians(degrees)
-    cross = np.cross(np.eye(3), axis)  # what it multiplies, it crosses with the axis
+    cross = np.cross(np.eye(3), axis)  # cross @ v is axis × v
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

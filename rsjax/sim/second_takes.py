@@ -1,6 +1,6 @@
-"""Collects second takes of simulated clips: each starts alike and replays the recorded actions, slightly jittered.
+"""Collects second takes of simulated clips: each starts like its clip and repeats the actions with slight jitter.
 
-How far two takes of one scene differ is the most that Physics-IQ's score asks of a model.
+Physics-IQ's score asks a model to come as close to a clip as its second take does, and no closer.
 """
 
 from collections.abc import Sequence
@@ -15,26 +15,26 @@ from rsjax.sim.collect import Collection, Report, make_store
 from rsjax.sim.episode import EpisodePlan, Replay, source_name
 from rsjax.sim.unseen import UNITS
 
-FOLDER = "second_takes"  # in the store's directory, with which it moves
-JITTER = 0.05  # standard deviation of what is added to each number of an action, which lies in [-1, 1]
-RECIPE = 1  # to raise when the same clips give other second takes
-MAX_START = 2.0  # grey levels, mean over frame 0; two renderers differ by less
+FOLDER = "second_takes"  # inside the store's directory, so that it moves with the store
+JITTER = 0.05  # standard deviation of the noise added to each number of an action, which lies in [-1, 1]
+RECIPE = 1  # raise when the same clips give different second takes
+MAX_START = 2.0  # grey levels: largest mean difference of frame 0; two OpenGL libraries differ by less
 
 
 def collect_second_takes(
     clips: Store, split: str, numbers: Sequence[int], workers: int, report: Report
 ) -> list[Record]:
-    """Collects a second take of each of these clips, unless they exist, and returns them in the clips' order.
+    """Collects a second take of each of these clips, unless it exists, and returns the takes in the clips' order.
 
     Args:
-        clips: a store of simulated clips; the takes lie in its directory.
-        numbers: of the clips in the split.
+        clips: a store of simulated clips; the takes are stored in its directory.
+        numbers: indices of the clips in the split.
         workers: processes that simulate; 0: one per core.
-        report: called as they finish.
+        report: called as episodes finish.
 
     Raises:
-        UserError: the clips were not simulated, the simulator fails at one, or they now start otherwise; and as
-            :func:`rsjax.sim.collect.collect`.
+        UserError: the clips were not simulated, the simulator fails on one, or a take starts differently from its clip;
+            also the errors of :func:`rsjax.sim.collect.collect`.
     """
     config = _config(clips, workers)
     records = [clips.source(split)[number] for number in numbers]
@@ -64,7 +64,7 @@ def _config(clips: Store, workers: int) -> SimConfig:
 
 
 def _plan(config: SimConfig, split: str, record: Record) -> EpisodePlan:
-    """Returns the plan of a clip's second take: with the change of its looks, if it has one."""
+    """Returns the plan of a clip's second take, with the same change of appearance if the clip has one."""
     origin, task = record["provenance"], record["task"] if config.env == "metaworld" else ""
     change = origin.get("unseen", {}).get("what")
     replay = Replay(record["actions"], JITTER)

@@ -28,12 +28,13 @@ class Snapshot:
 def grid_pixels(size: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "count 2"]:
     """Returns (row, column) of N₀ pixels of frame 0 to track, evenly over the image (paper §2.3).
 
-    The largest square grid that N₀ allows; the rest lie anywhere else, different as long as the image has pixels.
+    They form the largest square grid that N₀ allows. The remaining ones are random, and distinct as long as the image
+    has enough pixels.
 
     Args:
         size: pixels along each side of the image.
         count: N₀.
-        rng: generator of the rest.
+        rng: generator of the random pixels.
     """
     return _unravel(_fill(_grid(size, count), count, size, rng), size)
 
@@ -45,10 +46,10 @@ def object_pixels(
     count: int,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, "count 2"]:
-    """Returns (row, column) of N₀ pixels of frame 0 to track, many of them on what moves.
+    """Returns (row, column) of N₀ pixels of frame 0 to track, many of them on bodies that can move.
 
-    Up to half lie on a regular grid over the image. Of the others, half lie on the objects and half on moving links
-    of the arm, as far as these cover pixels; the rest lie anywhere.
+    Up to half lie on a regular grid over the image. Of the others, up to half lie on the objects and the remaining ones
+    on movable links of the arm, as far as these cover enough pixels; the rest lie anywhere.
 
     Args:
         bodies: body id at each pixel.
@@ -76,7 +77,7 @@ def _grid(size: int, most: int) -> Int[np.ndarray, " N"]:
 
 
 def _fill(chosen: Int[np.ndarray, " N"], count: int, size: int, rng: np.random.Generator) -> Int[np.ndarray, " count"]:
-    """Adds random pixels up to ``count``, different ones until the image has no more."""
+    """Adds random pixels up to ``count``, distinct ones until the image has no more."""
     rest = np.setdiff1d(np.arange(size * size), chosen)
     chosen = np.concatenate([chosen, rng.choice(rest, min(count - chosen.size, rest.size), replace=False)])
     return np.concatenate([chosen, rng.choice(size * size, count - chosen.size)])

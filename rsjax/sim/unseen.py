@@ -1,8 +1,8 @@
-"""Collects clips of what training never saw, beside a store of simulated clips: other tasks, cameras and colours.
+"""Collects clips of tasks, cameras and colours that training never saw, for a store of simulated clips.
 
-The splits ``unseen_camera`` and ``unseen_color`` are the first episodes of the store's test split again, with the same
-motion, seen from another place or with the objects in other colours; the difference to those clips is therefore paired.
-``unseen_task`` are episodes of the tasks that are held out (Meta-World alone).
+The splits ``unseen_camera`` and ``unseen_color`` repeat the first episodes of the store's test split with the same
+motion, but seen from another position or with objects in other colours; comparisons with the original clips are
+therefore paired. ``unseen_task`` holds episodes of the held-out tasks (Meta-World only).
 """
 
 from typing import Any
@@ -13,26 +13,27 @@ from rsjax.sim.collect import Collection, Report, collection_key, make_store
 from rsjax.sim.episode import EpisodePlan, task_of
 from rsjax.sim.scenery import PITCH, TURN, YAW, Change
 
-FOLDER = "unseen"  # in the store's directory, with which it moves
+FOLDER = "unseen"  # inside the store's directory, so that it moves with the store
 CHANGES: dict[str, Change] = {"unseen_camera": "camera", "unseen_color": "color"}
-RECIPE = 1  # to raise when the same configuration gives other episodes
+RECIPE = 1  # raise when the same configuration gives different episodes
 UNITS = ("depth_range", "action_mean", "action_std")
 
 
 def collect_unseen(config: SimConfig, clips: Store, episodes: int, report: Report) -> Store:
-    """Collects ``episodes`` clips of each kind, unless they exist, and returns their store.
+    """Collects ``episodes`` clips for each split, unless they exist, and returns their store.
 
-    Its splits are :func:`unseen_splits`; its depth range and action statistics are those of ``clips``, so that a model
-    reads both alike. ``manifest["unseen"]`` says of each split what is held out.
+    Its splits are :func:`unseen_splits`. It has the depth range and action statistics of ``clips``, so that a model
+    reads both stores alike. ``manifest["unseen"]`` says what is unseen in each split.
 
     Args:
         config: the configuration of ``clips``.
-        clips: the store of which these are the unseen ones.
-        report: called as they finish.
+        clips: the store that training reads.
+        report: called as episodes finish.
 
     Raises:
-        ConfigError: the store has fewer test episodes, or the camera that is to move rides on the arm.
-        UserError: as :func:`rsjax.sim.collect.collect`.
+        ConfigError: ``episodes`` is not between 1 and ``config.test_episodes``.
+        UserError: as :func:`rsjax.sim.collect.collect`; also if the camera is mounted on the arm, so that it cannot
+            move.
     """
     require(
         0 < episodes <= config.test_episodes,
