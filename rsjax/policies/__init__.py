@@ -29,7 +29,7 @@ _ENVIRONMENTS: dict[str, dict[str, Any]] = {
 
 
 def register() -> None:
-    """Registers the environments with Gymnasium, unless they are. Their modules are imported when one is made."""
+    """Registers the environments with Gymnasium, once. Making one imports its module."""
     import gymnasium
 
     for name, entries in _ENVIRONMENTS.items():
@@ -38,7 +38,7 @@ def register() -> None:
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a public class, and with it jax or the simulator, when it is first used."""
+    """Imports a public class, and with it jax or the simulator, at its first use."""
     if name not in _WHERE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -1,4 +1,4 @@
-"""Checks the actions that somebody's policy gives to an environment, and that a world model reads them."""
+"""Checks that a world model takes actions, and that the actions a policy sends to an environment are valid."""
 
 from typing import Literal, TypeAlias
 
@@ -16,7 +16,7 @@ class ActionError(UserError):
 
 
 def check_takes_actions(model: ModelConfig, name: str = "the model") -> None:
-    """Raises :class:`UserError` unless what a model generates depends on actions."""
+    """Raises :class:`UserError` unless the model generates videos that depend on actions."""
     if not model.takes_actions:
         raise UserError(
             f"{name} takes no actions (family {model.family!r}), so its videos do not show what actions do; take a run "
@@ -32,18 +32,18 @@ def checked_actions(
     unit: str,
     ignored: Bool[np.ndarray, " B"] | None = None,
 ) -> tuple[Float32[np.ndarray, "*B A"], Bool[np.ndarray, "*B A"]]:
-    """Returns actions as float32 within their range, and which of their numbers were clipped to it.
+    """Returns actions as float32 within their range, and a mask of the numbers that were out of range.
 
     Args:
-        actions: what a policy answered.
-        low: the least values; its shape is the shape that actions must have.
+        actions: the policy's output.
+        low: the least values; actions must have the same shape.
         high: the greatest values.
-        out_of_range: "clip" moves numbers into the range and counts them, "refuse" raises.
-        unit: what the numbers are, for messages.
-        ignored: rows that do not matter: in their place, zeros or the number of their range that is next to it.
+        out_of_range: "clip" clips numbers to the range, "refuse" raises an error.
+        unit: the unit of the numbers, for error messages.
+        ignored: rows that do not matter; they are replaced by the value in range that is closest to zero.
 
     Raises:
-        ActionError: another shape or type, a value that is not finite, or, with "refuse", one out of range.
+        ActionError: the shape or type is wrong, a value is not finite, or, with "refuse", a value is out of range.
     """
     try:
         given = np.asarray(actions, np.float32)

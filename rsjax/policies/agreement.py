@@ -1,4 +1,4 @@
-"""How well success in one world predicts success in another, over policies.
+"""Measures how well the success rates of policies in one world predict their success rates in another.
 
 Axes: P policies.
 """
@@ -13,17 +13,18 @@ from rsjax.evaluation.statistics import Estimate
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of predicted success rates y and true ones x, over policies.
+    """The agreement of predicted success rates y with true ones x, over policies.
 
     Attributes:
-        pearson: r with its Fisher interval (None with fewer than 4 policies, or where all lie on a line).
+        pearson: r with its Fisher interval (None with fewer than 4 policies, or if all lie on a line).
         r2_line: R² of the line that fits best, which is r².
-        r2_identity: R² of the line y = x, 1 - Σ(y - x)² / Σ(y - ȳ)², comparable with ``r2_line``: of the spread of y.
-        r2_prediction: R² of y as a prediction of x, 1 - Σ(y - x)² / Σ(x - x̄)². Where the spreads differ, one may be
-            above 0 (better than the mean) and the other below.
+        r2_identity: R² of the line y = x, 1 - Σ(y - x)² / Σ(y - ȳ)². It is relative to the spread of y, as ``r2_line``
+            is.
+        r2_prediction: R² of y as a prediction of x, 1 - Σ(y - x)² / Σ(x - x̄)². If the spreads of x and y differ, one
+            of ``r2_identity`` and ``r2_prediction`` may be above 0 (better than the mean) and the other below.
         spearman: the correlation of the ranks.
-        mmrv: mean maximum rank violation (SIMPLER): how far apart, in truth, policies are that are ranked wrongly.
-        bias: mean of predicted - true.
+        mmrv: mean maximum rank violation (SIMPLER): how much the true success rates of wrongly ordered policies differ.
+        bias: the mean of predicted - true.
     """
 
     pearson: Estimate
@@ -36,10 +37,10 @@ class Agreement:
 
 
 def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"], level: float = 0.95) -> Agreement:
-    """Compares success rates. Correlations are NaN where either does not vary, R² where its spread is 0.
+    """Compares success rates. Correlations are NaN if x or y does not vary; R² is NaN if its denominator is 0.
 
     Raises:
-        ValueError: fewer than 2 policies, or other numbers of them.
+        ValueError: there are fewer than 2 policies, or the two arrays differ in length.
     """
     x, y = np.asarray(true, np.float64), np.asarray(predicted, np.float64)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 2:
@@ -62,14 +63,14 @@ def _r2(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"], of: Float[np.nda
 
 
 def correlation(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"]) -> float:
-    """Returns Pearson's r; NaN where one does not vary."""
+    """Returns Pearson's r; NaN if x or y does not vary."""
     a, b = x - x.mean(), y - y.mean()
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
     return float(np.clip(np.sum(a * b) / size, -1, 1)) if size > 1e-12 else float("nan")
 
 
 def fisher(r: float, count: int, level: float = 0.95) -> Estimate:
-    """Returns r with the interval of Fisher's z transform, which ±1, up to rounding, does not have."""
+    """Returns r with the interval of Fisher's z transform; there is none if r is ±1 up to rounding, or count < 4."""
     from scipy.special import ndtri
 
     if count < 4 or not abs(r) < 1 - 1e-12:
@@ -79,13 +80,13 @@ def fisher(r: float, count: int, level: float = 0.95) -> Estimate:
 
 
 def ranks(values: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """Returns ranks from 1; equal values share the mean of theirs."""
+    """Returns ranks from 1; equal values share the mean of their ranks."""
     below = (values[:, None] > values).sum(1)
     return below + (1 + (values[:, None] == values).sum(1)) / 2
 
 
 def rank_violation(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"]) -> float:
-    """Returns the mean over policies of the largest true difference to one that is ranked the other way round."""
+    """Returns the mean over policies of the largest true difference to a policy that is ranked in the wrong order."""
     apart = np.abs(true[:, None] - true)
     wrong = (true[:, None] < true) != (predicted[:, None] < predicted)
     return float(np.mean(np.max(apart * wrong, axis=1)))

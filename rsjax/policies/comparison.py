@@ -23,7 +23,7 @@ from rsjax.policies.trials import FPS, Result, Trials, first_frames, save_arrays
 from rsjax.progress import note, stage
 from rsjax.report.video import write_mp4
 
-SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training at which policies are kept, beside the last one
+SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training after which policies are saved, before its end
 
 NUMBERS = {"r2_line": "R² of the line", "r2_identity": "R² of y = x", "r2_prediction": "R² of y for x"}
 NUMBERS |= {"spearman": "Spearman", "mmrv": "MMRV"}
@@ -36,7 +36,7 @@ FORMULAS = (
 def checkpoints(config: PolicyConfig, demos: Demos, directory: Path, count: int = 8) -> dict[str, Policy]:
     """Trains one policy and returns it at ``count`` stages of its training, from useless to good, by name.
 
-    A training of few steps has fewer stages, which a note says.
+    A very short training has fewer stages; a note then says so.
     """
     steps = config.train.steps
     shares = np.interp(np.linspace(0, 1, count - 1), np.linspace(0, 1, len(SHARES)), SHARES)
@@ -54,14 +54,14 @@ def compare(
     trials: Trials,
     out: Path,
 ) -> dict[str, Any]:
-    """Tries each policy from the same first frames in the simulator and in each world model, unless that is done.
+    """Runs each policy from the same first frames in the simulator and in each world model; keeps finished results.
 
     Args:
         policies: by name.
-        simulator: the true one.
-        models: makes the world of each run, by the run's name.
-        out: for all rollouts, ``results.json`` (null: not defined, as a correlation without variation), ``results.md``,
-            ``scatter.png`` and videos (left: simulator, right: world model).
+        simulator: the true simulator.
+        models: functions that make the world of each run, by the run's name.
+        out: the folder of all rollouts, ``results.json`` (null: undefined, such as a correlation without variation),
+            ``results.md``, ``scatter.png`` and videos (left: simulator, right: world model).
 
     Returns:
         The content of ``results.json``.
@@ -92,13 +92,13 @@ def _tried(
     name: str,
 ) -> Result:
     def see(number: int, episode: Episode) -> None:
-        save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)  # each, for other judges (rejudging.py)
+        save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)  # for other judges (rejudging.py)
 
     return try_policy(policy, world, starts, trials, folder, name, see)
 
 
 def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
-    """Writes simulator and world model side by side for the first episodes."""
+    """Writes videos of the first episodes: simulator and world model side by side."""
     for number in range(min(trials.videos, trials.episodes)):
         files = [out / world / name / f"episode-{number:02d}.npz" for world in ("simulator", run)]
         if all(file.exists() for file in files):
@@ -107,7 +107,7 @@ def _videos(out: Path, run: str, name: str, trials: Trials) -> None:
 
 
 def compared(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result]) -> dict[str, Any]:
-    """Returns what ``results.json`` says of a run: success in both worlds by policy, and how well they agree."""
+    """Returns a run's entry in ``results.json``: success in both worlds by policy, and how well they agree."""
     x, y = (np.array([np.mean(results[name].success) for name in true]) for results in (true, imagined))
     policies: dict[str, dict[str, Any]] = {
         name: {
@@ -125,13 +125,13 @@ def compared(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result
 
 
 def _defined(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Returns None in place of NaN, which JSON does not have."""
+    """Replaces NaN, which JSON does not have, by None."""
     parts = {name: _defined(value) if isinstance(value, dict) else value for name, value in numbers.items()}
     return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in parts.items()}
 
 
 def write_results(out: Path, rows: Sequence[dict[str, Any]], trials: Trials) -> None:
-    """Writes ``results.json``, ``results.md`` and ``scatter.png`` of the runs that are done."""
+    """Writes ``results.json``, ``results.md`` and ``scatter.png`` of the runs that are finished."""
     write_json(out / "results.json", {"trials": asdict(trials), "runs": list(rows)})
     write_file(out / "results.md", table(rows).encode())
     points = {row["run"]: _shares(row) for row in rows}
@@ -155,7 +155,7 @@ def _title(row: Mapping[str, Any]) -> str:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Returns the results in Markdown: agreement, success, and the judges that decided on it."""
+    """Returns the results in Markdown: agreement, success, and the judges that decided success."""
     names = ("run", "Pearson r", "95 %", *NUMBERS.values(), "bias", "same outcome", "uninterpretable")
     lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
     for row in rows:

@@ -1,6 +1,6 @@
-"""Lets policies act in models of families that generate whole videos alone: every frame is the start of another video.
+"""Lets policies act in models that generate only whole videos: each step generates a short video, keeps one frame.
 
-Axes: B clips, P given frames, A action dimensions.
+Axes: B clips, P prompt frames, A action dimensions.
 """
 
 import numpy as np
@@ -10,21 +10,21 @@ from rsjax.clip import Video
 from rsjax.models.base import Imagination, WorldModel
 from rsjax.models.trained import TrainedModel
 
-DRAWS = 2**20  # clips' numbers are below; each step has draws of its own
+DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in their draws; clip indices are smaller
 
 
 def imagination(trained: TrainedModel, clips: int) -> Imagination:
-    """Returns clips to be generated frame by frame, in the family's own way if it has one."""
+    """Returns an imagination that generates clips frame by frame, in the family's own way if it has one."""
     if getattr(type(trained.model), "imagine", None) is WorldModel.imagine:
         return Continued(trained)
     return trained.model.imagine(trained.params, trained.assets, clips)
 
 
 class Continued:
-    """Implements :class:`rsjax.models.base.Imagination` by ``generate``, for clips that begin together.
+    """Implements :class:`rsjax.models.base.Imagination` with ``generate``, for clips that begin together.
 
-    A frame follows the last P before it as they were decoded, P being the model's ``prompt_frames``: what was before
-    them is forgotten, and they lose a little each time. It costs what a video of P + 1 frames does.
+    The prompt of each new frame is the last P decoded frames, where P is the model's ``prompt_frames``. Earlier frames
+    are forgotten, and quality drops a little with each decoding. A step costs as much as a video of P + 1 frames.
     """
 
     def __init__(self, trained: TrainedModel) -> None:

@@ -14,7 +14,7 @@ MOST_BETA = 0.999
 
 
 def cosine_schedule(steps: int) -> Float64[np.ndarray, " N"]:
-    """Returns ᾱ after each noise step: the share of the signal's variance that is left (Nichol & Dhariwal 2021)."""
+    """Returns ᾱ after each noise step, the remaining share of the signal's variance (Nichol & Dhariwal 2021)."""
     places = np.arange(steps + 1) / steps
     left = np.cos((places + 0.008) / 1.008 * np.pi / 2) ** 2
     betas = np.minimum(1 - left[1:] / left[:-1], MOST_BETA)
@@ -24,7 +24,7 @@ def cosine_schedule(steps: int) -> Float64[np.ndarray, " N"]:
 def add_noise(
     clean: Float[Array, "B ..."], noise: Float[Array, "B ..."], step: Int[Array, " B"], left: Float64[np.ndarray, " N"]
 ) -> Float[Array, "B ..."]:
-    """Returns samples after so many noise steps, √ᾱ x + √(1-ᾱ) ε; ``step`` counts from 0."""
+    """Returns the samples with the noise of their step, √ᾱ x + √(1-ᾱ) ε; ``step`` counts from 0."""
     share = jnp.asarray(left, jnp.float32)[step].reshape(-1, *[1] * (clean.ndim - 1))
     return jnp.sqrt(share) * clean + jnp.sqrt(1 - share) * noise
 
@@ -39,11 +39,11 @@ def sample(
     """Draws samples in [-1, 1].
 
     Args:
-        predict: the noise in a sample at a noise step.
-        key: all draws follow from it.
-        shape: of the samples, with B first.
+        predict: predicts the noise in a sample at a noise step.
+        key: determines all draws.
+        shape: the shape of the samples, with B first.
         left: ᾱ of each noise step.
-        steps: how many of the noise steps to take, evenly spaced; all of them in DDPM itself.
+        steps: how many of the noise steps to take, evenly spaced; DDPM itself takes all of them.
     """
     first, rest = jax.random.split(key)
     stride = len(left) // steps

@@ -52,10 +52,10 @@ class Demos:
         return Range.of(np.concatenate([record["actions"][1:].reshape(-1, self.width) for record in self.records]))
 
     def first(self, count: int) -> "Demos":
-        """Returns the first of them.
+        """Returns the first ``count`` demonstrations.
 
         Raises:
-            UserError: there are fewer, or none is asked for.
+            UserError: there are fewer, or ``count`` is below 1.
         """
         if count < 1:
             raise UserError(f"{count} demonstrations are asked for; it takes 1 at least")
@@ -64,10 +64,10 @@ class Demos:
         return Demos(self.records[:count], self.controls)
 
     def __add__(self, other: "Demos") -> "Demos":
-        """Joins demonstrations of one shape.
+        """Joins demonstrations of equal sizes.
 
         Raises:
-            UserError: they have other sizes.
+            UserError: they differ in pixels, controls per action or numbers of a control.
         """
         kinds = [(each.image_size, each.controls, each.width) for each in (self, other)]
         if kinds[0] != kinds[1]:
@@ -79,10 +79,10 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
     """Reads a store's clips as demonstrations, in an order that depends on the seed alone.
 
     Args:
-        only: "success" takes those that end in success, as far as the store says which do.
+        only: "success" takes the clips that end in success, if the store says which do, and otherwise all.
 
     Raises:
-        UserError: the store has none.
+        UserError: the store has no such clip.
     """
     labelled = chooses(store, only)
     records: list[Record] = []
@@ -102,7 +102,7 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
 
 
 def chooses(store: Store, only: Only) -> bool:
-    """Returns whether only clips that end in success count; notes that all do where the store does not say which."""
+    """Returns whether to take only clips that end in success; prints a note if the store does not say which do."""
     known = store.manifest.get("success_share") is not None
     if only == "success" and not known:
         note(f"{store.path}: does not say which of its clips end in success, so all of them are taken")
@@ -110,6 +110,6 @@ def chooses(store: Store, only: Only) -> bool:
 
 
 def controls_of(clip: Record, manifest: dict[str, Any]) -> int:
-    """Returns how many controls an action of a clip holds: the simulator's control steps, 1 for other recordings."""
+    """Returns the number of controls in a clip's action: the simulator's control steps, or 1 for other recordings."""
     steps = clip["provenance"].get("control_steps") or (manifest.get("config") or {}).get("control_steps")
     return int(steps) if isinstance(steps, int) and steps > 0 and clip["actions"].shape[1] % steps == 0 else 1

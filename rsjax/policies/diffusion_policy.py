@@ -1,4 +1,4 @@
-"""The Diffusion Policy (Chi et al. 2023) as something to train and to act with.
+"""The Diffusion Policy (Chi et al. 2023): its loss, its plans and its training samples.
 
 Axes: B samples, O observed frames, S×S pixels, H controls of a plan, D numbers of a control, T frames of a clip, k
 controls between two frames, A = k·D numbers of a clip's action.
@@ -23,13 +23,13 @@ from rsjax.trainable import Params, StepContext, Term, Trainable
 
 @dataclass(frozen=True)
 class DiffusionPolicy(Trainable[Any]):
-    """The network with its loss.
+    """The policy's network with its loss.
 
     Attributes:
-        config: its settings.
-        image_size: S of the frames that it sees.
-        controls: k, controls between two frames.
-        width: D, numbers of a control.
+        config: the policy's settings.
+        image_size: S, the side of the frames.
+        controls: k, the number of controls between two frames.
+        width: D, the numbers of a control.
     """
 
     config: PolicyConfig
@@ -52,7 +52,7 @@ class DiffusionPolicy(Trainable[Any]):
 
     @property
     def cropped(self) -> int:
-        """Pixels along each side of what the network sees."""
+        """The side in pixels of the crop that the network sees."""
         return round(self.config.crop * self.image_size)
 
     @property
@@ -81,7 +81,7 @@ class DiffusionPolicy(Trainable[Any]):
         return {"noise": (jnp.sum(jnp.square(predicted - noise)), jnp.float32(noise.size))}
 
     def plan(self, params: Params, frames: UInt8[Array, "B O S S 3"], key: Key[Array, ""]) -> Float[Array, "B H D"]:
-        """Returns the controls that follow the frames, in [-1, 1] of the demonstrations' range."""
+        """Returns the controls that follow the frames, scaled so that the demonstrations' range is [-1, 1]."""
         edge = (self.image_size - self.cropped) // 2
         middle = frames[:, :, edge : edge + self.cropped, edge : edge + self.cropped]
         variables = {"params": params}
@@ -95,7 +95,7 @@ class DiffusionPolicy(Trainable[Any]):
 
 
 def scaled(frames: UInt8[Array, "*B"]) -> Float[Array, "*B"]:
-    """Returns pixels from -1 to 1."""
+    """Returns pixels scaled to [-1, 1]."""
     return frames.astype(jnp.float32) / 127.5 - 1
 
 
@@ -111,7 +111,7 @@ class Range:
         return cls(tuple(controls.min(0).tolist()), tuple(controls.max(0).tolist()))
 
     def scale(self, controls: Float[np.ndarray, "*B D"]) -> Float32[np.ndarray, "*B D"]:
-        """Returns controls from -1 to 1; 0 where they never vary."""
+        """Returns controls scaled to [-1, 1]; 0 for numbers that never vary."""
         low, span = self._ends()
         return np.where(span > 0, 2 * (controls - low) / np.where(span > 0, span, 1) - 1, 0).astype(np.float32)
 
@@ -127,9 +127,10 @@ class Range:
 
 @dataclass(frozen=True)
 class Windows:
-    """Draws a training sample from a demonstration: a random frame with those before it, and the plan that follows.
+    """Draws a training sample from a demonstration: a random frame with those before it, and the controls that follow.
 
-    At the clip's ends the first frame and the last control are repeated. A module's class, so that it can be pickled.
+    At the clip's ends, the first frame and the last control are repeated. This is a class of the module rather than a
+    local function so that it can be pickled.
     """
 
     model: DiffusionPolicy

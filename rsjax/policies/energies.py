@@ -1,4 +1,4 @@
-"""Energies for the planner: a world model imagines where candidates lead, and a score says how far that is from a goal.
+"""Energies for the planner: a world model imagines where candidates lead, and a score measures the distance to a goal.
 
 Axes: N candidates, P frames so far, H steps, F generated frames, S×S pixels, A action dimensions.
 """
@@ -19,7 +19,7 @@ from rsjax.policies.planner import Energy
 from rsjax.policies.verdicts import HISTORY, SUCCESS, Judge
 from rsjax.tokenizers.lpips import load_lpips, min_size
 
-# Of the last F frames (at most ``HISTORY``) of N generated videos: (N,), lower is better.
+# From the last F frames (at most ``HISTORY``) of N generated videos to their scores (N,); lower is better.
 Score: TypeAlias = Callable[[UInt8[np.ndarray, "N F S S 3"]], Float[np.ndarray, " N"]]
 
 
@@ -29,8 +29,8 @@ class Seen:
 
     Attributes:
         rgb: the last frames.
-        depth: likewise, metres; None if the model has no depth.
-        actions: row t led into frame t; row 0 is not read.
+        depth: of the same frames, metres; None if the model has no depth.
+        actions: row t led to frame t; row 0 is not read.
     """
 
     rgb: UInt8[np.ndarray, "P S S 3"]
@@ -39,10 +39,9 @@ class Seen:
 
 
 def imagined(model: TrainedModel, score: Score) -> Energy:
-    """Returns the energy of candidates as the score of what a world model generates under them.
+    """Returns an energy: the score of the video that a world model generates for each candidate.
 
-    All candidates share the cache of the frames so far, and their random draws. The energy is called with
-    :class:`Seen`.
+    All candidates share the cache of the frames so far, and the random draws. The energy takes a :class:`Seen`.
     """
 
     def energy(seen: Seen, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
@@ -55,13 +54,13 @@ def imagined(model: TrainedModel, score: Score) -> Energy:
 
 
 def pixel_distance(goal: UInt8[np.ndarray, "S S 3"]) -> Score:
-    """Returns the mean squared difference between the last frame and a goal, both from 0 to 1."""
+    """Returns a score: the mean squared difference between the last frame and a goal, both scaled to [0, 1]."""
     wanted = goal.astype(np.float32) / 255
     return lambda video: np.square(video[:, -1].astype(np.float32) / 255 - wanted).mean((1, 2, 3))
 
 
 def token_distance(model: TrainedModel, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
-    """Returns the share of bits by which the last frame's tokens differ from those of a goal.
+    """Returns a score: the share of bits in which the last frame's tokens differ from the tokens of a goal.
 
     Raises:
         UserError: the model has no tokens.
@@ -76,7 +75,7 @@ def token_distance(model: TrainedModel, goal: UInt8[np.ndarray, "S S 3"]) -> Sco
 
 
 def lpips_distance(weights: Path, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
-    """Returns LPIPS between the last frame and a goal.
+    """Returns a score: LPIPS between the last frame and a goal.
 
     Raises:
         UserError: the file of weights is missing or damaged, or the frames are too small for its network.
@@ -88,5 +87,5 @@ def lpips_distance(weights: Path, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
 
 
 def judged(judge: Judge) -> Score:
-    """Returns 1 - the probability of success at the end of the video."""
+    """Returns a score: 1 - the probability of success at the end of the video."""
     return lambda video: 1 - judge(video)[:, SUCCESS]

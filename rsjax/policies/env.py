@@ -14,9 +14,9 @@ from rsjax.policies.simulator import Observation
 class WorldModelEnv(gymnasium.Env[Any, Any]):
     """One episode in the world model of a run. docs/policies.md has the details.
 
-    The observation is a generated frame, {"rgb": uint8 (S, S, 3), "depth": float32 (S, S), metres}, without "depth" for
-    a model that generates none. A step is a frame of the clips, its action a row of their actions. The judge's
-    "success" gives a reward of 1 and terminates the episode.
+    The observation is a generated frame, {"rgb": uint8 (S, S, 3), "depth": float32 (S, S), metres}, without "depth" if
+    the model generates none. A step is one frame at the clips' rate, and its action is like a row of a clip's actions.
+    When the judge says "success", the reward is 1 and the episode terminates.
 
     Args:
         run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
@@ -42,8 +42,8 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
         """Begins an episode with the first frame of a clip, by default a random one of the test split.
 
         Args:
-            seed: of the choice of clips and of the model's draws.
-            options: "clip", the number of a clip; or "rgb" and "depth", a frame; "draw", a number that decides the
+            seed: determines the choice of clips and the model's draws.
+            options: "clip", the number of a clip, or "rgb" and "depth", a frame; "draw", a number that determines the
                 model's draws (0 gives the video of ``TrainedModel.generate``).
 
         Raises:
@@ -61,10 +61,10 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
 
         Returns:
             Observation, reward, terminated, truncated, and info: "success", "label", "verdict" (probabilities),
-            "clipped" (numbers clipped in this episode), "clip", and "action", what was done.
+            "clipped" (numbers clipped in this episode), "clip", and "action", the action after clipping.
 
         Raises:
-            ActionError: the action has another shape or a value that is not finite, or is refused as out of range.
+            ActionError: the action has the wrong shape or a value that is not finite, or is refused as out of range.
         """
         if self._frame is None:
             raise gymnasium.error.ResetNeeded("reset the environment before its first step")

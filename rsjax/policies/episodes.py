@@ -1,4 +1,4 @@
-"""Episodes in a world model, each judged at every frame: what both environments consist of.
+"""Episodes in a world model, each judged at every frame: the core of both environments.
 
 Axes: B episodes, N of them, S×S pixels, A action dimensions.
 """
@@ -24,7 +24,7 @@ from rsjax.policies.simulator import FAR, STEPS, UNIT, Observation
 from rsjax.policies.starts import Starts
 from rsjax.policies.verdicts import HISTORY, LABELS, Judge
 
-SPREAD = 5.0  # standard deviations around the mean to which actions of recordings are clipped
+SPREAD = 5.0  # actions of recordings are clipped to this many standard deviations around the mean
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class Settings:
     """Settings of an environment.
 
     Attributes:
-        data_dir: directory of simulated data sets, which has the first frames of a run on simulated clips.
+        data_dir: the directory of simulated data sets, where a run on simulated clips finds its first frames.
         store: the new path of the run's store of ingested clips, if it was moved.
         split: the clips whose first frames episodes begin with.
         max_steps: steps after which an episode is truncated; it may be longer than the model's window.
-        judge: decides reward and termination: a judge, the directory of a trained one, or "run": the run's own if
-            ``experiments.judge`` trained it. Without any, every reward is 0.
-        out_of_range: whether actions out of their space are clipped and counted ("clip"), or an error ("refuse").
+        judge: decides reward and termination: a judge, the directory of a trained one, or "run" for the judge that
+            ``experiments.judge`` trained for the run, if any. Without a judge, every reward is 0.
+        out_of_range: whether actions outside the action space are clipped and counted ("clip"), or raise ("refuse").
     """
 
     data_dir: Path | str = "data"
@@ -51,13 +51,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Step:
-    """What a step gave, for all B episodes.
+    """The result of one step of all B episodes.
 
     Attributes:
         seen: the observations.
-        success: where the judge sees the task done.
-        over: which have had all their steps.
-        info: as :meth:`Episodes.info`, and "action": the actions after clipping.
+        success: whether the judge sees that the task is done.
+        over: whether an episode has had all its steps.
+        info: as from :meth:`Episodes.info`, and "action": the actions after clipping.
     """
 
     seen: Observation
@@ -71,16 +71,16 @@ class Episodes:
 
     Args:
         run: a run directory, or its trained model.
-        count: B; None for a single one, whose actions have no leading axis.
-        settings: those of the environment.
+        count: B; None for a single episode, whose actions have no leading axis.
+        settings: the settings of the environment.
 
     Attributes:
-        action_space: of one episode.
-        observation_space: likewise.
+        action_space: the action space of one episode.
+        observation_space: the observation space of one episode.
 
     Raises:
         UserError: the run is missing or unfinished, its model takes no actions or cannot generate frame by frame, or
-            the judge is missing, damaged or of frames of another size.
+            the judge is missing, damaged or takes frames of another size.
     """
 
     def __init__(self, run: Path | str | TrainedModel, count: int | None, settings: Settings) -> None:
@@ -110,12 +110,12 @@ class Episodes:
     def restart(
         self, which: Bool[np.ndarray, " B"], rng: Sequence[np.random.Generator], options: dict[str, Any]
     ) -> Observation:
-        """Begins N episodes anew and returns their first observations, as the model sees them.
+        """Restarts N episodes and returns their first observations, as the model sees them.
 
         Args:
-            which: those episodes.
-            rng: chooses the clip and the draws of each of the N.
-            options: of the environments' ``reset``: "rgb" and "depth", or "clip"; "draw".
+            which: a mask of these episodes.
+            rng: one generator for each of the N; it chooses the clip and the draws.
+            options: as for the environments' ``reset``: "rgb" and "depth", or "clip"; "draw".
 
         Raises:
             StartError: the given frame does not fit, or the run's clips are missing.
@@ -140,7 +140,7 @@ class Episodes:
             ignored: episodes whose actions do not matter.
 
         Raises:
-            ActionError: they have another shape or a value that is not finite, or are refused as out of range.
+            ActionError: the actions have the wrong shape or a value that is not finite, or are refused as out of range.
         """
         shape = (*self._lead, *self._low.shape)
         low, high = np.broadcast_to(self._low, shape), np.broadcast_to(self._high, shape)
@@ -155,13 +155,13 @@ class Episodes:
         return Step(_observation(video), info["success"], self._steps >= self._settings.max_steps, info)
 
     def verdict(self) -> Float[np.ndarray, "B 3"]:
-        """Returns the probability of each label at the present frames; zeros without a judge."""
+        """Returns the probability of each label at the current frames; zeros without a judge."""
         if self._judge is None:
             return np.zeros((len(self._steps), len(LABELS)))
         return self._judge(self._recent)
 
     def info(self, verdict: Float[np.ndarray, "B 3"]) -> dict[str, np.ndarray]:
-        """Returns facts of all episodes: label, its probabilities, success, numbers clipped so far, clip."""
+        """Returns the ``info`` of all episodes: label, its probabilities, success, numbers clipped so far, clip."""
         judged = self._judge is not None
         labels = [LABELS[i] for i in verdict.argmax(-1)] if judged else ["unjudged"] * len(verdict)
         return {
@@ -176,10 +176,10 @@ class Episodes:
 def action_range(
     config: Config, normalization: Normalization
 ) -> tuple[Float32[np.ndarray, " A"], Float32[np.ndarray, " A"], str]:
-    """Returns the least and greatest actions, and what they are.
+    """Returns the least and greatest actions, and their unit.
 
-    The simulator's are from -1 to 1; a recording's, of which a run knows mean and deviation, ``SPREAD`` deviations
-    around the mean.
+    Actions in the simulator range from -1 to 1. For recordings, a run knows only the actions' mean and standard
+    deviation; their range is the mean ± ``SPREAD`` standard deviations.
     """
     width = config.clips.action_dim
     if not config.data.key:

@@ -1,4 +1,4 @@
-"""Figures of the experiments with policies, as PNG, and their side-by-side videos."""
+"""Draws the figures of the policy experiments as PNG, and joins videos side by side."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ GAP = 4  # pixels between videos
 
 
 def success_curves(series: Mapping[str, Sequence[tuple[float, Estimate]]], label: str = "demonstrations") -> bytes:
-    """Returns success with its intervals, one line for each series of (x, share)."""
+    """Returns a plot of success with its intervals, one line for each series of (x, share)."""
     figure = Figure(figsize=(5.5, 3.8), layout="constrained")
     axes = figure.subplots()
     for number, (name, points) in enumerate(series.items()):
@@ -30,7 +30,7 @@ def success_curves(series: Mapping[str, Sequence[tuple[float, Estimate]]], label
 
 
 def scatter(points: Mapping[str, tuple[Sequence[Estimate], Sequence[Estimate]]], titles: Mapping[str, str]) -> bytes:
-    """Returns a panel for each world model: true success across, imagined success up, a cross for each policy."""
+    """Returns a panel for each world model: true success on x, imagined success on y, a cross for each policy."""
     figure = Figure(figsize=(3.8 * len(points), 4.4), layout="compressed")
     panels = figure.subplots(1, len(points), squeeze=False)[0]
     for axes, (name, (true, imagined)) in zip(panels, points.items(), strict=True):
@@ -45,7 +45,7 @@ def scatter(points: Mapping[str, tuple[Sequence[Estimate], Sequence[Estimate]]],
 
 
 def side_by_side(videos: Sequence[UInt8[np.ndarray, "T S S 3"]]) -> UInt8[np.ndarray, "T2 S W 3"]:
-    """Returns videos beside each other; shorter ones hold their last frame."""
+    """Returns one video with the given videos side by side; shorter videos hold their last frame."""
     length = max(map(len, videos))
     gap = np.full((length, videos[0].shape[1], GAP, 3), 255, np.uint8)
     parts: list[np.ndarray] = []

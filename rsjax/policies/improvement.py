@@ -30,12 +30,12 @@ class Improvement:
     """How a policy is improved.
 
     Attributes:
-        rounds: of imagining and fine-tuning.
+        rounds: rounds of imagining and fine-tuning.
         imagined: episodes in the world model in each round.
-        max_steps: frames of each.
-        steps: of fine-tuning in each round.
-        share: of old demonstrations among those that are learnt from, 0 to below 1.
-        learning_rate: of fine-tuning, as a share of the training's.
+        max_steps: steps of an episode, at most.
+        steps: fine-tuning steps in each round.
+        share: share of old demonstrations in the data for fine-tuning, at least 0 and below 1.
+        learning_rate: of fine-tuning, as a share of the training's learning rate.
     """
 
     rounds: int = 2
@@ -63,22 +63,22 @@ def improve(
     trials: Trials,
     out: Path,
 ) -> dict[str, Any]:
-    """Improves a policy, and beside it trains a control for as many steps on its old demonstrations alone.
+    """Improves a policy, and trains a control for as many steps on the old demonstrations alone.
 
     Args:
-        policy: to begin with.
-        demos: those that it was trained on.
-        starts: first frames for imagined episodes; each round goes on where the one before ended.
+        policy: the policy to begin with.
+        demos: the demonstrations that the policy was trained on.
+        starts: first frames for imagined episodes; each round continues in this list where the last one ended.
         model: the world model.
-        simulator: the true one, in which success is measured before and after each round.
-        out: for policies, imagined successes, ``results.json``, ``results.md`` and ``success.png``.
+        simulator: the true simulator, in which success is measured before and after each round.
+        out: the folder for policies, imagined successes, ``results.json``, ``results.md`` and ``success.png``.
 
     Returns:
         The content of ``results.json``. An interrupted call resumes.
     """
     rows: list[dict[str, Any]] = []
     arms = {"imagined": policy, "control": policy}
-    config = _tuning(policy.model.config, settings)  # once: the policies of each round have it as theirs
+    config = _tuning(policy.model.config, settings)  # once: the policies of later rounds have this config already
     before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before")
     for number in range(1, settings.rounds + 1):
         stage(
@@ -119,14 +119,14 @@ def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
 def imagine(
     policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
 ) -> tuple[list[Record], dict[str, int]]:
-    """Imagines the episodes of a round; each group of them is kept in a file that is named after all it depends on.
+    """Imagines the episodes of a round; keeps each group in a file whose name is a hash of everything it depends on.
 
     Returns:
-        Those that the judge calls successes, as demonstrations; and of all, how many the judge calls uninterpretable
-        at their end, and how many numbers of actions were clipped.
+        The episodes that the judge calls successes, as demonstrations; and over all episodes, how many end in a frame
+        that the judge calls uninterpretable, and how many numbers of actions were clipped.
     """
     begins = (number - 1) * settings.imagined
-    # A start that is used again has other draws.
+    # A start that is used again gets different draws.
     chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
     made: list[Record] = []
     counts = {"uninterpretable": 0, "clipped": 0}
@@ -167,7 +167,7 @@ def _files(
 
 
 def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demos:
-    """Returns imagined successes with so many of the old demonstrations, at random, that these are ``share`` of all."""
+    """Returns imagined successes with random old demonstrations, which make up ``share`` of the result."""
     wanted = round(share / (1 - share) * len(made))
     rng = np.random.default_rng(seed)
     chosen = np.concatenate(
@@ -177,7 +177,7 @@ def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demo
 
 
 def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Returns what the last round gained, against before and against the control."""
+    """Returns the gain after the last round, compared with before and with the control."""
     last = {name: np.array([results["rounds"][-1][name]], float) for name in ("imagined", "control")}
     last["before"] = np.array([results["before"]], float)
     found = []

@@ -1,7 +1,7 @@
 """A small network that judges a task from the last four frames; it learns from frames that the simulator labelled.
 
-"Uninterpretable" is its third class, trained on frames that were spoilt on purpose: blocks in another order, two clips
-on top of one another, heavy noise, heavy blur. What it says of other spoilt frames shows in its validation.
+"Uninterpretable" is its third class, trained on frames that are spoilt on purpose: shuffled blocks, two clips on top of
+one another, heavy noise, heavy blur. The validation also judges spoilt held-out frames.
 
 Axes: B videos, F frames of a history, H×W pixels.
 """
@@ -31,10 +31,10 @@ from rsjax.progress import Progress
 
 FILE = "judge.msgpack"
 VALIDATION = "validation.json"
-SIDE = 64  # most pixels along each side of what the network reads; larger frames are made smaller
-BATCH = 64  # histories of a step, of which a quarter are spoilt
+SIDE = 64  # pixels; frames with a longer side are downsampled for the network
+BATCH = 64  # histories in a training step, of which a quarter are spoilt
 SPOILT = BATCH // 4
-CHUNK = 256  # most histories per pass
+CHUNK = 256  # histories in a forward pass, at most
 
 
 class Network(nn.Module):
@@ -54,7 +54,7 @@ class Network(nn.Module):
 
 @dataclass(frozen=True)
 class TrainedJudge:
-    """A trained network with the temperature that calibrates it; a :class:`rsjax.policies.verdicts.Judge`.
+    """A trained network and the temperature that calibrates it; a :class:`rsjax.policies.verdicts.Judge`.
 
     Attributes:
         validation: the content of its ``validation.json``, if it was validated.
@@ -66,7 +66,7 @@ class TrainedJudge:
 
     @cached_property
     def key(self) -> str:
-        """Changes with the weights and the temperature."""
+        """A hash of the weights and the temperature."""
         return content_key("judge", arrays_key(self.params), self.temperature)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
@@ -82,13 +82,13 @@ class TrainedJudge:
 
 
 def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
-    """Reads a judge that ``python -m experiments.judge`` trained, with its validation unless that is another judge's.
+    """Reads a judge that ``python -m experiments.judge`` trained, with its validation if that is of the same judge.
 
     Args:
-        side: of the frames that it will see, pixels; None: not known yet.
+        side: of the frames that the judge will see, pixels; None: not known yet.
 
     Raises:
-        UserError: there is none, its file is damaged, or it does not take frames of that size.
+        UserError: there is no judge, its file is damaged, or it does not take frames of that size.
     """
     path, report = folder / FILE, folder / VALIDATION
     try:
@@ -108,7 +108,7 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
                 f"with python -m experiments.judge RUN"
             ) from error
     found = read_json(report, cure="train the judge again") if report.exists() else None
-    # An interrupted training may have left the validation of the judge before; older ones do not name theirs.
+    # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
     return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge
 
 
@@ -117,15 +117,15 @@ class Footage:
     """Labelled videos to learn from or to be validated on.
 
     Attributes:
-        rgb: N videos.
-        success: the simulator's predicate at each frame.
+        rgb: the N videos.
+        success: the simulator's success predicate at each frame.
     """
 
     rgb: UInt8[np.ndarray, "N T H W 3"]
     success: Bool[np.ndarray, "N T"]
 
     def histories(self, videos: Int[np.ndarray, " B"], frames: Int[np.ndarray, " B"]) -> UInt8[np.ndarray, "B F H W 3"]:
-        """Returns the frames that end with the given one of each given video."""
+        """Returns the history that ends at the given frame, for each given video."""
         back = np.maximum(frames[:, None] - np.arange(HISTORY)[::-1], 0)
         return self.rgb[videos[:, None], back]
 
@@ -135,8 +135,8 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
 
     Args:
         footage: training videos, which must show both success and failure.
-        held: other videos, on which the temperature is fitted.
-        steps: of Adam, with batches of ``BATCH``.
+        held: held-out videos, on which the temperature is fitted.
+        steps: steps of Adam, with batches of ``BATCH``.
 
     Raises:
         UserError: the videos show only success, or only failure.
@@ -163,7 +163,7 @@ def spoilt(
 ) -> UInt8[np.ndarray, "B F H W 3"]:
     """Returns histories that nobody can interpret, each spoilt in one of four ways.
 
-    Blocks and blur leave a border where 8 does not divide the side.
+    If the side is not a multiple of 8, shuffled blocks and blur leave a border unchanged.
 
     Args:
         others: histories of other videos, one of which may be put on top.
@@ -184,7 +184,7 @@ def spoilt(
 
 
 def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws histories, half of them successes, a quarter of all spoilt, and their labels."""
+    """Draws histories and their labels: half of them successes, then a quarter of all spoilt."""
     half = BATCH // 2
     chosen = np.concatenate([each[rng.integers(len(each), size=half)] for each in found])
     frames = _altered(footage.histories(*chosen.T), rng)
@@ -196,7 +196,7 @@ def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) 
 
 
 def _altered(frames: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "B F H W 3"]:
-    """Changes contrast, brightness, place (by up to 2 pixels) and noise a little, as generated frames do."""
+    """Changes contrast, brightness, position (by up to 2 pixels) and noise a little, as generated frames vary."""
     one = (len(frames), 1, 1, 1, 1)
     shifted = np.roll(frames, rng.integers(-2, 3, 2), axis=(2, 3)).astype(np.float32)
     out = (shifted - 128) * rng.uniform(0.85, 1.15, one) + 128 + rng.normal(0, 8, one)
@@ -205,7 +205,7 @@ def _altered(frames: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator) -
 
 
 def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:
-    """Returns the temperature with which held-out labels are most probable."""
+    """Returns the temperature under which the held-out labels are most probable."""
     found = [each for each in (np.argwhere(held.success == done) for done in (True, False)) if len(each)]
     if len(found) < 2:
         return 1.0

@@ -1,8 +1,8 @@
-"""How far a judge can be trusted: its confusion matrix and calibration on held-out videos of three kinds.
+"""Measures how far a judge can be trusted: its confusion matrix and calibration on held-out videos of three kinds.
 
-Raw frames, the tokenizer's reconstructions, and generated videos under the clips' own actions. The labels are always
-the simulator's. On generated videos the model's errors count as the judge's: a cube that the model dropped is "fail" to
-a right judge and "success" to the simulator.
+The kinds are raw frames, the tokenizer's reconstructions, and videos generated under the clips' own actions. The labels
+are always the simulator's. On generated videos the model's errors count as the judge's errors: if the model drops a
+cube that was lifted in the clip, a correct judge says "fail" but the label is "success".
 """
 
 from typing import Any
@@ -21,10 +21,10 @@ AT_ONCE = 1024  # histories judged at once
 
 
 def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False) -> dict[str, Any]:
-    """Judges every frame from ``first`` on, and returns counts and rates, JSON-ready.
+    """Judges every frame from ``first`` on, and returns counts and rates, ready for JSON.
 
     Args:
-        spoil: also judge as many spoilt histories, whose label is "uninterpretable".
+        spoil: whether to judge also an equal number of spoilt histories, whose label is "uninterpretable".
     """
     videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
     truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
@@ -44,9 +44,10 @@ def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False
 def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]) -> dict[str, Any]:
     """Returns the confusion matrix (rows: the truth), rates with Wilson intervals, and the calibration.
 
-    ``calibration_error`` is the mean gap, over ten equal bins of the highest probability, between it and the share of
-    right labels, weighted by the bins' counts (ECE); ``brier`` is the mean squared error of the probabilities. Frames
-    of one clip resemble each other, so the intervals, which count frames, are narrower than they should be.
+    ``calibration_error`` is the expected calibration error (ECE): the mean gap between the highest probability and the
+    share of correct labels, over ten equal bins of that probability, weighted by the bins' counts. ``brier`` is the
+    mean squared error of the probabilities. Frames of one clip resemble each other, so the intervals, which count
+    frames as independent, are narrower than they should be.
     """
     chosen, sure = probabilities.argmax(-1), probabilities.max(-1)
     right = chosen == truth
@@ -74,7 +75,7 @@ def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]
 
 
 def summary(validation: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Returns what results say of their judge: of each kind of video, the validation without its bins."""
+    """Returns the part of a validation that results contain: for each kind of video, everything but the bins."""
     if validation is None:
         return None
     kinds = {kind: validation[kind] for kind in KINDS if kind in validation}
@@ -82,7 +83,7 @@ def summary(validation: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def markdown(judge: dict[str, Any] | None) -> list[str]:
-    """Returns lines of Markdown of a :func:`summary`: confusion matrix and calibration, for each kind of video."""
+    """Returns a :func:`summary` as Markdown lines: confusion matrix and calibration, for each kind of video."""
     if judge is None:
         return ["", "The judge has no validation.json: how far it can be trusted is unknown."]
     found = " / ".join(LABELS)
@@ -96,7 +97,7 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
 
 
 def table(result: dict[str, Any]) -> Table:
-    """Formats a validation: a row for each kind of video and true label."""
+    """Formats a validation as a table: a row for each kind of video and true label."""
     out = Table(title=f"judge on {result['clips']} held-out clips: frames by label")
     for heading in ("video", "truth", *LABELS, "right", "calibration error"):
         out.add_column(heading, justify="left" if heading in ("video", "truth") else "right")

@@ -24,7 +24,7 @@ from rsjax.policies.verdicts import Judge
 from rsjax.progress import Progress
 
 FOLDER = "judge"  # in the run directory
-FITTED = 10  # every tenth training clip fits the temperature instead
+FITTED = 10  # every tenth training clip serves to fit the temperature instead
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class JudgeSettings:
     """How a judge is trained and validated.
 
     Attributes:
-        steps: of training.
+        steps: training steps.
         clips: training clips, at most.
-        reconstructed: those of them that it also sees as the tokenizer reconstructs them, so that it knows the look of
-            generated frames; their labels are the simulator's too.
+        reconstructed: how many of these clips the judge also sees as the tokenizer reconstructs them, so that it knows
+            the look of generated frames; their labels are the simulator's too.
         validation_clips: held-out clips, at most.
-        seed: of the training.
+        seed: seed of the training.
     """
 
     steps: int = 1000
@@ -53,13 +53,13 @@ class JudgeSettings:
 
 
 def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, side: int) -> Judge | None:
-    """Returns a judge: itself, the one in a directory, or for "run" that of the run if it has one.
+    """Returns ``judge`` itself, the judge in that directory, or for "run" the run's judge if it has one.
 
     Args:
         side: of the run's frames, pixels.
 
     Raises:
-        UserError: the directory has no judge, its file is damaged, or it is of frames of another size.
+        UserError: the directory has no judge, its file is damaged, or it takes frames of another size.
     """
     if judge == "run":
         folder = None if isinstance(run, TrainedModel) else Path(run) / FOLDER
@@ -108,7 +108,7 @@ def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> 
 
 
 def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> tuple[Footage, Footage]:
-    """Returns what to learn from, and what to fit the temperature on: raw and reconstructed clips each."""
+    """Returns the videos to learn from and the videos to fit the temperature on, each raw and reconstructed."""
     source = clips.source("train")
     records = [clip for _, clip in readable(source, spread(source, settings.clips))]
     if len(records) < 2:
@@ -118,7 +118,7 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
     rgb = raw.rgb if seen is None else np.concatenate([raw.rgb, seen])
     success = raw.success if seen is None else np.concatenate([raw.success, raw.success[: len(seen)]])
     held = np.arange(len(rgb)) % len(raw.rgb) % FITTED == FITTED - 1 if len(raw.rgb) >= FITTED else None
-    if held is None:  # a toy's few clips serve both
+    if held is None:  # so few clips serve both purposes
         return Footage(rgb, success), Footage(rgb, success)
     return Footage(rgb[~held], success[~held]), Footage(rgb[held], success[held])
 

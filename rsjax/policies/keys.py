@@ -1,4 +1,4 @@
-"""Keys of what results depend on: equal in any process exactly when weights, settings and judges are equal."""
+"""Hash keys of what results depend on: two keys are equal, in any process, if weights, settings and judges are."""
 
 from typing import Any
 
@@ -9,19 +9,19 @@ from rsjax.policies.verdicts import Judge
 
 
 def arrays_key(*trees: Any) -> str:
-    """Returns 16 hex digits that change with any name, type, shape or number of these trees of arrays."""
+    """Returns 16 hex digits that change with any name, type, shape or value in these trees of arrays."""
     return fingerprint(trees)
 
 
 def model_key(trained: TrainedModel) -> str:
-    """Returns the key of what a world model generates: its weights, its tokenizer's, and their settings."""
+    """Returns the key of all that a world model's videos depend on: weights, tokenizer, normalization and settings."""
     config, assets = trained.config, trained.assets
     settings = (config.prompt_frames, config.clips, config.tokenizer, config.model)
     return content_key("model", str(settings), str(assets.normalization), arrays_key(trained.params, assets.tokenizer))
 
 
 def judge_key(judge: Judge | None) -> str:
-    """Returns a judge's attribute ``key``; the name of a judge without one, such as a function; "" for None."""
+    """Returns a judge's attribute ``key``, its name if it has no ``key`` (such as a function), or "" for None."""
     if judge is None:
         return ""
     return str(getattr(judge, "key", "")) or str(getattr(judge, "__qualname__", type(judge).__qualname__))

@@ -1,4 +1,4 @@
-"""Trains policies on synthetic and on real demonstrations, and compares their success in the true simulator."""
+"""Trains policies on synthetic and on real demonstrations, and compares their success in the simulator."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,12 +18,12 @@ from rsjax.policies.training import train_policy
 from rsjax.policies.trials import Trials, try_policy
 from rsjax.progress import stage
 
-SAME = 0.1  # success that a policy on synthetic demonstrations may lack for "as good as real ones"
+SAME = 0.1  # "as good as real demonstrations" allows a success rate that is lower by this much
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One policy to train: so many real and synthetic demonstrations, and a multiple of the usual steps."""
+    """One policy to train: the numbers of real and synthetic demonstrations, and a multiple of the usual steps."""
 
     name: str
     real: int
@@ -38,7 +38,7 @@ class Learning:
     Attributes:
         counts: numbers of demonstrations; the paper's are 50, 100, 150, 200.
         seeds: trainings of each cell.
-        cells: names of those to run; empty: all.
+        cells: names of the cells to run; empty: all.
     """
 
     counts: tuple[int, ...] = (50, 100, 150, 200)
@@ -52,8 +52,9 @@ class Learning:
     def chosen(self) -> list[Cell]:
         """Returns the cells to run.
 
-        For each number, as many synthetic and, as size-matched controls, as many real ones. Beside the most of both
-        together, which train for twice the steps, the most real ones for twice the steps: the data repeated.
+        For each number of ``counts`` there is a cell with that many synthetic demonstrations and, as a control of equal
+        size, one with that many real ones. The largest number of both together trains for twice the steps; its control
+        is the largest number of real ones for twice the steps, which repeats the data.
 
         Raises:
             UserError: a name is unknown.
@@ -70,12 +71,12 @@ class Learning:
 def learn(
     settings: Learning, config: PolicyConfig, real: Demos, synthetic: Demos, world: World, trials: Trials, out: Path
 ) -> dict[str, Any]:
-    """Trains and tries every cell, those that are finished excepted; writes ``results.json``, a table and a figure.
+    """Trains and tests every cell that is not finished; writes ``results.json``, a table and a figure.
 
     Args:
-        real, synthetic: demonstrations, of which each cell takes the first ones.
-        world: the true simulator.
-        out: a folder for each cell and seed, and the results.
+        real, synthetic: the demonstrations; each cell takes as many as it needs, from the first on.
+        world: the simulator.
+        out: the directory of the results, with a folder for each cell and seed.
 
     Returns:
         The content of ``results.json``.
@@ -84,7 +85,7 @@ def learn(
         UserError: there are too few demonstrations, or ``out`` holds others.
     """
     cells, rows = settings.chosen(), []
-    for cell in cells:  # before hours of training
+    for cell in cells:  # raises before hours of training if there are too few
         _demos(cell, real, synthetic)
     for number, cell in enumerate(cells, 1):
         stage(number, len(cells), cell.name, f"{cell.real} real and {cell.synthetic} synthetic demonstrations")
@@ -119,7 +120,7 @@ def pooled(row: dict[str, Any]) -> Estimate:
 
 
 def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Returns what the differences between rows say of the paper's claims."""
+    """Returns the verdicts on the paper's claims that follow from differences between rows."""
     success = {row["name"]: np.array(row["success"], float) for row in rows}
     least = min((row["synthetic"] for row in rows if row["synthetic"] and not row["real"]), default=0)
     wanted = [

@@ -1,4 +1,4 @@
-"""Judges that are not trained here: people who do not know what they see, and vision-language models.
+"""Judges that are not trained here: people who do not know where a video comes from, and vision-language models.
 
 Axes: B videos, T frames, H×W pixels.
 """
@@ -24,15 +24,15 @@ ANSWERS = {"yes": 0, "no": 1, "unclear": 2}
 
 
 def video_name(frames: UInt8[np.ndarray, "T H W 3"]) -> str:
-    """Returns a video's name in a sheet of labels: a hash of its frames, which says nothing of where it is from."""
+    """Returns a video's name in a sheet of labels: a hash of its frames, which does not reveal where it comes from."""
     return hashlib.sha256(repr(frames.shape).encode() + np.ascontiguousarray(frames).tobytes()).hexdigest()[:12]
 
 
 def write_blinded(videos: Sequence[UInt8[np.ndarray, "T H W 3"]], folder: Path, fps: float = 5.0) -> Path:
-    """Writes videos for people to judge, under names that say nothing, in an order that says nothing.
+    """Writes videos for people to judge; names and order do not reveal where the videos come from.
 
     Returns:
-        A sheet with the columns video and label (to be filled in with ``LABELS``), for :class:`HumanJudge`.
+        A sheet for :class:`HumanJudge` with the columns video and label (to be filled in with ``LABELS``).
     """
     named = {video_name(video): video for video in videos}
     for name, video in named.items():
@@ -46,7 +46,7 @@ def write_blinded(videos: Sequence[UInt8[np.ndarray, "T H W 3"]], folder: Path, 
 
 @dataclass(frozen=True)
 class HumanJudge:
-    """Labels that people gave to whole videos, by :func:`video_name`. A :class:`rsjax.policies.verdicts.Judge`."""
+    """A :class:`rsjax.policies.verdicts.Judge` of labels that people gave to whole videos, by :func:`video_name`."""
 
     labels: Mapping[str, int]
     sheet: Path
@@ -56,7 +56,7 @@ class HumanJudge:
         """Reads a filled-in sheet of :func:`write_blinded`.
 
         Raises:
-            UserError: it is missing, lacks a column, or a video has no label, an unknown one, or two.
+            UserError: the sheet is missing or lacks a column, or a video has no label, an unknown label or two labels.
         """
         try:
             with sheet.open(newline="", encoding="utf-8-sig") as file:
@@ -79,7 +79,7 @@ class HumanJudge:
         return cls(labels, sheet)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
-        """Returns 1 for the label that each video was given.
+        """Returns probability 1 for the label that people gave to each video, and 0 for the others.
 
         Raises:
             UserError: a video is not in the sheet.
@@ -94,12 +94,12 @@ class HumanJudge:
 
 @dataclass(frozen=True)
 class LanguageJudge:
-    """A vision-language model that is asked about the frames. A :class:`rsjax.policies.verdicts.Judge`.
+    """A :class:`rsjax.policies.verdicts.Judge` that asks a vision-language model about the frames.
 
     Attributes:
         model, processor: of the ``transformers`` library.
-        question: what it is asked; it is told to answer yes, no or unclear in one word.
-        frames: of the video's end that it is shown.
+        question: the question to the model, which asks for one word: yes, no or unclear.
+        frames: how many of the last frames the model sees.
     """
 
     model: Any
@@ -132,7 +132,7 @@ class LanguageJudge:
         return cls(model.eval(), processor, question, frames)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
-        """Returns 1 for the label that each answer means."""
+        """Returns probability 1 for the label that each answer means, and 0 for the others."""
         return np.eye(len(LABELS))[[answer_label(self._ask(video[-self.frames :])) for video in frames]]
 
     def _ask(self, frames: UInt8[np.ndarray, "T H W 3"]) -> str:
@@ -149,6 +149,6 @@ class LanguageJudge:
 
 
 def answer_label(answer: str) -> int:
-    """Returns the label's number that the first word of an answer means; "uninterpretable" for any other word."""
+    """Returns the index of the label that the first word of an answer means; "uninterpretable" for unknown words."""
     words = "".join(c if c.isalpha() else " " for c in answer.lower()).split()
     return ANSWERS.get(words[0], UNINTERPRETABLE) if words else UNINTERPRETABLE

@@ -1,7 +1,7 @@
-"""Model-predictive control: searches action sequences for one whose end some function calls good.
+"""Model-predictive control: searches for the action sequence with the lowest energy.
 
-The function is the world: ``(frames, candidate actions) → energies``. :mod:`rsjax.policies.energies` makes it from a
-world model and a goal; a simulator, or anything else that predicts, serves as well.
+The planner knows the world only through the energy, a function ``(frames, candidate actions) → energies``.
+:mod:`rsjax.policies.energies` makes one from a world model and a goal; a simulator or any other predictor serves too.
 
 Axes: N candidates, H steps of the horizon, A action dimensions.
 """
@@ -17,7 +17,7 @@ from rsjax.config import ConfigError
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 
-# Of what the planner is given (any type) and N candidates, (N, H, A): (N,), lower is better; inf: never.
+# From the planner's input (any type) and N candidates (N, H, A) to energies (N,); lower is better, inf excludes one.
 Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray, " N"]]
 
 
@@ -25,22 +25,21 @@ Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray
 class PlannerConfig:
     """How a planner searches.
 
-    In each round it draws candidates around a mean, and moves the mean towards the good ones.
+    In each round it draws candidates around a mean, and moves the mean towards the good candidates.
 
     Attributes:
-        method: "cem": mean and deviation become those of the ``elites`` best candidates (Rubinstein's cross-entropy
-            method); "mppi": the mean becomes that of all, weighted by exp(-energy/λ), with a deviation that stays
-            (Williams et al. 2017).
+        method: "cem": the new mean and deviation are those of the ``elites`` best candidates (Rubinstein's
+            cross-entropy method); "mppi": the new mean is that of all candidates, weighted by exp(-energy/λ), and the
+            deviation stays the same (Williams et al. 2017).
         horizon: steps of a candidate.
-        candidates: drawn in each round; the mean itself is one of them, and in later rounds the best so far.
-        rounds: of a decision.
+        candidates: candidates in each round; they include the mean itself and the best candidate so far.
+        rounds: rounds of a decision.
         elites: for "cem".
         temperature: λ for "mppi", in standard deviations of the candidates' finite energies.
         spread: standard deviation of the first candidates, as a share of half the actions' range.
-        memory: correlation of a candidate's noise from one step to the next: arms do not tremble.
-        hold: numbers of an action are this often the same: an action that is ``hold`` controls after one another is
-            searched as one control, held.
-        seed: of the draws.
+        memory: correlation of a candidate's noise from one step to the next, so that arms do not tremble.
+        hold: controls in an action; the search holds one control for all of them.
+        seed: seed of the draws.
     """
 
     method: Literal["cem", "mppi"] = "cem"
@@ -92,14 +91,14 @@ def search(
     """Searches for the action sequence of least energy.
 
     Args:
-        energy: of candidates; it is called ``config.rounds`` times.
-        frames: what it is called with, such as the frames so far.
+        energy: gives the candidates' energies; it is called ``config.rounds`` times.
+        frames: the first argument of ``energy``, such as the frames so far.
         mean: where the search begins.
-        low: least actions; candidates are clipped to them.
+        low: least actions; candidates are clipped to [low, high].
         high: greatest actions.
 
     Raises:
-        UserError: the energies have another shape, or are NaN or -inf.
+        UserError: the energies have the wrong shape, or one is NaN or -inf.
     """
     deviation = np.broadcast_to(config.spread * (high - low) / 2, mean.shape)
     best, lowest, history = mean, np.inf, []
@@ -126,7 +125,7 @@ def search(
 
 
 class Planner:
-    """Decides one action after another; each search begins with what is left of the plan before.
+    """Decides one action after another; each search begins with the remaining actions of the last plan.
 
     Args:
         energy: see :mod:`rsjax.policies.planner`.
@@ -135,7 +134,7 @@ class Planner:
         config: how it searches.
 
     Attributes:
-        plan: of the last decision; None before the first.
+        plan: the plan of the last decision; None before the first decision.
 
     Raises:
         ConfigError: an action's length is not a multiple of ``config.hold``.
@@ -153,7 +152,7 @@ class Planner:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the plan, for another episode. The draws begin anew."""
+        """Forgets the plan and resets the random draws, for another episode."""
         self.plan: Plan | None = None
         self._rng = np.random.default_rng(self._config.seed)
 
@@ -161,7 +160,7 @@ class Planner:
         """Returns the first action of a new plan.
 
         Args:
-            frames: passed on to the energy.
+            frames: the first argument of the energy.
         """
         middle = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
         mean = middle if self.plan is None else np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
@@ -174,7 +173,7 @@ class Planner:
 
 
 def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float[np.ndarray, "N H A"]:
-    """Returns normal noise of unit variance whose steps remember the step before."""
+    """Returns normal noise of unit variance in which each step is correlated with the step before."""
     noise = rng.standard_normal((config.candidates, config.horizon, width))
     for step in range(1, config.horizon):
         fresh = np.sqrt(1 - config.memory**2) * noise[:, step]

@@ -1,7 +1,7 @@
-"""Compares planning in a world model with other ways to act, in a closed loop with the real simulator.
+"""Compares planning in a world model with other ways to act, in a closed loop with the simulator.
 
-Every way acts in the same episodes: equal seeds mean equal starts. The goal image of an episode is what the scripted
-expert reaches from the same start; it is not shown how.
+All ways act in the same episodes, because equal seeds give equal starts. The goal image of an episode is the last frame
+of the scripted expert's episode from the same start; the planner does not see how the expert gets there.
 """
 
 import time
@@ -35,7 +35,7 @@ from rsjax.report.video import write_mp4
 
 EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
-MEMORY = 2  # last frames that the world model starts from; one at an episode's beginning
+MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
 FIRST_SEED = 1_000_000  # of episodes
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
 VIDEOS = 3  # of each way to act
@@ -47,12 +47,12 @@ class PlanSettings:
 
     Attributes:
         planner: how the planner searches; its ``method`` is replaced by each of ``methods``.
-        methods: of planning.
-        energy: "judge": 1 - the run's judge's probability of success; or the distance of the last frame to the goal
-            image by the model's tokens, pixels, or LPIPS.
+        methods: planning methods to compare.
+        energy: "judge": 1 - the probability of success according to the run's judge; otherwise the distance of the
+            last frame to the goal image, in the model's tokens, in pixels, or in LPIPS.
         lpips_weights: a file of weights for "lpips".
-        episodes: seeds, from ``FIRST_SEED`` on.
-        max_steps: of an episode.
+        episodes: number of episodes, with seeds from ``FIRST_SEED`` on.
+        max_steps: steps of an episode, at most.
     """
 
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -70,10 +70,10 @@ class PlanSettings:
 
 
 class PlanningActor:
-    """Plans anew at every frame, with the last frames as the world model's prompt.
+    """Makes a new plan at every frame, with the last frames as the world model's prompt.
 
     Attributes:
-        seconds: of each decision.
+        seconds: duration of each decision.
     """
 
     def __init__(self, planner: Planner, width: int, depth: bool) -> None:
@@ -100,7 +100,7 @@ def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UIn
     """Returns the score that a planner minimises.
 
     Raises:
-        UserError: the run has no judge for its frames or no tokens, or the weights are missing or damaged.
+        UserError: the run has no judge for its frames, its model has no tokens, or the weights are missing or damaged.
     """
     if settings.energy == "judge":
         return judged(load_judge(run / FOLDER, len(goal)))
@@ -140,10 +140,10 @@ def actors(
 
 
 def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
-    """Returns how a policy acts.
+    """Returns a function that makes an actor from a policy.
 
     Raises:
-        UserError: its actions or frames are not those of the run's clips.
+        UserError: the policy's actions or frames differ in size from those of the run's clips.
     """
     clips = trained.config.clips
     if (policy.action_dim, policy.model.image_size) != (clips.action_dim, clips.image_size):
@@ -162,9 +162,9 @@ def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
 def compare(
     trained: TrainedModel, run: Path, settings: PlanSettings, policies: Mapping[str, Policy] | None = None
 ) -> dict[str, Any]:
-    """Acts in the simulator in every way, and returns success rates and times; also in a :func:`folder` of the run.
+    """Runs episodes in the simulator with each way to act, and returns success rates and times.
 
-    Finished episodes are kept there, so an interrupted comparison goes on where it was.
+    A :func:`folder` of the run gets the result too. It keeps finished episodes, so an interrupted comparison resumes.
 
     Args:
         trained: the model of ``run``, which was trained on simulated clips.
@@ -208,12 +208,12 @@ def compare(
 
 
 def folder(run: Path, key: str) -> Path:
-    """Returns the folder of a comparison of that key: ``result.json``, ``results.md`` and videos."""
+    """Returns the folder of the comparison with that key: ``result.json``, ``results.md`` and videos."""
     return run / "plan" / key[:8]
 
 
 def table(result: dict[str, Any]) -> Table:
-    """Formats a comparison."""
+    """Formats the result of a comparison as a table."""
     out = Table(title=_title(result))
     for heading in HEADINGS:
         out.add_column(heading, justify="left" if heading == HEADINGS[0] else "right")
@@ -290,7 +290,7 @@ def _summary(
 
 
 def _kept(path: Path, key: str) -> list[dict[str, Any]]:
-    """Returns the episodes of an interrupted comparison with the same settings; those of others are done again."""
+    """Returns the finished episodes of an interrupted comparison; none if it had other settings."""
     try:
         saved = parse_json(path.read_bytes())
     except (OSError, ValueError):

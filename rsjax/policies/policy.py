@@ -1,4 +1,4 @@
-"""A trained Diffusion Policy: acts in many episodes at once, and is kept in a directory.
+"""A trained Diffusion Policy, which acts in many episodes at once and is saved in a directory.
 
 Axes: B episodes, O observed frames, S×S pixels, H controls of a plan, D numbers of a control, A = k·D of an action.
 """
@@ -36,21 +36,21 @@ class Policy:
 
     @property
     def action_dim(self) -> int:
-        """A, numbers of an action of a clip."""
+        """A, the numbers of a clip's action."""
         return self.model.controls * self.model.width
 
     @cached_property
     def key(self) -> str:
-        """Changes with everything that actions depend on: weights, range and settings, those of training excepted."""
+        """A hash of all that actions depend on: weights, range and settings except those of training."""
         model = replace(self.model, config=replace(self.model.config, train=LoopConfig()))
         return content_key("policy", str(model), str(self.range), arrays_key(self.params))
 
     def actor(self, seed: int = 0) -> "Actor":
-        """Returns what acts in new episodes; its draws follow from the seed."""
+        """Returns an actor for new episodes; the seed determines its draws."""
         return Actor(self, seed)
 
     def save(self, directory: Path) -> None:
-        """Writes what :func:`load_policy` reads; a policy is there once its ``policy.json`` is, so that comes last."""
+        """Writes what :func:`load_policy` reads; ``policy.json`` comes last, so a policy that has one is complete."""
         model = self.model
         values: dict[str, Any] = {"image_size": model.image_size, "controls": model.controls, "width": model.width}
         values |= {"config": to_dict(model.config), "range": to_dict(self.range)}
@@ -64,7 +64,7 @@ def load_policy(directory: Path) -> Policy:
     """Reads a policy.
 
     Raises:
-        UserError: it is missing, damaged or of another version.
+        UserError: the policy is missing, damaged or of another version.
     """
     path = directory / FILE
     if not path.exists():
@@ -79,24 +79,24 @@ def load_policy(directory: Path) -> Policy:
 
 
 class Actor:
-    """Acts in B episodes that began together: frames in, a clip's action for each out.
+    """Acts in B episodes that began together: it takes their frames and returns an action for each.
 
-    It plans when the controls of the last plan that are to be executed are used up.
+    It makes a new plan after executing as many controls of the last plan as the settings say.
     """
 
     def __init__(self, policy: Policy, seed: int) -> None:
-        # Without settings of training, so that policies that were trained for other steps share one program.
+        # No training settings, so that policies trained for different numbers of steps share one compiled program.
         self._model = replace(policy.model, config=replace(policy.model.config, train=LoopConfig()))
         self._policy, self._key = policy, jax.random.key(seed)
         self._seen: list[np.ndarray] = []
         self._plan: np.ndarray | None = None
-        self._done = 0  # frames
+        self._done = 0  # frames so far
 
     def __call__(self, frames: UInt8[np.ndarray, "B S S 3"]) -> Float32[np.ndarray, "B A"]:
-        """Returns the action that leads out of these frames.
+        """Returns the actions to take at these frames.
 
         Raises:
-            UserError: the frames have another size than the policy's.
+            UserError: the frames are not of the policy's size.
         """
         model, size = self._model, self._model.image_size
         if np.shape(frames)[1:] != (size, size, 3):
@@ -116,13 +116,13 @@ class Actor:
         return controls.reshape(len(frames), -1)
 
 
-@partial(jax.jit, static_argnums=0)  # one program for all policies of a size
+@partial(jax.jit, static_argnums=0)  # one program for all policies of one size
 def _plan(model: DiffusionPolicy, params: Params, frames: Any, key: Any) -> Any:
     return model.plan(params, frames, key)
 
 
 def common_size(policies: Iterable[Policy]) -> int:
-    """Returns the image size of policies that are compared.
+    """Returns the common image size of the policies in a comparison.
 
     Raises:
         UserError: they differ.

@@ -1,6 +1,7 @@
-"""Judges kept rollouts of policies once more, by people who do not know what they see or by a vision-language model.
+"""Judges saved rollouts of policies again, by people who judge blindly or by a vision-language model.
 
-The simulator's rollouts are among them: against the simulator's own predicate, they show how far the judge is right.
+The simulator's rollouts are among them: comparing their verdicts with the simulator's own predicate shows how often the
+judge is right.
 """
 
 import zlib
@@ -22,7 +23,7 @@ from rsjax.policies.verdicts import FAIL, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.progress import Progress
 
 Rollouts = dict[str, list[UInt8[np.ndarray, "T S S 3"]]]  # by policy, one for each episode
-EVERY = 20  # videos after which verdicts are written
+EVERY = 20  # verdicts are saved after each this many videos
 
 
 def blind(out: Path, folder: Path) -> Path:
@@ -38,10 +39,10 @@ def blind(out: Path, folder: Path) -> Path:
 
 
 def named_judge(words: str) -> tuple[Judge, str]:
-    """Returns the judge that ``human:SHEET.csv`` or ``vlm:DIRECTORY`` means, and a name of it and its content.
+    """Returns the judge that ``human:SHEET.csv`` or ``vlm:DIRECTORY`` names, and a name for its folder.
 
     Raises:
-        UserError: the words mean none, or its files are missing or damaged.
+        UserError: the words name no judge, or its files are missing or damaged.
     """
     kind, _, place = words.partition(":")
     path = Path(place)
@@ -55,15 +56,15 @@ def named_judge(words: str) -> tuple[Judge, str]:
 
 
 def rejudge(out: Path, judge: Judge, name: str) -> Path:
-    """Judges the last frames of all rollouts of a comparison, and writes its results by these verdicts.
+    """Judges all rollouts of a comparison at their last frames, and writes the results that follow.
 
     Args:
-        out: of the comparison.
+        out: the folder of the comparison.
         judge: sees one whole video at a time.
-        name: of its folder in ``out``, in which verdicts so far are kept.
+        name: the end of the name of the judge's folder in ``out``, which also keeps the verdicts so far.
 
     Returns:
-        The folder: ``results.json``, ``results.md`` and ``scatter.png`` as those of the comparison.
+        The folder, with ``results.json``, ``results.md`` and ``scatter.png`` like the comparison's.
 
     Raises:
         UserError: ``out`` has no finished comparison, or the judge cannot judge one of its videos.
@@ -126,7 +127,7 @@ def _video(file: Path) -> UInt8[np.ndarray, "T S S 3"]:
 def _verdicts(
     rollouts: Mapping[str, Rollouts], judge: Judge, file: Path
 ) -> dict[str, dict[str, Float[np.ndarray, "N 3"]]]:
-    """Returns the judge's probabilities for every video; equal ones are judged once."""
+    """Returns the judge's probabilities for every video; equal videos are judged once."""
     known: dict[str, list[float]] = read_json(file, cure=f"delete {file}") if file.exists() else {}
     names = {
         world: {policy: [video_name(video) for video in videos] for policy, videos in policies.items()}

@@ -1,4 +1,4 @@
-"""Rollouts of a policy, many at a time, in the simulator and in a world model, and their success.
+"""Runs a policy in many episodes at a time, in the simulator or in a world model, and records success.
 
 Axes: B episodes, T frames, S×S pixels, A action dimensions.
 """
@@ -20,20 +20,20 @@ from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
 from rsjax.progress import note
 
 Acts = Callable[[UInt8[np.ndarray, "B S S 3"]], Float32[np.ndarray, "B A"]]
-FIRST_SEED = 2**31  # of the test episodes: collections draw theirs from anywhere, few of which will be these
+FIRST_SEED = 2**31  # of the test episodes; collected data may use any seed, so few of the two coincide
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What B episodes look like after a step.
+    """The state of B episodes after a step.
 
     Attributes:
         rgb: (B, S, S, 3).
         depth: (B, S, S), metres, or None.
-        success: (B,), whether the task is done, by the world's own judgement.
-        actions: (B, A), what was done to get here, after clipping.
-        clipped: (B,), numbers of these actions that were clipped.
-        uninterpretable: (B,), whether the judge can say nothing of it; None without a judge.
+        success: (B,), whether the task is done, as the world itself judges.
+        actions: (B, A), the actions that led here, after clipping.
+        clipped: (B,), how many numbers of these actions were clipped.
+        uninterpretable: (B,), whether the judge cannot interpret the frames; None without a judge.
     """
 
     rgb: UInt8[np.ndarray, "B S S 3"]
@@ -52,31 +52,31 @@ class World(Protocol):
 
     @property
     def key(self) -> str:
-        """Changes with all that success depends on beside policy and starts: the simulator, or model and judge."""
+        """A hash of all that success depends on except policy and starts: the simulator, or model and judge."""
         ...
 
     @property
     def validation(self) -> dict[str, Any] | None:
-        """The validation of the judge that looks at episodes, if there is one and it was validated."""
+        """The validation of the world's judge, if it has one that was validated."""
         ...
 
     def restart(self, starts: Sequence[Any]) -> Seen:
-        """Begins an episode from each start, at most ``count``."""
+        """Begins an episode from each of at most ``count`` starts."""
         ...
 
     def step(self, actions: Float32[np.ndarray, "B A"], over: Bool[np.ndarray, " B"]) -> Seen:
-        """Does a step in every episode; what it gives of those that are over does not matter."""
+        """Runs one step of every episode; the results of episodes that are over do not matter."""
         ...
 
 
 class Simulated:
     """Episodes in simulator environments, which start from seeds.
 
-    An episode whose simulation diverges stays as it was before, with a note, and does not succeed.
+    An episode whose simulation diverges keeps its last state and does not succeed; a note says so.
 
     Args:
         envs: environments like :class:`rsjax.policies.simulator.LiftEnv`.
-        key: of their settings.
+        key: a hash of their settings.
     """
 
     validation = None
@@ -119,13 +119,13 @@ class Simulated:
 
 
 class Imagined:
-    """Episodes in a world model, which start from first frames and which a judge looks at.
+    """Episodes in a world model, which start from first frames; a judge decides on success.
 
     Args:
         trained: a model that ``rsjax.load`` loaded.
         count: episodes that run together.
-        judge: says what success is.
-        low, high: the least and greatest actions, (A,); what is beyond is clipped and counted.
+        judge: decides which frames show success.
+        low, high: the least and greatest actions, (A,); numbers out of range are clipped and counted.
     """
 
     def __init__(self, trained: Any, count: int, judge: Judge, low: np.ndarray, high: np.ndarray) -> None:
@@ -167,7 +167,7 @@ class Imagined:
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """A first frame for a world model: rgb (S, S, 3), depth (S, S) or None, and a number that decides its draws."""
+    """A first frame for a world model: rgb (S, S, 3), depth (S, S) or None, and a number that determines the draws."""
 
     rgb: UInt8[np.ndarray, "S S 3"]
     depth: Float32[np.ndarray, "S S"] | None
@@ -178,7 +178,7 @@ def run_together(world: World, act: Acts, starts: Sequence[Any], steps: int) -> 
     """Runs at most ``world.count`` episodes together, each until it succeeds or has had all its steps.
 
     Raises:
-        ActionError: the policy answers with another shape, or a value that is not finite.
+        ActionError: the policy returns actions of the wrong shape, or a value that is not finite.
     """
     seen = world.restart(starts)
     over, history, ends = np.zeros(len(starts), bool), [seen], np.full(len(starts), steps)
@@ -188,7 +188,7 @@ def run_together(world: World, act: Acts, starts: Sequence[Any], steps: int) -> 
         if over.all():
             break
         free = np.full(seen.actions.shape, np.inf, np.float32)
-        actions, _ = checked_actions(act(seen.rgb), -free, free, "clip", UNIT)  # the world clips, and counts
+        actions, _ = checked_actions(act(seen.rgb), -free, free, "clip", UNIT)  # the world itself clips and counts
         seen = world.step(actions, over)
         history.append(seen)
         ends[seen.success & ~over] = step
@@ -220,9 +220,9 @@ def run_all(
     """Runs an episode from each start, ``world.count`` at a time, and returns which succeeded.
 
     Args:
-        actor: makes what acts in new episodes, from a seed.
-        keep: called with the number and the episode of each.
-        report: called with the number of episodes done.
+        actor: makes an actor for new episodes, from a seed.
+        keep: called with the number of each episode and the episode.
+        report: called with the number of finished episodes.
     """
     results: list[bool] = []
     for first in range(0, len(starts), world.count):

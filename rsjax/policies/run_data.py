@@ -1,4 +1,4 @@
-"""What the experiments with policies take from a run: its clips, simulator, judge and world model."""
+"""Loads what the policy experiments take from a run: its clips, simulator, judge and world model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class RunData:
 
     Attributes:
         run: the directory.
-        data_dir: of simulated data sets.
+        data_dir: the directory of simulated data sets.
         moved: the new path of the run's store of ingested clips, if it was moved.
     """
 
@@ -56,7 +56,7 @@ class RunData:
         """The simulator that the clips are from.
 
         Raises:
-            UserError: they are recordings, or of another simulator.
+            UserError: the clips are recordings, or from another simulator.
         """
         source = str(self.clips.manifest.get("source") or "an unknown source")
         if not source.startswith("robosuite/Lift"):
@@ -67,7 +67,7 @@ class RunData:
         return from_dict(SimConfig, self.clips.manifest["config"])
 
     def world(self, count: int, judge: Path | None = None) -> Imagined:
-        """Returns the run's world model as a world of ``count`` episodes, with the run's judge or another one's folder.
+        """Returns the run's world model as a world of ``count`` episodes, with the run's judge or that in a folder.
 
         Raises:
             UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
@@ -77,10 +77,10 @@ class RunData:
         return Imagined(self.trained, count, self.judge(judge), low, high)
 
     def check_world(self, like: "RunData") -> None:
-        """Checks, without loading weights, that policies can act in the run's model, on clips like another run's.
+        """Checks, without loading weights, that policies of another run's clips can act in this run's model.
 
         Raises:
-            UserError: it is unfinished, takes no actions, or frames or actions differ.
+            UserError: the run is unfinished, its model takes no actions, or frames or actions differ in size.
         """
         check_takes_actions(self.config.model, f"{self.run}: the model")
         shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
@@ -96,12 +96,12 @@ class RunData:
         """Returns the run's judge, or the one in another folder.
 
         Raises:
-            UserError: there is none, or it is of frames of another size than the run's.
+            UserError: there is no judge, or its frames differ in size from the run's.
         """
         return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
 
     def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
-        """Returns the first frames of so many clips, with depth where they have it."""
+        """Returns the first frames of ``count`` clips, with depth if the clips have it."""
         source = self.clips.source(split)
         chosen = readable(source, range(min(count, len(source))))
         return [
@@ -126,7 +126,7 @@ def synthetic_demos(path: Path, run: Path) -> Demos:
 
 
 def sized_policy(size: str, steps: int) -> PolicyConfig:
-    """Returns the settings of a named size, perhaps with another number of training steps.
+    """Returns the policy settings of a named size, with another number of training steps if one is given.
 
     Raises:
         ConfigError: there is no such size.
@@ -136,10 +136,10 @@ def sized_policy(size: str, steps: int) -> PolicyConfig:
 
 
 def named(runs: Sequence[Path]) -> dict[str, Path]:
-    """Returns runs by a name for each: the last part of its path that tells them apart.
+    """Names each run by the shortest end of its path that tells the runs apart.
 
     Raises:
-        UserError: two are the same.
+        UserError: two runs are the same.
     """
     for parts in range(1, 8):
         names = ["-".join(run.absolute().parts[-parts:]) for run in runs]

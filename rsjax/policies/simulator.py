@@ -1,7 +1,7 @@
-"""Lift in the simulator as a closed loop at the clips' frame rate: what a clip recorded, a policy can act in.
+"""Lift in the simulator as a closed loop at the clips' frame rate, so that a policy can act in what clips recorded.
 
-One step is one frame: the action is a clip's, ``control_steps`` controls of 7 numbers (docs/policies.md), and frames
-are rendered as clips are, so replaying a clip's actions from its own start gives its own frames.
+One step is one frame. An action is like a clip's: ``control_steps`` controls of 7 numbers (docs/policies.md). Frames
+are rendered as in clips, so replaying a clip's actions from the clip's start reproduces its frames.
 
 Axes: T frames, S×S pixels, A action dimensions.
 """
@@ -22,15 +22,15 @@ from rsjax.sim.lift import LiftSim, State
 
 Observation: TypeAlias = dict[str, np.ndarray]  # "rgb": uint8 (S, S, 3); "depth": float32 (S, S), metres
 Control: TypeAlias = Callable[[State], Float[np.ndarray, " 7"]]  # from the simulator's state, at each control step
-Actor: TypeAlias = Callable[[Observation], Any]  # one episode's policy: a frame's action, or a control
+Actor: TypeAlias = Callable[[Observation], Any]  # the policy of one episode; it returns a frame's action, or a control
 UNIT = "6-D change of the goal pose and gripper (+1 closes) for each control step, from -1 to 1"
 FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
 DEFAULT = SimConfig(camera="near")
-STEPS = 30  # of an episode, by default: 6 s at 5 frames per second
+STEPS = 30  # default length of an episode: 6 s at 5 frames per second
 
 
 def clip_seed(provenance: dict[str, Any]) -> int:
-    """Returns the seed with which :meth:`LiftEnv.reset` starts where a simulated clip did."""
+    """Returns the seed with which :meth:`LiftEnv.reset` starts where a simulated clip started."""
     return int(np.random.default_rng([provenance["seed"], provenance["episode"]]).integers(2**32))
 
 
@@ -43,12 +43,12 @@ def skilled_expert(seed: int) -> Expert:
 class LiftEnv(gymnasium.Env[Any, Any]):
     """Lift as a Gymnasium environment that steps from frame to frame of a clip. Call :meth:`close` when done.
 
-    The observation is the frame, the reward is 1 when the cube is lifted, which also terminates the episode.
+    The observation is the frame. When the cube is lifted, the reward is 1 and the episode terminates.
 
     Args:
-        config: image size, camera and control steps per frame, as of the clips (``load_config(run).sim``).
+        config: image size, camera and control steps per frame, as for the clips (``load_config(run).sim``).
         max_steps: steps after which an episode is truncated.
-        out_of_range: whether actions beyond ±1 are clipped and counted ("clip"), or an error ("refuse").
+        out_of_range: whether actions beyond ±1 are clipped and counted ("clip"), or raise an error ("refuse").
         render_mode: "rgb_array", or None.
 
     Raises:
@@ -89,9 +89,9 @@ class LiftEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode; the arm's start and the cube's place follow from the seed (0 … 2³² - 1).
+        """Begins an episode; the seed (0 … 2³² - 1) determines the arm's start and the cube's place.
 
-        Without a seed, one is drawn from the generator that the last seed started.
+        If there is no seed, one is drawn from the generator that the last seed started.
         """
         super().reset(seed=seed)
         self._sim.reset(int(self.np_random.integers(2**32)) if seed is None else seed)
@@ -102,14 +102,14 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         """Runs one frame's control steps.
 
         Args:
-            action: (A,), as a row of a clip's actions; or a control, which is asked at each control step.
+            action: (A,), like a row of a clip's actions; or a control, which is called at each control step.
 
         Returns:
             Observation, reward, terminated, truncated, and info: "success", "clipped" (numbers clipped in this episode)
-            and "action", what was done.
+            and "action", the action after clipping.
 
         Raises:
-            ActionError: the action has another shape or a value that is not finite, or is refused as out of range.
+            ActionError: the action has the wrong shape or a value that is not finite, or is refused as out of range.
             ArithmeticError: the simulation diverged.
         """
         done = np.zeros((self._config.control_steps, 7), np.float32)
@@ -142,15 +142,15 @@ class LiftEnv(gymnasium.Env[Any, Any]):
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened in one episode in an environment.
+    """The record of one episode in an environment.
 
     Attributes:
-        rgb: all frames, the first one included.
-        depth: likewise, metres; None if the environment has none.
-        actions: row t led into frame t, row 0 is zeros, as in clips.
+        rgb: all frames, including the first one.
+        depth: of the same frames, metres; None if the environment has none.
+        actions: row t led to frame t; row 0 is zeros, as in clips.
         success: whether the task was done at each frame.
-        clipped: numbers of the actions that were clipped to their range.
-        uninterpretable: whether a judge can say nothing of the last frame.
+        clipped: how many numbers of the actions were clipped to their range.
+        uninterpretable: whether the judge cannot interpret the last frame.
     """
 
     rgb: UInt8[np.ndarray, "T S S 3"]
@@ -168,7 +168,7 @@ def run_episode(env: gymnasium.Env[Any, Any], act: Actor, seed: int, options: di
         env: an environment of this package.
         act: the policy, fresh for this episode.
         seed: for :meth:`gymnasium.Env.reset`.
-        options: likewise.
+        options: for the same call.
     """
     seen, info = env.reset(seed=seed, options=options)
     frames, actions, success, over = [seen], [], [bool(info["success"])], False

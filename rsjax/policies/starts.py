@@ -1,4 +1,4 @@
-"""First frames for episodes in a world model: of a run's held-out clips, or given ones.
+"""First frames for episodes in a world model: from a run's held-out clips, or from the caller.
 
 Axes: N episodes, S×S pixels.
 """
@@ -20,7 +20,7 @@ from rsjax.pipeline.run import Run
 
 
 class StartError(UserError):
-    """An episode cannot begin: the run's clips are missing, or the given frame does not fit."""
+    """Says why an episode cannot begin: the run's clips are missing, or the given frame does not fit."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Start:
 
 @dataclass(frozen=True)
 class Starts:
-    """The first frames of a run.
+    """The first frames of a run's clips.
 
     Attributes:
-        config: the run's.
+        config: the run's configuration.
         run, data_dir, store: where its clips are, as for ``experiments.generate``.
         split: the clips to choose from.
         depth: whether a first frame needs depth.
@@ -59,7 +59,7 @@ class Starts:
         """The clips of the split.
 
         Raises:
-            StartError: they are missing.
+            StartError: the clips are missing.
         """
         try:
             config = relocated(self.config, self.store) if self.store else self.config
@@ -75,7 +75,7 @@ class Starts:
             ) from error
 
     def choose(self, rng: np.random.Generator, options: dict[str, Any]) -> Start:
-        """Returns the frame that options give or name, or a random clip's.
+        """Returns the frame in the options, the first frame of the clip that they name, or that of a random clip.
 
         Args:
             options: "rgb", uint8 (S, S, 3), with "depth", metres (S, S), if the model generates it; or "clip", a

@@ -28,7 +28,7 @@ from rsjax.policies.keys import arrays_key, judge_key, model_key
 from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
 
 MARK = "synthesis.json"
-CLIPS = "clips"  # folder of the store
+CLIPS = "clips"  # the store's folder
 VERSIONS: tuple[Literal["v3.0", "v2.1"], ...] = ("v3.0", "v2.1")
 
 
@@ -37,11 +37,11 @@ class Synthesis:
     """Which demonstrations to make.
 
     Attributes:
-        demos: how many. More than there are clips use clips again, with other noise and other draws of the model.
+        demos: how many. Beyond the number of clips, clips are used again with new noise and new draws of the model.
         noise: standard deviation of the noise on actions, in each number's own standard deviation in the data set.
-            Numbers of a clip that are commands with two values at most, such as a gripper's, stay as they are.
-        split: of the clips whose first frames and actions are used.
-        only: success uses those that end in success, where the data set says which do.
+            Numbers with at most two values in a clip, such as a gripper command, get no noise.
+        split: split of the clips whose first frames and actions are used.
+        only: success uses only clips that end in success, if the data set says which do.
         seed: of the choice of clips, the noise and the model's draws.
         batch: clips that are generated together.
         fps: frames per second; 0: as the clips say.
@@ -77,20 +77,20 @@ def synthesize(
     Args:
         trained: the world model.
         store: the data set.
-        limits: the least and greatest actions; what is beyond is clipped and counted.
-        judge: says which frames show success; None: the store does not say.
+        limits: the least and greatest actions; numbers out of range are clipped and counted.
+        judge: labels the frames that show success; None: the store has no such labels.
         report: called with (demonstrations done, demonstrations in all).
 
     Returns:
         The content of ``out/synthesis.json``: ``demos``, ``clipped`` (numbers of actions), ``success`` and
-        ``uninterpretable`` (how many the judge calls that at their end, None without), ``judge`` (its validation, if
-        it has one), the options and the sources.
+        ``uninterpretable`` (how many demonstrations get that label at their end; None without a judge), ``judge`` (its
+        validation, if it has one), the options and the sources.
 
     Raises:
-        UserError: the data set has no clip to begin with, does not fit the model, or ``out`` holds other clips.
+        UserError: the data set has no suitable clip, does not fit the model, or ``out`` holds other clips.
     """
     inputs = (model_key(trained), judge_key(judge), arrays_key(limits))
-    settings = {name: value for name, value in asdict(options).items() if name != "fps" or value}  # keys from before it
+    settings = {name: value for name, value in asdict(options).items() if name != "fps" or value}  # older keys lack fps
     key = content_key(4, *inputs, str(store.manifest.get("key")), str(settings))
     if (mark := _finished(out, key)) is not None:
         return mark
@@ -103,7 +103,7 @@ def synthesize(
         clips = write_clips(out / CLIPS, _records(partial / key, options.demos), test_share=0.0)
         for version in VERSIONS:
             place = out / f"lerobot-{version}"
-            shutil.rmtree(place, ignore_errors=True)  # of an attempt that ended before its mark
+            shutil.rmtree(place, ignore_errors=True)  # left by an attempt that did not finish
             export_lerobot(clips, place, LeRobotOptions(version))
         mark = {"key": key, **asdict(options), **_summary(clips, judge)}
         write_json(out / MARK, mark)
@@ -112,7 +112,7 @@ def synthesize(
 
 
 def _finished(out: Path, key: str) -> dict[str, Any] | None:
-    """Returns what a finished call left; None if there was none; raises UserError if its inputs were others."""
+    """Returns the result of a finished call, or None; raises UserError if that call had other inputs."""
     if not (out / MARK).exists():
         return None
     mark = read_json(out / MARK, cure=f"delete {out}")
@@ -133,7 +133,7 @@ def _generate(
     judge: Judge | None,
     report: Callable[[int, int], None],
 ) -> None:
-    """Leaves each demonstration in a file of its own, those that exist excepted."""
+    """Writes each demonstration to its own file, unless that exists."""
     source, chosen = store.source(options.split), choose_clips(store, options)
     spread = np.asarray(trained.assets.normalization.action_std)
     _check_fits(source[chosen[0]], store, trained, options)
@@ -154,7 +154,7 @@ def _generate(
 
 
 def _check_fits(clip: Record, store: Store, trained: TrainedModel, options: Synthesis) -> None:
-    """Raises UserError unless the model takes clips like this one, and they have what the exports need."""
+    """Raises UserError unless the model takes clips like this one, and they contain what the exports need."""
     check_takes_actions(trained.config.model)
     size, width = trained.config.clips.image_size, len(trained.assets.normalization.action_std)
     if clip["actions"].shape[1] != width:
@@ -175,10 +175,10 @@ def _generated(
     options: Synthesis,
     judge: Judge | None,
 ) -> Iterator[Record]:
-    """Yields what :func:`rsjax.write_store` takes of each clip that the model generates."""
+    """Yields each generated clip as a record for :func:`rsjax.write_store`."""
     count = trained.config.prompt_frames
     prompt = Clips.stacked(clips, list(numbers)).video.frames(0, count)
-    full = options.batch - len(clips)  # a last batch is filled up: one program serves all
+    full = options.batch - len(clips)  # fills up the last batch: one program serves all
     rows = np.concatenate([np.arange(len(clips)), np.zeros(full, int)])
     actions = np.stack([actions for actions, _ in noisy])
     index = np.array(numbers)[rows] + options.seed % 2**11 * 2**20
@@ -212,10 +212,10 @@ def _generated(
 
 
 def choose_clips(store: Store, options: Synthesis) -> list[int]:
-    """Returns the numbers of the clips to begin with, in an order that depends on the seed; at most ``demos``.
+    """Returns the numbers of at most ``demos`` clips to generate from, in an order that depends on the seed.
 
     Raises:
-        UserError: there is none, or without ``options.fps`` they have several frame rates.
+        UserError: there is no clip, or the clips differ in frame rate and ``options.fps`` is 0.
     """
     source = store.source(options.split)
     labelled = chooses(store, options.only)
@@ -247,7 +247,7 @@ def perturb(
     """Returns actions with Gaussian noise, clipped to their range, and how many numbers were clipped; row 0 stays zero.
 
     Args:
-        spread: the noise's standard deviation; numbers with two values at most in these actions get none.
+        spread: the noise's standard deviation; numbers with at most two values in these actions get no noise.
     """
     commands = np.array([len(np.unique(column)) <= 2 for column in actions[1:].T])
     noise = rng.standard_normal(actions.shape) * np.where(commands, 0, spread)
@@ -259,7 +259,7 @@ def perturb(
 
 
 def labels(rgb: UInt8[np.ndarray, "B T S S 3"], judge: Judge) -> Int[np.ndarray, "B T"]:
-    """Returns the number of the judge's label of each frame."""
+    """Returns the index of the judge's label for each frame."""
     return np.stack([judge(last_frames(rgb[:, : frame + 1])).argmax(-1) for frame in range(rgb.shape[1])], 1)
 
 

@@ -1,4 +1,4 @@
-"""Trains a Diffusion Policy, with the train step, loop and checkpoints of everything else."""
+"""Trains a Diffusion Policy, with the same train step, loop and checkpoints as every other model here."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -35,17 +35,17 @@ def train_policy(
     """Trains a policy on demonstrations, resuming where an earlier call was interrupted.
 
     Args:
-        config: the policy's settings; ``config.train.steps`` are those of this training.
-        demos: what it learns from.
-        directory: of checkpoints, logs and, in the end, the policy itself.
+        config: the policy's settings; ``config.train.steps`` is the length of this training.
+        demos: the demonstrations to learn from.
+        directory: the directory of checkpoints, logs and, in the end, the policy itself.
         name: for the progress line.
         seed: of the parameters, the order of the data and all draws.
-        stops: steps after which the policy so far is kept too, in ``directory/at-STEP``.
-        start: a policy to go on from, with its range of controls.
+        stops: steps after which the current policy is saved too, in ``directory/at-STEP``.
+        start: a policy to continue from, with its range of controls.
 
     Raises:
-        UserError: the directory holds a training on other data or of other settings, or one that kept other stops.
-        FileError: another process trains there.
+        UserError: the directory holds a training on other data, with other settings, or with other stops.
+        FileError: another process trains in the directory.
     """
     model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
     span = start.range if start else demos.range
@@ -82,11 +82,11 @@ def _fit(
 
     begin: Callable[[Any], Any] | None = (
         (lambda fresh: jax.tree.map(np.array, start.params)) if start else None
-    )  # a copy, as steps donate theirs
+    )  # a copy, because training steps donate their parameters
     monitor = Monitor(("samples", loop.batch_size))
     options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "monitor": monitor}
     state = fit(model, loop, loader, directory, **options)
-    if stop < loop.steps and state.step > stop:  # it was interrupted later on, when it kept other stops
+    if stop < loop.steps and state.step > stop:  # an earlier call with other stops trained past this one
         raise _other_stops(directory, stop)
     return state.weights
 

@@ -1,4 +1,4 @@
-"""Trials of policies: which of the same starts each succeeds from, kept so that an interrupted series resumes."""
+"""Tries policies from the same starts, and saves which succeed so that an interrupted series of trials resumes."""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
@@ -28,9 +28,9 @@ class Trials:
 
     Attributes:
         episodes: how many, from fixed seeds.
-        max_steps: frames after which one counts as a failure.
+        max_steps: steps after which an episode counts as a failure.
         together: episodes that run at a time.
-        videos: how many episodes are kept as videos.
+        videos: how many episodes are saved as videos.
     """
 
     episodes: int = 50
@@ -51,12 +51,12 @@ class Trials:
 
 @dataclass
 class Result:
-    """What came of a policy's trials.
+    """The results of a policy's trials.
 
     Attributes:
         success: by episode.
-        clipped: numbers of actions that were clipped.
-        uninterpretable: by episode, whether the judge can say nothing of its last frame; False in the simulator.
+        clipped: how many numbers of actions were clipped.
+        uninterpretable: by episode, whether the judge cannot interpret its last frame; False in the simulator.
     """
 
     success: list[bool] = field(default_factory=list)
@@ -78,16 +78,16 @@ def try_policy(
     name: str,
     see: Callable[[int, Episode], None] = lambda number, episode: None,
 ) -> Result:
-    """Runs a policy from each start, except where ``folder`` has the result already.
+    """Runs a policy from each start, except those whose result is in ``folder`` already.
 
     Args:
-        folder: of ``success.json``, which grows as episodes end, and of a few videos.
+        folder: where ``success.json``, which grows as episodes end, and a few videos are.
         name: for the progress line.
-        see: called with the number and the episode of each that is run now.
+        see: called with the number of each episode that this call runs, and the episode.
 
     Raises:
-        UserError: the result in ``folder`` is of other trials, another policy, or another world or judge.
-        FileError: another process tries policies there.
+        UserError: the result in ``folder`` is from other trials, another policy, or another world or judge.
+        FileError: another process runs trials in ``folder``.
     """
     file = folder / "success.json"
     with making(folder, wait=False):
@@ -107,14 +107,14 @@ def try_policy(
                 write_json(file, kept)
                 progress.update(begins + done, success=sum(kept["success"]))
 
-            # Draws depend on an episode's group, which begins at a multiple of ``together``.
+            # An episode's draws depend on its group, so a resumed series continues at a multiple of ``together``.
             run_all(world, lambda first: policy.actor(begins + first), starts[begins:], trials.max_steps, keep, report)
     success, spoilt = ([bool(one) for one in kept[name]] for name in ("success", "uninterpretable"))
     return Result(success, int(kept["clipped"]), spoilt)
 
 
 def _kept(file: Path, settings: list[int], key: str) -> dict[str, Any]:
-    """Returns the content of a file of successes so far, or that of one to begin with."""
+    """Returns the content of the file of results so far, or an empty one's content if there is no file."""
     empty = {"success": [], "uninterpretable": [], "clipped": 0, "trials": settings, "key": key}
     kept = read_json(file, cure=f"delete {file}") if file.exists() else empty
     if kept.get("trials") != settings:
@@ -129,7 +129,7 @@ def _kept(file: Path, settings: list[int], key: str) -> dict[str, Any]:
 
 @contextmanager
 def lift_simulators(config: SimConfig, trials: Trials) -> Iterator[Simulated]:
-    """Opens simulators of Lift and closes them afterwards."""
+    """Opens Lift environments in the simulator and closes them afterwards."""
     envs: list[LiftEnv] = []
     try:
         for _ in range(min(trials.together, trials.episodes)):
@@ -141,7 +141,7 @@ def lift_simulators(config: SimConfig, trials: Trials) -> Iterator[Simulated]:
 
 
 def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFrame]:
-    """Returns the simulator's first frames for these seeds, from a file if it has them of this simulator."""
+    """Returns the simulator's first frames for these seeds, from the file if it has those of this simulator."""
     if file.exists():
         with np.load(file) as arrays:
             if arrays["seeds"].tolist() == list(seeds) and "key" in arrays and str(arrays["key"]) == world.key:

@@ -1,4 +1,4 @@
-"""The Diffusion Policy's network (Chi et al. 2023): a 1-D U-Net over controls, conditioned on pictures by FiLM.
+"""The Diffusion Policy's network (Chi et al. 2023): a 1-D U-Net over controls, conditioned on frames by FiLM.
 
 Axes: B samples, H controls, D numbers of a control, O observed frames, S×S pixels, K keypoints, C channels, F features.
 """
@@ -17,17 +17,17 @@ def mish(x: Array) -> Array:
 
 
 def step_embedding(step: Int[Array, " B"], width: int) -> Float[Array, "B F"]:
-    """Returns sines and cosines of the noise step, of ``width`` frequencies in all."""
+    """Returns ``width`` sines and cosines of the noise step, half of each."""
     rates = jnp.exp(-jnp.log(10000.0) / (width // 2 - 1) * jnp.arange(width // 2))
     angles = step[:, None] * rates
     return jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], -1)
 
 
 class Conv(nn.Module):
-    """A 1-D convolution, as a product with the values around each place: several times faster on CPUs.
+    """A 1-D convolution, computed as a matrix product with the values around each place: several times faster on CPUs.
 
     Args:
-        pad: zeros before and after; by default as many as keep the length.
+        pad: zeros before and after; by default as many as preserve the length.
     """
 
     channels: int
@@ -65,7 +65,7 @@ class ConvBlock(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolution blocks and a shortcut; the condition scales and shifts what is between them (FiLM)."""
+    """Two convolution blocks and a shortcut; the condition scales and shifts the values between them (FiLM)."""
 
     channels: int
     kernel: int
@@ -80,7 +80,7 @@ class ResidualBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """Predicts the noise in controls from a noise step and features of the observation."""
+    """Predicts the noise in controls from the noise step and the features of the observation."""
 
     config: PolicyConfig
 
@@ -112,7 +112,7 @@ class UNet(nn.Module):
 
 
 class Vision(nn.Module):
-    """A ResNet with group normalisation and a spatial softmax: where each of K keypoints is, and from it F features."""
+    """A ResNet with group normalisation and a spatial softmax: finds K keypoints and turns them into F features."""
 
     config: PolicyConfig
 
@@ -142,7 +142,7 @@ class Vision(nn.Module):
 
 
 def spatial_softmax(maps: Float[Array, "B h w K"]) -> Float[Array, "B 2K"]:
-    """Returns the expected place of each map's mass, x then y, from -1 to 1 across the map."""
+    """Returns the expected place under each map's softmax, all x before all y, from -1 to 1 across the map."""
     height, width = maps.shape[1:3]
     mass = jax.nn.softmax(maps.reshape(len(maps), -1, maps.shape[-1]), axis=1).reshape(maps.shape)
     x = jnp.einsum("bhwk,w->bk", mass, jnp.linspace(-1, 1, width))
@@ -165,7 +165,7 @@ class PolicyNet(nn.Module):
         return self.unet(controls, step, self.see(frames))
 
     def see(self, frames: Float[Array, "B O S S 3"]) -> Float[Array, "B F"]:
-        """Returns the features of the observed frames, one after the other."""
+        """Returns the features of the observed frames, concatenated."""
         features = self.vision(frames.reshape(-1, *frames.shape[2:]))
         return features.reshape(len(frames), -1)
 

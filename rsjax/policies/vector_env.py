@@ -13,14 +13,14 @@ from rsjax.policies.simulator import Observation
 
 
 class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """``num_envs`` environments like :class:`rsjax.policies.env.WorldModelEnv`, of which one program steps all.
+    """``num_envs`` environments like :class:`rsjax.policies.env.WorldModelEnv`, all stepped by one compiled program.
 
-    An episode that ended begins anew in the next step, whose action it ignores (Gymnasium's NEXT_STEP mode). Facts in
-    ``info`` are arrays over the environments.
+    An environment whose episode ended restarts in the next step and ignores that step's action (Gymnasium's NEXT_STEP
+    mode). The values in ``info`` are arrays over the environments.
 
     Args:
         run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
-        num_envs: their number.
+        num_envs: the number of environments.
         settings: fields of :class:`rsjax.policies.episodes.Settings`.
 
     Raises:
@@ -42,9 +42,9 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins all episodes; arguments as for one environment, and environment i takes the seed + i.
+        """Begins all episodes, with arguments as for one environment; environment i takes the seed + i.
 
-        With a list of seeds, each takes its own. Options hold for all.
+        From a list of seeds, each environment takes its own. The options apply to all.
         """
         if seed is not None or not self._rng:
             seeds = (
@@ -56,14 +56,14 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return seen, _marked(self._episodes.info(self._episodes.verdict()))
 
     def step(self, actions: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Generates the next frame of every episode; those that ended begin anew instead.
+        """Generates the next frame of every episode; episodes that ended restart instead.
 
         Args:
             actions: (num_envs, A), in the recording's units.
 
         Raises:
-            ActionError: they have another shape, or in an episode that goes on a value that is not finite or is refused
-                as out of range.
+            ActionError: the actions have the wrong shape, or an episode that does not restart has a value that is not
+                finite or is refused as out of range.
         """
         if not self._rng:
             raise gymnasium.error.ResetNeeded("reset the environments before their first step")
@@ -82,5 +82,5 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
 
 def _marked(info: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Adds Gymnasium's masks of the environments that have a fact: all."""
+    """Adds Gymnasium's masks, which say that every environment has each value."""
     return info | {f"_{name}": np.ones(len(values), bool) for name, values in info.items()}

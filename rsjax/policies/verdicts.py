@@ -1,4 +1,4 @@
-"""The interface of judges, which say from pictures whether a task is done.
+"""The interface of judges, which decide from frames whether a task is done.
 
 Axes: B videos, T frames, H×W pixels.
 """
@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 LABELS = ("success", "fail", "uninterpretable")
 SUCCESS, FAIL, UNINTERPRETABLE = range(3)
-HISTORY = 4  # frames that judges of this package look at; fewer are completed by repeating the first one
+HISTORY = 4  # frames that this package's judges look at; shorter videos are padded by repeating the first frame
 
 
 class Judge(Protocol):
@@ -22,6 +22,6 @@ class Judge(Protocol):
 
 
 def last_frames(frames: UInt8[np.ndarray, "B T H W 3"]) -> UInt8[np.ndarray, "B 4 H W 3"]:
-    """Returns the last ``HISTORY`` frames of videos, completed by repeating the first one."""
+    """Returns the last ``HISTORY`` frames of videos, padded by repeating the first frame."""
     missing = max(0, HISTORY - frames.shape[1])
     return np.concatenate([np.repeat(frames[:, :1], missing, axis=1), frames[:, -HISTORY:]], axis=1)
