@@ -1,7 +1,7 @@
 """Maps the names of ``diffusers``' CogVideoX: AutoencoderKLCogVideoX and CogVideoXTransformer3DModel.
 
-The ``config.json`` that is published beside the weights has what they do not reveal: the factor of the latents, and how
-positions are encoded. The weights of a large transformer are in several files, of which the first is named.
+The ``config.json`` that is published beside the weights contains what they do not reveal: the scaling factor of the
+latents, and how positions are encoded. The weights of a large transformer are in several files; name any one of them.
 """
 
 import math
@@ -33,11 +33,11 @@ from rsjax.trainable import Params
 
 CONFIG = "config.json"
 CLASSES = {"tokenizer": "AutoencoderKLCogVideoX", "world_model": "CogVideoXTransformer3DModel"}
-FACTOR = 0.7  # of the latents of 5B-I2V; 1.15258426 of 2B's
+FACTOR = 0.7  # scaling factor of 5B-I2V's latents; 2B's is 1.15258426
 WIDTH_2B = 1920
-ASIDE = re.compile(r"patch_embed\.pos_embedding")  # of a network with fixed positions, which are computed
+ASIDE = re.compile(r"patch_embed\.pos_embedding")  # stored by networks with fixed positions, which are computed here
 
-# Parts of the autoencoder's paths, and of public names.
+# Parts of the autoencoder's paths, and the public names for them.
 _PARTS = (
     (r"(down|up)_(\d+)_block_(\d+)", r"\1_blocks.\2.resnets.\3"),
     (r"(down|up)_(\d+)_(down|up)sample", r"\1_blocks.\2.\3samplers.0"),
@@ -49,7 +49,7 @@ _LAYOUTS: dict[int, Layout] = {2: "linear3d", 4: "conv", 5: "conv3d"}
 
 
 def autoencoder_table(of: Params) -> Table:
-    """Returns an entry for each parameter of encoder and decoder, whose shapes are ``of``."""
+    """Returns an entry for each parameter of encoder and decoder; ``of`` gives the parameters' shapes."""
     entries = []
     for path, x in flatten_dict(of, sep="/").items():
         key = path.replace("/", ".")
@@ -87,10 +87,10 @@ def transformer_table(config: CogVideoXConfig) -> Table:
 
 
 def is_autoencoder(source: object, tensors: Tensors) -> bool:
-    """Returns whether tensors are an autoencoder's and not a transformer's.
+    """Returns whether the tensors are an autoencoder's, not a transformer's.
 
     Raises:
-        ConvertError: they are neither's, or those of CogVideoX 1.5.
+        ConvertError: they belong to neither, or to CogVideoX 1.5.
     """
     if "decoder.mid_block.resnets.0.norm1.conv_y.conv.weight" in tensors:
         return True
@@ -113,11 +113,11 @@ def autoencoder_from_public(
     """Returns an autoencoder's settings and parameters.
 
     Args:
-        settings: of the file, from ``published_settings``; without them the latents' factor is 5B-I2V's.
-        names: of the tensors in the file, for errors, where they differ.
+        settings: the file's settings, from ``published_settings``; without them the latents' factor is 5B-I2V's.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
-        ConvertError: tensors are missing, unexpected, of another shape or no finite floats; or the settings do not fit.
+        ConvertError: tensors are missing, unexpected, of the wrong shape or not finite; or the settings do not fit.
     """
     factor = settings.get("scaling_factor", FACTOR)
     if type(factor) not in (int, float) or not math.isfinite(factor) or factor <= 0:
@@ -149,10 +149,10 @@ def autoencoder_from_public(
 def transformer_from_public(
     source: object, tensors: Tensors, settings: dict[str, Any], names: Names = SAME_NAMES
 ) -> tuple[CogVideoXConfig, Params, int]:
-    """Returns a transformer's settings and parameters, and how many tensors were left aside: fixed positions.
+    """Returns a transformer's settings and parameters, and how many tensors (fixed positions) were left aside.
 
-    Arguments and errors are those of :func:`autoencoder_from_public`. Without settings the network is 2B's or 5B's by
-    its width, and learned positions are for 480×720 pixels.
+    Arguments and errors are those of :func:`autoencoder_from_public`. Without settings, the width decides whether the
+    network is 2B's or 5B's, and learned positions are taken to be for 480×720 pixels.
     """
     config = infer_transformer(source, tensors, settings, names)
     used = {name: x for name, x in tensors.items() if config.learned_positions or not ASIDE.search(name)}
@@ -196,7 +196,7 @@ def infer_transformer(
             learned_positions=learned,
             autoencoder=CausalVAEConfig(latent_channels=channels),
         )
-        # Public networks have no learned tokens; their texts are in a file.
+        # Public networks have no learned tokens; their text embeddings are in a file.
         return replace(config, text=replace(config.text, file="text.safetensors", tokens=tokens, width=text))
     except (ConfigError, TypeError) as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error

@@ -1,4 +1,4 @@
-"""Converts CogVideoX and makes files of text embeddings, for ``python -m rsjax.convert``. Functions return lines."""
+"""Converts CogVideoX and embeds texts, for ``python -m rsjax.convert``. Each command returns lines to print."""
 
 import importlib
 import re
@@ -44,8 +44,8 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     """Imports a public autoencoder or transformer into a directory, or exports a directory's to a safetensors file.
 
     Args:
-        source: of a network in several files, such as ``…-00001-of-00003.safetensors``, any one.
-        part: to export; None: the only one.
+        source: the file or directory; if a network has several files (``…-00001-of-00003.safetensors``), any of them.
+        part: the part to export; None: the only one.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
@@ -79,7 +79,7 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
 
 
 def _read(source: Path) -> TensorFile:
-    """Returns the content of a file, or of all files of a network of which it is one."""
+    """Returns the content of a file, or of all files of a network if the file is one of several."""
     if not (match := _SHARD.fullmatch(source.name)):
         return read_tensors(source)
     numbers = range(1, int(match[3]) + 1)
@@ -115,13 +115,15 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
 
 
 def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | None, tokens: int = TOKENS) -> list[str]:
-    """Embeds the empty text and tasks with a T5 encoder from a local directory; padding is not masked, as in public.
+    """Embeds the empty text and tasks with a T5 encoder from a local directory.
+
+    Padding is not masked, as in the public code.
 
     Args:
         source: a directory with ``text_encoder`` (safetensors) and ``tokenizer``, as the public models have.
         tasks: in words.
         store: a store of clips whose tasks are embedded too.
-        tokens: of each text, which is padded or cut.
+        tokens: length to which each text is padded or cut.
 
     Raises:
         UserError: the directory holds no such encoder, ``transformers`` is not installed, or there are no tasks.
@@ -143,7 +145,7 @@ def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | Non
     try:
         tokenizer = transformers.AutoTokenizer.from_pretrained(source / "tokenizer", **local)
         encoder = transformers.T5EncoderModel.from_pretrained(source / "text_encoder", use_safetensors=True, **local)
-    except Exception as error:  # transformers raises many types, for missing and damaged files
+    except Exception as error:  # transformers raises many types for missing and damaged files
         raise ConvertError(f"{source}: holds no T5 encoder with its tokenizer ({first_line(error)})") from error
     made, fixed = [], {"padding": "max_length", "max_length": tokens, "truncation": True, "return_tensors": "pt"}
     with torch.no_grad():

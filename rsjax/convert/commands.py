@@ -34,7 +34,7 @@ def convert_tokenizer(source: Path, out: Path, weights: tokenizer.Weights) -> li
 
 
 def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
-    """Imports a public Genie into a directory, or exports a directory's model to a safetensors file.
+    """Imports a public Genie into a directory, or exports a directory's world model to a safetensors file.
 
     Raises:
         UserError: as :func:`convert_tokenizer`.
@@ -62,7 +62,7 @@ def convert_genie(source: Path, out: Path, heads: int | None) -> list[str]:
 
 
 def convert_lpips(sources: list[Path], out: Path) -> list[str]:
-    """Converts LPIPS's backbone and heads, from one public file or two, to one file.
+    """Converts LPIPS's backbone and heads from one or two public files to one file.
 
     Raises:
         UserError: as :func:`convert_tokenizer`.
@@ -85,7 +85,7 @@ def convert_lpips(sources: list[Path], out: Path) -> list[str]:
 
 
 def check_file(out: Path) -> str:
-    """Checks the name of the file to write; returns what to add to the message about it."""
+    """Checks the name of the file to write; returns a note for the message if the file replaces another one."""
     if out.suffix != SAFE:
         raise ConvertError(f"{out}: the output is a {SAFE} file; name OUT accordingly")
     return REPLACES * out.exists()

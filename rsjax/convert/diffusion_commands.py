@@ -18,7 +18,7 @@ def convert_irasim(source: Path, out: Path, weights: Literal["ema", "raw"], head
     """Imports a public IRASim into a directory, or exports a directory's transformer to a safetensors file.
 
     Args:
-        weights: which of the two networks in a public training checkpoint.
+        weights: which of the two networks in a public training checkpoint to import.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.

@@ -1,6 +1,6 @@
-"""Directories of converted checkpoints, laid out as run directories: ``config.json``, and weights beside it.
+"""Directories of converted checkpoints, laid out like run directories: ``config.json`` and the weights.
 
-A directory holds a tokenizer, a world model or both; training starts from it (``start_from``), as from a run.
+A directory holds a tokenizer, a world model or both; training can start from it (``start_from``), as from a run.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ from rsjax.training.checkpoint import load_weights, save_weights
 M = TypeVar("M", bound=ModelConfig)
 Part = Literal["tokenizer", "world_model"]
 
-SECTIONS: dict[type, tuple[str, str]] = {  # section of config.json, and directory of the weights
+SECTIONS: dict[type, tuple[str, str]] = {  # configuration → (section of config.json, directory of the weights)
     TokenizerConfig: ("tokenizer", "tokenizer/weights"),
     Architecture: ("architecture", "world_model/weights"),
     KLConfig: (pretrained.AUTOENCODER, "tokenizer/weights"),
@@ -33,13 +33,13 @@ SECTIONS: dict[type, tuple[str, str]] = {  # section of config.json, and directo
 
 
 def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | dit.Architecture, params: Params) -> bool:
-    """Writes a tokenizer or a world model; the directory's other network is kept, the same one replaced.
+    """Writes a tokenizer or a world model, replacing one that is there; the directory's other network is kept.
 
     Returns:
-        Whether there was one, which it replaced.
+        Whether it replaced one.
 
     Raises:
-        ConvertError: the directory is a run's, whose weights were trained there.
+        ConvertError: the directory is a run's, so its weights were trained there.
         FileError: the disk is full.
     """
     (section, place), path = SECTIONS[type(config)], directory / "config.json"
@@ -48,7 +48,7 @@ def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | di
         raise ConvertError(f"{directory}: is a run directory; choose another one")
     with disk_guard(directory):
         (directory / place).parent.mkdir(parents=True, exist_ok=True)
-        # Stopped in between, there is no such network rather than one's settings beside another's weights.
+        # Settings are removed first: if stopped in between, none are left beside another network's weights.
         old = [settings.pop(name, None) for name, there in SECTIONS.values() if there == place]
         if replaces := any(old):
             write_json(path, settings)
@@ -58,11 +58,11 @@ def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | di
 
 
 def save_part(directory: Path, part: Part, model: ModelConfig, inputs: Inputs, params: Params) -> bool:
-    """Writes the autoencoder or the world model of a family with both; the directory's other part is kept.
+    """Writes the autoencoder or the world model of a family that has both; the directory's other part is kept.
 
     Args:
-        model: the family's settings, those of the other part in the directory among them (:func:`saved_part`).
-        inputs: what the networks were made for.
+        model: the family's settings, including those of the other part in the directory (:func:`saved_part`).
+        inputs: image size and action dimension that the networks take.
 
     Returns:
         Whether the directory had such a part, which it replaced.
@@ -79,14 +79,14 @@ def save_part(directory: Path, part: Part, model: ModelConfig, inputs: Inputs, p
         place = directory / part / "weights"
         place.parent.mkdir(parents=True, exist_ok=True)
         if replaces := place.exists():
-            path.unlink(missing_ok=True)  # stopped in between, no settings are beside another network's weights
+            path.unlink(missing_ok=True)  # if stopped in between, no settings are left beside another network's weights
         save_weights(place, params)
         write_json(path, {"model": to_dict(model), "inputs": inputs._asdict()})
     return replaces
 
 
 def saved_part(directory: Path, kind: type[M], part: Part) -> tuple[M, Inputs] | None:
-    """Returns settings and inputs of a part that :func:`save_part` wrote or a run trained; None if there is none.
+    """Returns settings and inputs of a part that :func:`save_part` wrote or a run trained; None if there is no part.
 
     Raises:
         UserError: the settings are damaged, or of another family.
@@ -97,7 +97,7 @@ def saved_part(directory: Path, kind: type[M], part: Part) -> tuple[M, Inputs] |
 
 
 def load_tokenizer(directory: Path) -> tuple[TokenizerConfig, Params]:
-    """Reads the tokenizer of a converted or a run directory.
+    """Reads the tokenizer of a converted directory or a run directory.
 
     Raises:
         UserError: there is none, or it is damaged.

@@ -16,11 +16,11 @@ from rsjax.files import placeholder, read_json, write_file
 Tensors = dict[str, np.ndarray]
 
 SAFE = ".safetensors"
-PICKLED = (".ckpt", ".pt", ".pth", ".bin")  # PyTorch's own; a pickle inside
+PICKLED = (".ckpt", ".pt", ".pth", ".bin")  # PyTorch's own formats, which contain a pickle
 HOLDERS = ("state_dict", "model_state_dict", "model")  # keys under which training scripts save a network's tensors
-# What DistributedDataParallel and torch.compile add to names.
+# The prefixes that DistributedDataParallel and torch.compile add to names.
 _WRAPPED = re.compile(r"^module\.|(?<![^.])_orig_mod\.")
-# Types that training scripts save beside tensors. A placeholder is made for each, so that nothing of them is called.
+# Types that training scripts save beside tensors. Each is replaced by a placeholder, so that none of their code runs.
 _HARMLESS = (
     "argparse.Namespace",
     "typing.Any",
@@ -32,7 +32,7 @@ _HARMLESS = (
     *(f"numpy.dtypes.{name}DType" for name in ("Bool", "Int32", "Int64", "Float16", "Float32", "Float64")),
     *(f"omegaconf.{name}" for name in ("dictconfig.DictConfig", "listconfig.ListConfig", "nodes.AnyNode")),
     *(f"omegaconf.base.{name}" for name in ("ContainerMetadata", "Metadata")),
-    # Types that OmegaConf's metadata name; plain dicts and lists have opcodes of their own and are read as such.
+    # Types that OmegaConf's metadata name; plain dicts and lists have their own pickle opcodes and are read as such.
     *(f"builtins.{name}" for name in ("dict", "int", "list")),
 )
 
@@ -46,10 +46,10 @@ class TensorFile(NamedTuple):
 
     Attributes:
         tensors: by name, without what DistributedDataParallel (``module.``) and torch.compile (``_orig_mod.``) add.
-        metadata: of a safetensors file; empty for PyTorch's.
-        names: each tensor's name in the file, by the name in ``tensors``.
-        others: how many more tensors the file has, by the keys under which they lie; empty for a safetensors file.
-        key: under which the tensors lie; empty if under none.
+        metadata: the metadata of a safetensors file; empty for PyTorch's formats.
+        names: each tensor's name in the file, by its name in ``tensors``.
+        others: how many more tensors the file has, by the key that holds them; empty for a safetensors file.
+        key: the key that holds the tensors; empty if none does.
     """
 
     tensors: Tensors
@@ -63,12 +63,12 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
     """Reads the tensors of a file.
 
     Args:
-        path: a ``.safetensors`` file, or one of PyTorch's; also with a network under one of ``holders``.
+        path: a ``.safetensors`` file or one of PyTorch's, in which a key of ``holders`` may hold the network.
         holders: keys under which to look for the network's tensors, in this order.
 
     Raises:
-        ConvertError: the file does not exist, is of another kind, is damaged, or holds what could run code; a tensor's
-            type is unknown to numpy; or PyTorch is not installed.
+        ConvertError: the file does not exist, is of another kind, is damaged, or contains objects that could run code;
+            numpy lacks a tensor's type; or PyTorch is needed and not installed.
     """
     if not path.is_file():
         what = "is a directory; name a file in it" if path.is_dir() else "is a pipe or device; name a file"
@@ -102,7 +102,7 @@ def left_aside(*groups: Mapping[str, int]) -> list[str]:
 
 def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> None:
     """Writes a safetensors file atomically. Errors as in :func:`rsjax.files.write_file`."""
-    # safetensors writes memory in its order, ignoring strides.
+    # safetensors writes memory as it lies and ignores strides.
     contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
     write_file(path, safetensors.numpy.save(contiguous, metadata))
 
@@ -111,7 +111,7 @@ def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
     tensors: Tensors = {}
     try:
         with safetensors.safe_open(path, "np") as file:
-            for name in file.keys():  # noqa: SIM118 - it is no dict
+            for name in file.keys():  # noqa: SIM118 - it is not a dict
                 try:
                     tensors[name] = file.get_tensor(name)
                 except (AttributeError, TypeError) as error:  # numpy has no such type
@@ -122,7 +122,7 @@ def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
 
 
 class _Placeholder:
-    """Stands for an object that is no tensor; made instead of it, whatever the file says."""
+    """Stands for an object that is not a tensor; built in its place, whatever the file says."""
 
     def __init__(self, *_: object, **__: object) -> None: ...
 
@@ -130,7 +130,7 @@ class _Placeholder:
 
 
 def _without_default(*_: object) -> dict[Any, Any]:
-    """Stands for collections.defaultdict, whose factory is dropped and never called."""
+    """Stands for collections.defaultdict; drops its factory without calling it."""
     return {}
 
 
@@ -158,13 +158,13 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
 
 
 def _unpickled(path: Path, torch: Any) -> Any:
-    """Loads a file of PyTorch's with ``weights_only``, so tensors and plain values alone, and placeholders."""
+    """Loads a PyTorch file with ``weights_only``: tensors, plain values, and placeholders for other objects."""
     stand_ins = [(_Placeholder, name) for name in _HARMLESS] + [(_without_default, "collections.defaultdict")]
     try:
         with torch.serialization.safe_globals(stand_ins):
             return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many types for damage and for content that it refuses
-        # Its messages advise to load the file without this protection, so they are not shown.
+        # torch's messages advise loading the file without this protection, so they are not shown.
         unknown = re.search(r"GLOBAL (\S+)", str(error))
         why = (
             f"it holds {unknown[1]:.80}, which could run code when loaded" if unknown else "it is damaged or no weights"
@@ -173,7 +173,7 @@ def _unpickled(path: Path, torch: Any) -> Any:
 
 
 def _tensors(state: Any, torch: Any) -> dict[str, Any]:
-    """Returns the tensors of a state dict; the rest, such as counters, is left out."""
+    """Returns the tensors of a state dict; other values, such as counters, are left out."""
     items = state.items() if isinstance(state, dict) else ()
     return {name: x for name, x in items if isinstance(name, str) and isinstance(x, torch.Tensor)}
 
@@ -189,7 +189,7 @@ def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
         x = tensor.detach()  # parameters that require a gradient refuse numpy()
         # numpy has no bfloat16; float32 represents each of its numbers.
         return (x.float() if x.dtype == torch.bfloat16 else x).numpy()
-    except Exception as error:  # sparse, quantized or on no device: torch raises several types
+    except Exception as error:  # torch raises several types for tensors that are sparse, quantized or on no device
         raise _unreadable(path, name, str(tensor.dtype).removeprefix("torch.")) from error
 
 
@@ -201,10 +201,10 @@ def published_settings(weights: Path, *classes: str) -> dict[str, Any]:
     """Reads the settings beside a file of weights in diffusers' layout; returns an empty dict if there are none.
 
     Args:
-        classes: names of the networks that they may describe.
+        classes: names of the networks that the settings may describe.
 
     Raises:
-        UserError: the file is damaged or of another network.
+        UserError: the file is damaged or describes another network.
     """
     path = weights.parent / "config.json"
     if not path.exists():

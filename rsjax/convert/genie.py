@@ -81,7 +81,7 @@ def infer_config(
     Args:
         settings: a GenieConfig's fields; those about training are ignored.
         heads: overrides num_heads of the settings.
-        names: of the tensors in the file, for errors, where they differ.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
         ConvertError: the tensors are not a Genie's, contradict the settings, or leave the number of heads unknown; or
@@ -137,7 +137,7 @@ def infer_config(
 
 
 def _check_types(path: Path, settings: dict[str, Any]) -> None:
-    """Raises :class:`ConvertError` unless each known field is null or of its type; a whole number is a float, too."""
+    """Raises :class:`ConvertError` unless each known field is null or of its type; integers count as floats, too."""
     for name, example in settings_of(Architecture()).items():
         value = settings.get(name)
         kinds = (int, float) if type(example) is float else (type(example),)
@@ -147,7 +147,7 @@ def _check_types(path: Path, settings: dict[str, Any]) -> None:
 
 
 def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, Any]) -> None:
-    # Older configurations leave factored_vocab_size out or null: it follows from the others.
+    # Older configurations omit factored_vocab_size or set it to null: it follows from the other fields.
     written = {name: value for name, value in settings.items() if value is not None}
     for name, only in FIXED.items():
         if written.get(name, only) != only:

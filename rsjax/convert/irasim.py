@@ -1,7 +1,7 @@
 """Maps the names of the public IRASim checkpoints to the transformer's parameters.
 
-The weights' shapes do not reveal the number of heads, nor the grid of a frame's tokens, which the parameters do not
-depend on. The file's fixed positions are left aside: the network computes its own.
+The weights' shapes reveal neither the number of heads nor the token grid of a frame; the parameters do not depend on
+the grid. The file's fixed positions are left aside: the network computes its own.
 """
 
 import math
@@ -16,11 +16,11 @@ from rsjax.models.irasim.dit import Architecture, DiT
 from rsjax.trainable import Params
 
 FIXED = ("pos_embed", "temp_embed")
-HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # of the public sizes, by width
+HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # attention heads of the public sizes, by width
 
 
 def table(config: Architecture) -> Table:
-    """Returns an entry for each public tensor of the network, positions left out."""
+    """Returns an entry for each public tensor of the network except the positions."""
     linear = config.action_activation == "none"
     first, second = ("embed_arm_state", "embed_state") if linear else ("embed_state.fc1", "embed_state.fc2")
     entries: list[Entry] = [
@@ -45,8 +45,8 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
     """Infers the network from the names and shapes of its tensors.
 
     Args:
-        heads: attention heads, if the width is none of the public sizes.
-        names: of the tensors in the file, for errors, where they differ.
+        heads: attention heads, needed if the width is none of the public sizes'.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
         ConvertError: the tensors are not an IRASim's, or leave the number of heads unknown.
@@ -61,7 +61,7 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
     (_, cells, _), (_, frames, _) = shape("pos_embed", 3), shape("temp_embed", 3)
     linear = "embed_arm_state.weight" in tensors
     inputs = shape("embed_arm_state.weight" if linear else "embed_state.fc1.weight", 2)[1]
-    # Frame-Ada reads one action at a time, Video-Ada the frames - 1 actions of a clip.
+    # Frame-Ada reads one action at a time; Video-Ada reads all (frames - 1) actions of a clip.
     video = inputs % (frames - 1) == 0 and inputs > frames - 1 if frames > 2 else False
     heads = heads or HEADS.get(width)
     if heads is None:
@@ -96,11 +96,11 @@ def from_public(
     """Returns a model's architecture, its parameters and how many tensors were left aside.
 
     Args:
-        own: the architecture, if the file was exported here and says so.
+        own: the architecture, if the file was exported by this project and states it.
         heads, names: as for :func:`infer_config`, whose errors it raises.
 
     Raises:
-        ConvertError: also if tensors are missing, unexpected, of another shape or no finite floats.
+        ConvertError: in addition, if tensors are missing, unexpected, of the wrong shape or not finite.
     """
     config = own or infer_config(source, tensors, heads, names)
     used = {name: x for name, x in tensors.items() if name not in FIXED}
@@ -109,6 +109,6 @@ def from_public(
 
 
 def to_public(config: Architecture, params: Params) -> Tensors:
-    """Returns the tensors of a public file, the fixed positions among them."""
+    """Returns the tensors of a public file, including the fixed positions."""
     space, time = grid_positions(*config.grid, config.width), positions(config.frames, config.width)
     return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, table(config))

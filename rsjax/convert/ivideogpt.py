@@ -1,7 +1,7 @@
 """Maps the names of the public iVideoGPT checkpoints: the conditional VQ tokenizer, and the LLaMA with its actions.
 
-The weights' shapes do not reveal the attention heads nor the groups of norms: 4 and 32 in the public tokenizers, heads
-of 64 channels in the public transformers.
+The weights' shapes reveal neither the number of attention heads nor that of the norms' groups. The public tokenizers
+have 4 heads and 32 groups; the public transformers have heads of 64 channels.
 """
 
 import json
@@ -38,12 +38,12 @@ from rsjax.tokenizers.conditional_vq import ConditionalVQ
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights
 
-METADATA = "rsjax.ivideogpt"  # key of settings and inputs in the metadata of an exported file
+METADATA = "rsjax.ivideogpt"  # metadata key under which an exported file keeps settings and inputs
 PARTS: tuple[Part, ...] = ("tokenizer", "world_model")
-# Tensors of public transformers that have no place here: heads for rewards and actions, and fixed rotations.
+# Tensors of public transformers that this project does not use: heads for rewards and actions, and fixed rotations.
 ASIDE = re.compile(r"^(reward_linear|action_recon_linear)|rotary_emb\.inv_freq$")
 
-# Parts of the tokenizer's paths that autoencoders of ``diffusers`` do not have, and their public names.
+# Parts of the tokenizer's paths that autoencoders of ``diffusers`` lack, and their public names.
 _PARTS = (
     (r"cross_(\d+)", r"cross_att_blocks.\1"),
     (r"in_proj_kernel$", "att.in_proj_weight"),
@@ -67,7 +67,7 @@ def infer_tokenizer(source: object, tensors: Tensors, names: Names = SAME_NAMES)
     """Infers the tokenizer's settings and the side of its images from the names and shapes of its tensors.
 
     Raises:
-        ConvertError: the tensors are not of such a tokenizer, or of one that this project cannot build.
+        ConvertError: the tensors are not such a tokenizer's, or belong to one that this project cannot build.
     """
 
     def shape(key: str, axes: int) -> tuple[int, ...]:
@@ -110,10 +110,10 @@ def tokenizer_from_public(
     """Returns the tokenizer's settings, the side of its images and its parameters.
 
     Args:
-        own: settings and side, if the file was exported here and says so; None infers them.
+        own: settings and side, if the file was exported by this project and states them; None infers them.
 
     Raises:
-        ConvertError: tensors are missing, unexpected, of another shape or no finite floats, or not a tokenizer's.
+        ConvertError: tensors are missing, unexpected, of the wrong shape, not finite, or not a tokenizer's.
     """
     config, size = own or infer_tokenizer(source, tensors, names)
     shapes = tokenizer_shapes(config, size)
@@ -131,8 +131,8 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     """Imports a public tokenizer or transformer into a directory, or exports a directory's to a safetensors file.
 
     Args:
-        heads: of the transformer, see :func:`infer_llama`.
-        part: to export; None: the only one.
+        heads: attention heads of the transformer, see :func:`infer_llama`.
+        part: the part to export; None: the only one.
 
     Raises:
         UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
@@ -191,9 +191,9 @@ def _exported(source: Path, metadata: dict[str, str]) -> tuple[IVideoGPTConfig, 
 
 
 def _llama_shapes(model: IVideoGPTConfig, actions: int) -> Params:
-    """Returns the shapes of the transformer's parameters; ``actions`` are the numbers of one, perhaps not read."""
+    """Returns the shapes of the transformer's parameters; ``actions`` is the size of an action, even if unused."""
     inputs = actions * (1 + model.integrate_actions) * model.use_actions
-    layout = Layout(model.autoencoder.codes, 1, 1, 1, model.positions)  # parameters depend on its vocabulary alone
+    layout = Layout(model.autoencoder.codes, 1, 1, 1, model.positions)  # the parameters depend only on its vocabulary
     return jax.eval_shape(LLaMA(Architecture(model, layout, inputs)).init_params, jax.random.key(0))
 
 
@@ -207,7 +207,7 @@ def _check_codes(directory: Path, there: IVideoGPTConfig | None, model: IVideoGP
 
 
 def llama_table(config: IVideoGPTConfig) -> Table:
-    """Returns an entry for each parameter of the LLaMA; with actions the public names are under ``llm``."""
+    """Returns an entry for each parameter of the LLaMA; with actions the public names begin with ``llm``."""
     under = "llm." if config.use_actions else ""
     entries: list[Entry] = [
         Entry(f"{under}model.embed_tokens.weight", "embed_tokens/embedding"),
@@ -230,14 +230,14 @@ def llama_table(config: IVideoGPTConfig) -> Table:
 def infer_llama(
     source: object, tensors: Tensors, heads: int | None = None, names: Names = SAME_NAMES
 ) -> tuple[IVideoGPTConfig, int]:
-    """Infers the LLaMA's settings and the numbers of an action (0 without actions) from the shapes of its tensors.
+    """Infers the LLaMA's settings and the size of an action (0 without actions) from the shapes of its tensors.
 
     Args:
-        heads: attention heads; None: so many that one has 64 channels, as in the public models.
-        names: of the tensors in the file, for errors, where they differ.
+        heads: attention heads; None: heads of 64 channels each, as in the public models.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
-        ConvertError: the tensors are not of such a LLaMA, or of one that this project cannot build.
+        ConvertError: the tensors are not such a LLaMA's, or belong to one that this project cannot build.
     """
     use_actions = "action_linear.weight" in tensors
     under = "llm." if use_actions else ""

@@ -1,7 +1,7 @@
 """Maps the names of ``diffusers``' AutoencoderKL, such as SDXL's, to the parameters of IRASim's autoencoder.
 
-The ``config.json`` that is published beside the weights has the factor of the latents, which the weights do not reveal:
-older autoencoders of the same shapes have another one.
+The ``config.json`` that is published beside the weights contains the scaling factor of the latents. The weights do not
+reveal this factor: older autoencoders of the same shapes have another one.
 """
 
 import math
@@ -20,7 +20,7 @@ from rsjax.trainable import Params
 
 CONFIG = "config.json"
 CLASS = "AutoencoderKL"
-# Names of attention's layers in older files.
+# The names of the attention layers in older files.
 OLDER = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 _OLDER = re.compile(rf"(mid_block\.attentions\.0\.)({'|'.join(OLDER)})\.")
 
@@ -37,7 +37,7 @@ def table(config: KLConfig) -> Table:
 
 
 def _shapes(config: KLConfig) -> Params:
-    """Returns the shapes of the networks, without the latents' statistics."""
+    """Returns the shapes of the networks' parameters, without the latents' statistics."""
     shapes = jax.eval_shape(lambda key: init(config, key), jax.random.key(0))
     return {name: shapes[name] for name in ("encoder", "decoder")}
 
@@ -80,12 +80,12 @@ def from_public(
     """Returns an autoencoder's settings and parameters, converted from a public file's tensors.
 
     Args:
-        settings: of the file, from ``published_settings``; without them the latents' factor is SDXL's.
-        names: of the tensors in the file, for errors, where they differ.
+        settings: the file's settings, from ``published_settings``; without them the latents' factor is SDXL's.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
-        ConvertError: as :func:`infer_config`; or tensors are missing, unexpected, of another shape or no finite floats;
-            or the settings are no numbers.
+        ConvertError: as :func:`infer_config`; or tensors are missing, unexpected, of the wrong shape or not finite;
+            or the settings are not numbers.
     """
     own = {_renamed(name): name for name in tensors}
     tensors, names = (
@@ -105,7 +105,7 @@ def from_public(
 
 
 def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]]:
-    """Returns the tensors of a public file, and the settings beside it.
+    """Returns the tensors of a public file, and the settings to write beside it.
 
     Raises:
         ConvertError: the public format cannot express the network or its latents' statistics.
@@ -135,5 +135,5 @@ def _renamed(name: str) -> str:
 
 
 def _flat(name: str, x: np.ndarray) -> np.ndarray:
-    """Returns attention's weights as matrices; some files have them as 1×1 convolutions."""
+    """Returns attention weights as matrices; some files store them as 1×1 convolutions."""
     return x[..., 0, 0] if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1) else x

@@ -1,7 +1,7 @@
 """Converts public LPIPS weights to the one file that :func:`rsjax.tokenizers.lpips.load_lpips` reads.
 
-The backbone is torchvision's AlexNet or VGG16, the heads are PerceptualSimilarity's. They may come in a file each, in
-one state dict, or inside a tokenizer's training checkpoint.
+The backbone is torchvision's AlexNet or VGG16; the heads are PerceptualSimilarity's. They may be in two files, in one
+state dict, or inside a tokenizer's training checkpoint.
 """
 
 import re
@@ -26,12 +26,12 @@ def from_public(source: object, tensors: Tensors, names: Names = SAME_NAMES) -> 
     """Returns the network's name and its weights, named as in the project's file.
 
     Args:
-        source: the files of the tensors, for errors.
-        tensors: those of all files together.
-        names: of the tensors in the files, for errors, where they differ.
+        source: the files of the tensors, for error messages.
+        tensors: the tensors of all files together.
+        names: the tensors' names in the files, where they differ, for error messages.
 
     Raises:
-        ConvertError: the network is unknown; or tensors are missing, unexpected, of another shape or no finite floats.
+        ConvertError: the network is unknown; or tensors are missing, unexpected, of the wrong shape or not finite.
     """
     weights: Tensors = {}
     public: dict[str, str] = {}

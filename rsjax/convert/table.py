@@ -17,7 +17,7 @@ from rsjax.convert.files import ConvertError, Tensors
 
 Layout = Literal["same", "linear", "conv", "lead", "conv3d", "linear3d"]
 Shape = tuple[int, ...]
-Names = Mapping[str, str]  # a tensor's name in its file, by its name here
+Names = Mapping[str, str]  # a tensor's name in this project → its name in its file
 
 SAME_NAMES: Names = MappingProxyType({})
 
@@ -28,9 +28,9 @@ LAYOUTS: dict[Layout, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.nda
     "conv": (lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1)),  # OIHW ↔ HWIO
     "lead": (lambda x: x[0], lambda x: x[None]),  # torch keeps a leading axis of one
     "conv3d": (lambda x: x.transpose(2, 3, 4, 1, 0), lambda x: x.transpose(4, 3, 0, 1, 2)),  # OITHW ↔ THWIO
-    "linear3d": (lambda x: x[..., 0, 0, 0].T, lambda x: x.T[..., None, None, None]),  # a convolution of one cell
+    "linear3d": (lambda x: x[..., 0, 0, 0].T, lambda x: x.T[..., None, None, None]),  # a 1×1×1 convolution
 }
-NAMED = 8  # names of each kind in an error; the others are counted
+NAMED = 8  # names of each kind that an error lists; the others are only counted
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def public_shapes(table: Table, shapes: Any) -> dict[str, Shape]:
     """Returns the shape of every public tensor.
 
     Args:
-        shapes: the parameters, or their ``jax.eval_shape``.
+        shapes: the parameters, or their shapes from ``jax.eval_shape``.
 
     Raises:
         ConvertError: the network and the table do not have the same parameters.
@@ -78,10 +78,10 @@ def to_params(source: object, tensors: Tensors, table: Table, shapes: Any, names
     """Converts public tensors to float32 parameters.
 
     Args:
-        source: the file of the tensors, for errors.
+        source: the file of the tensors, for error messages.
         tensors: exactly those of the table, of any floating type.
         shapes: ``jax.eval_shape`` of the parameters.
-        names: of the tensors in the file, for errors, where they differ.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
         ConvertError: as :func:`check`.
@@ -112,7 +112,7 @@ def shape_of(source: object, tensors: Tensors, key: str, axes: int, names: Names
     """Returns the shape of a tensor from which a network is inferred.
 
     Raises:
-        ConvertError: there is no such tensor, or it has another number of axes, or no values.
+        ConvertError: there is no such tensor, or it has the wrong number of axes, or no values.
     """
     name = names.get(key, key)
     if key not in tensors:
@@ -127,11 +127,11 @@ def check(source: object, tensors: Tensors, expected: dict[str, Shape], names: N
     """Compares names and shapes of tensors, and checks that their values are finite floats.
 
     Args:
-        names: of the tensors in the file, for errors, where they differ.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Raises:
-        ConvertError: tensors are missing, unexpected, of another shape or type, or not finite in float32; the message
-            names them all.
+        ConvertError: tensors are missing, unexpected, of the wrong shape or type, or not finite in float32; one message
+            reports them all.
     """
     both = {key: (names.get(key, key), tensors[key], shape) for key, shape in expected.items() if key in tensors}
     misfits: dict[str, Collection[str]] = {

@@ -1,7 +1,7 @@
-"""Maps the names of Open-MAGVIT2's tokenizer, both generations, raw weights or their moving average.
+"""Maps the names of Open-MAGVIT2's tokenizer: both generations, raw weights or their moving average.
 
-A public file holds ``encoder.*`` and ``decoder.*``, their exponential moving average under ``model_ema.`` with the dots
-removed from the names, and the networks of the training losses.
+A public file holds ``encoder.*`` and ``decoder.*``, their exponential moving average under ``model_ema.`` (with the
+dots removed from the names), and the networks of the training losses.
 """
 
 from collections import Counter
@@ -74,8 +74,8 @@ def infer_config(source: object, tensors: Tensors, weights: Weights, names: Name
     """Infers the network from the names and shapes of its tensors.
 
     Raises:
-        ConvertError: the tensors are not a tokenizer's, include no moving average where ``weights`` is "ema", or are
-            of a network that this project cannot build.
+        ConvertError: the tensors are not a tokenizer's, lack the moving average although ``weights`` is "ema", or
+            belong to a network that this project cannot build.
     """
 
     def has(key: str) -> bool:
@@ -125,16 +125,16 @@ def from_public(
     """Converts a public file's tensors to a tokenizer.
 
     Args:
-        source: the file of the tensors, for errors.
-        weights: those of the last step, or their moving average.
+        source: the file of the tensors, for error messages.
+        weights: which weights to read: those of the last step ("raw"), or their moving average ("ema").
         config: the network; None infers it.
-        names: of the tensors in the file, for errors, where they differ.
+        names: the tensors' names in the file, where they differ, for error messages.
 
     Returns:
-        The configuration, the parameters, and how many tensors were left aside, by the first words of their names.
+        The configuration, the parameters, and how many tensors were left aside, by the prefixes of their names.
 
     Raises:
-        ConvertError: tensors are missing, unexpected, of another shape or no finite floats, or not a tokenizer's.
+        ConvertError: tensors are missing, unexpected, of the wrong shape, not finite, or not a tokenizer's.
     """
     config = config or infer_config(source, tensors, weights, names)
     entries = table(config)

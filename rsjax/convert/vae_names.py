@@ -24,8 +24,8 @@ def vae_table(shapes: Params, more: Sequence[tuple[str, str]] = ()) -> Table:
     """Returns an entry for each parameter.
 
     Args:
-        shapes: of the parameters.
-        more: further regular expressions for parts of paths, dotted, and what takes their place; they come first.
+        shapes: the parameters' shapes.
+        more: further (regular expression for a part of a dotted path, its replacement), which are applied first.
     """
     entries = []
     for path, x in flatten_dict(shapes, sep="/").items():
