@@ -1,4 +1,4 @@
-"""Depth that one network estimates from recorded and generated frames, so that models without depth have scores."""
+"""Estimates depth from recorded and generated frames by one network, so that models without depth have depth scores."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,14 +20,14 @@ _CAMERA = "rgb"
 
 
 def choose_estimator(settings: EvalConfig, load: bool = False) -> DepthEstimator | None:
-    """Returns the network that ``eval.depth_estimator`` names; None if it is empty.
+    """Returns the network that ``eval.depth_estimator`` names; None if the setting is empty.
 
     Args:
-        load: load it now, and not at its first call.
+        load: load the network now, not at its first call.
 
     Raises:
-        ConfigError: no such network or field, or a file that it names is missing.
-        AnnotationError: it cannot be loaded: a package or a device is missing, or a file is damaged.
+        ConfigError: there is no such network or field, or a file that the setting names is missing.
+        AnnotationError: the network cannot be loaded: a package or a device is missing, or a file is damaged.
     """
     if not settings.depth_estimator:
         return None
@@ -45,9 +45,9 @@ def choose_estimator(settings: EvalConfig, load: bool = False) -> DepthEstimator
 
 
 def by_content(settings: EvalConfig) -> str:
-    """Returns the network and all its fields, its files by a hash of their content; "" without one.
+    """Returns the network's name and all its fields, with a hash of content for each file; "" without a network.
 
-    Of a checkout, which may hold anything beside its code, only Python files count. Errors as in
+    In a checkout, which may contain other files than code, only Python files count. The errors are those of
     :func:`choose_estimator` and :func:`rsjax.files.content_hash`.
     """
     estimator = choose_estimator(settings)
@@ -67,8 +67,8 @@ def estimate_depth(
 ) -> dict[str, EstimatedDepth]:
     """Estimates the depth of recorded clips, and of each kind of video that was generated for them.
 
-    A network that gives 1/depth up to scale and shift gives them by its own habit, not by the video. So both videos of
-    a clip are stretched alike: to 1 at the recorded video's nearest point and 10 at its farthest.
+    Some networks estimate 1/depth only up to a scale and a shift, which are arbitrary. Their output for both videos of
+    a clip is therefore stretched by the same map: to 1 at the recorded video's nearest point and 10 at its farthest.
 
     Raises:
         AnnotationError: the network cannot run, or gives values that are not finite.
@@ -87,7 +87,7 @@ def estimate_depth(
 
 
 def _like(depth: DepthMaps, reference: DepthMaps) -> Float32[np.ndarray, "T H W"]:
-    """Returns the maps in metres, or relative and stretched as the reference is."""
+    """Returns the maps in metres, or relative depth stretched by the same map as the reference."""
     frames = range(len(depth.maps))
     if depth.unit == "metres":
         return depth.maps.read(frames)
@@ -100,7 +100,7 @@ def _episode(frames: UInt8[np.ndarray, "T H W 3"], clip: int) -> Episode:
         id=f"evaluation-{clip}",
         fingerprint="",
         task="",
-        fps=1.0,  # of no effect on depth
+        fps=1.0,  # has no effect on depth
         timestamps=np.arange(count, dtype=np.float64),
         actions=np.zeros((count, 0), np.float32),
         states=None,

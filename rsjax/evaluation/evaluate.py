@@ -1,4 +1,4 @@
-"""Evaluates a world model: generates from first frames of held-out clips and scores all registered metrics.
+"""Evaluates a world model: generates videos from the first frames of held-out clips and scores all registered metrics.
 
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
@@ -35,7 +35,7 @@ from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
-KEPT_CLIPS = 24  # whose frames are kept for comparisons, spread evenly over the scored ones; beside :func:`extremes`
+KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class Evaluation:
         metrics: scores by name.
         reasons: why a registered metric has no score, by name.
         shown: arrays of the clips in the report, with a leading axis over clips.
-        per_clip: the scored clips' own scores, by the names in ``metrics``, in the order of the split, without clips
-            that have no score; with several repetitions, their means.
+        per_clip: the score of each scored clip, by the names in ``metrics``, in the order of the split, without clips
+            that have no score; the mean over repetitions if there are several.
         curves: means over the clips at each predicted frame, as in curves.json.
         repetitions: the scores of each repetition.
         clips: the scored clips: ``number`` in the split, ``episode`` if known, ``sha256`` of frames and actions.
-        kept: frames of some of the clips: ``rows`` among the scored ones, ``truth``, ``prediction``, and
+        kept: frames of some of the scored clips: ``rows``, the rows of these clips; ``truth``, ``prediction``, and
             ``reconstruction`` by the tokenizer if the model has one, each (n, T, H, W, 3).
     """
 
@@ -66,10 +66,10 @@ class Evaluation:
 
 
 def check_files(settings: EvalConfig) -> None:
-    """Checks the files of weights that metrics need, so that a run does not train for hours first.
+    """Checks the weight files that metrics need, so that a run does not fail after hours of training.
 
     Raises:
-        UserError: one is missing, damaged or of another network.
+        UserError: a file is missing, damaged or of another network.
     """
     for path, net in ((settings.lpips_alex_weights, "alexnet"), (settings.lpips_vgg_weights, "vgg16")):
         if path:
@@ -85,9 +85,9 @@ class HeldOut:
 
     Attributes:
         protocol: with its horizon and resolution as numbers.
-        records: of the scored clips, whole.
-        clips: the same, cut to the protocol's frames.
-        second_takes: the same scenes recorded once more, cut likewise; None without.
+        records: the records of the scored clips, in full length.
+        clips: the same clips, cut to the protocol's frames.
+        second_takes: second recordings of the same scenes, cut in the same way; None if there are none.
     """
 
     store: Store
@@ -105,8 +105,9 @@ class HeldOut:
             shape: of the clips that the model learned from.
 
         Raises:
-            StoreError: there is no such split, it has fewer than two clips, or one is damaged.
-            UserError: the clips are shorter than the protocol, or of another size.
+            StoreError: there is no such split, it has fewer than two clips, a clip is damaged, or the size of its
+                frames or actions is not the model's.
+            UserError: the clips are shorter or smaller than the protocol needs.
         """
         source, where = store.source(split), f"the {split} split of {store.path}"
         numbers = spread(source, protocol.clips)
@@ -143,17 +144,17 @@ def evaluate(
     held_out: HeldOut | None = None,
     folder: Path | None = None,
 ) -> Evaluation:
-    """Scores a model on held-out clips, and two baselines: repeating the last prompt frame, and reconstruction.
+    """Scores a model and two baselines on held-out clips: the last prompt frame repeated, and the reconstruction.
 
     Args:
         store: the clips of the run; the train split determines the range of uniform random actions.
-        protocol: how; None: by the run's own configuration.
-        held_out: the clips to score; None: of the store's test split.
+        protocol: the protocol to evaluate by; None: that of the run's own configuration.
+        held_out: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
 
     Raises:
         StoreError: a test clip is damaged.
-        UserError: a file of weights is missing, damaged or of another network, or the depth estimator cannot run.
+        UserError: a weight file is missing, damaged or of another network, or the depth estimator cannot run.
     """
     settings = trained.config.eval
     check_files(settings)
@@ -200,7 +201,7 @@ def _repetitions(
 
 
 def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | None = None) -> Generation:
-    """Returns all that an evaluation generates; with several processes, each makes its share of it."""
+    """Returns the generation of all videos of an evaluation; several processes can each make a share of them."""
     trained = replace(trained, params=replicate(trained.params), assets=_assets(trained.assets))
     clips, protocol = held_out.clips, held_out.protocol
     truth = scored_frames(trained, protocol, clips) if protocol.samples > 1 else clips.video
@@ -220,7 +221,7 @@ def _assets(assets: Assets) -> Assets:
 
 
 def _draws(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dict[str, np.ndarray]:
-    """Returns the actions to generate under by kind, each (R, B, T, A)."""
+    """Returns, by kind, the actions under which videos are generated, each (R, B, T, A)."""
     if not draws:
         return {OWN: actions[None]}
     train = store.source("train")
@@ -235,10 +236,12 @@ def _draws(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dic
 
 
 def _kept(scenes: dict[str, Scene], still: PerClip) -> dict[str, np.ndarray]:
-    """Returns frames of the same clips for all models: some spread evenly, and those that move most and least.
+    """Returns the frames of some clips: clips spread evenly, and those with the most and the least motion.
+
+    The choice is the same for all models.
 
     Args:
-        still: PSNR of the first frame repeated, which no model decides.
+        still: PSNR of the last prompt frame repeated, which does not depend on the model.
     """
     truth = scenes[""].truth.rgb
     rows = np.union1d(spread(truth, KEPT_CLIPS), np.concatenate(extremes(still)))
@@ -265,6 +268,6 @@ def load(path: Path) -> Evaluation:
     except ValueError as error:
         raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
     metrics, reasons = record.pop("metrics"), record.pop("reasons")
-    # Files of earlier versions have neither of these two.
+    # Files of earlier versions have neither of the following two.
     per_clip, curves = record.pop("per_clip", {}), record.pop("curves", {})
     return Evaluation(metrics, reasons, record, per_clip, curves)

@@ -1,4 +1,4 @@
-"""Generates the videos of an evaluation in batches, on all devices, and keeps each batch, so that it can go on later.
+"""Generates the videos of an evaluation in batches, on all devices; each batch is kept, so that it can resume later.
 
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of actions.
 """
@@ -21,8 +21,8 @@ from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 
-OWN = "own"  # the kind of videos under the clips' own actions
-SAMPLE = "sample"  # the kind of further samples under them, of which only scores are kept
+OWN = "own"  # the kind of videos generated under the clips' own actions
+SAMPLE = "sample"  # the kind of further samples under the own actions, of which only the scores are kept
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,11 @@ class Batch:
     """Some clips under one draw of actions.
 
     Attributes:
-        kind: of the actions, :data:`OWN`, "other" or "uniform"; or :data:`SAMPLE`.
-        draw: which of the draws of actions, or which sample.
+        run: the repetition's number.
+        kind: the kind of actions, :data:`OWN`, "other" or "uniform"; or :data:`SAMPLE`.
+        draw: the number of the draw of actions, or of the sample.
         start: the first clip's row.
-        clips: how many; with other devices or settings there may be more or fewer.
+        clips: the number of clips; it can change with the devices and the settings.
     """
 
     run: int
@@ -44,21 +45,22 @@ class Batch:
 
     @property
     def name(self) -> str:
-        """Its file's."""
+        """The name of the batch's file."""
         return f"{self.run:03d}-{self.kind}-{self.draw:03d}-{self.start:06d}+{self.clips}.msgpack"
 
 
 @dataclass(frozen=True)
 class Generation:
-    """All that one evaluation generates.
+    """The videos that one evaluation generates.
 
     Attributes:
         trained: its parameters are on all devices that take part (:func:`rsjax.devices.replicate`).
         protocol: with its horizon as a number.
         clips: cut to the protocol's frames.
-        draws: the actions to generate under by kind, each (R, B, T, A).
-        split_size: clips of the whole split, which keeps the random draws of repetitions apart.
-        score: returns the scores of a sample's videos of these rows by name, each (rows,); of which the best count.
+        draws: by kind, the actions under which videos are generated, each (R, B, T, A).
+        split_size: the number of clips in the whole split, which keeps the random draws of repetitions apart.
+        score: takes rows and one sample's videos of these clips, and returns their scores by name, each (rows,). The
+            best score over the samples counts.
         folder: where batches are kept; None: in memory.
     """
 
@@ -71,7 +73,7 @@ class Generation:
     folder: Path | None = None
 
     def make(self, index: int = 0, count: int = 1) -> None:
-        """Generates the batches that are not there yet, or process ``index``'s share of them among ``count``."""
+        """Generates the batches that do not exist yet; with ``count`` processes, only the share of number ``index``."""
         batches = list(self._batches())[index::count]
         with Progress("evaluation", sum(batch.clips for batch in batches), "rollouts") as progress:
             done = 0
@@ -81,7 +83,7 @@ class Generation:
                 progress.update(done := done + batch.clips)
 
     def videos(self, run: int) -> dict[str, list[Video]]:
-        """Returns one repetition's videos of all clips by kind, one for each draw."""
+        """Returns one repetition's videos by kind: for each draw of actions, the videos of all clips."""
         return {
             kind: [
                 _joined([self._video(batch) for batch in self._row(run, kind, draw)]) for draw in range(len(actions))
@@ -90,7 +92,7 @@ class Generation:
         }
 
     def samples(self, run: int) -> list[dict[str, np.ndarray]]:
-        """Returns the scores of each further sample of one repetition by name, in the order of the clips."""
+        """Returns each further sample's scores of one repetition by name, in the order of the clips."""
         out = []
         for sample in range(1, self.protocol.samples):
             records = [self._record(batch) for batch in self._row(run, SAMPLE, sample)]
@@ -119,7 +121,7 @@ class Generation:
 
     def _record(self, batch: Batch) -> Record:
         record = self._read(batch)
-        if record is None:  # a file that was damaged or deleted meanwhile
+        if record is None:  # the file was damaged or deleted in the meantime
             record = self._generate(batch)
             self._keep(batch, record)
         return record
@@ -143,7 +145,7 @@ class Generation:
             write_file(self.folder / batch.name, encode(record))
 
     def _generate(self, batch: Batch) -> Record:
-        """Generates a batch; the last one is filled up, so that one program is compiled."""
+        """Generates a batch; the last batch is padded to full size, so that only one program is compiled."""
         sampled, rows = batch.kind == SAMPLE, np.arange(batch.start, batch.start + batch.clips)
         padded = np.minimum(np.arange(batch.start, batch.start + batch_size(self.trained)), rows[-1])
         own = self.draws[OWN][0]
@@ -160,20 +162,21 @@ class Generation:
 
 
 def batch_size(trained: TrainedModel) -> int:
-    """Returns the clips of a batch: the run's, rounded up so that the devices of this process share them evenly."""
+    """Returns the clips per batch: the run's number, rounded up to a multiple of the devices of this process."""
     devices = jax.local_device_count()
     return -(-trained.config.eval.batch_size // devices) * devices
 
 
 def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> TeacherForced | None:
-    """Predicts every frame's tokens from the true frames before it; None if the model cannot.
+    """Predicts every frame's tokens from the true frames before it; returns None if the model cannot do this.
 
-    This costs less than one of the several rollouts of each clip, so it is not kept, nor shared with other processes.
+    This costs less than one of the several rollouts of each clip, so the result is neither kept nor divided among
+    processes.
     """
     size, video, parts = batch_size(trained), clips.video, list[TeacherForced]()
     count = len(clips.rgb)
     for start in range(0, count, size):
-        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is filled up
+        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is padded to full size
         inputs = (trained.params, trained.assets, video[rows], clips.actions[rows])
         part = trained.model.teacher_forced(*inputs, protocol.prompt_frames)
         if part is None:
@@ -194,11 +197,11 @@ def rolled_out(
     own: Float[np.ndarray, "B T A"],
     actions: Float[np.ndarray, "B T A"],
 ) -> Video:
-    """Returns the generated videos, whose frames follow the generated ones before them, or the recorded ones.
+    """Returns the generated videos; each frame is predicted from the generated frames before it, or the recorded ones.
 
     Args:
-        own: the clips' own actions, which led into the recorded frames that generation starts from.
-        actions: those into generated frames.
+        own: the clips' own actions, which led to the recorded frames that generation starts from.
+        actions: the actions that lead to the generated frames.
     """
     prompt, frames = protocol.prompt_frames, actions.shape[1]
 
@@ -212,7 +215,7 @@ def rolled_out(
 
 
 def _joined(parts: list[Video], axis: int = 0) -> Video:
-    """Joins videos of several batches, or the frames of one; NaN where a part has no depth but another has."""
+    """Joins videos of several batches, or parts of one video; a part without depth gets NaN if another has depth."""
     rgb = np.concatenate([part.rgb for part in parts], axis)
     if all(part.depth is None for part in parts):
         return Video(rgb)

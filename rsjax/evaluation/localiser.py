@@ -1,7 +1,8 @@
-"""Reads from a frame where cube and gripper are and whether the cube is lifted: a small network trained on true frames.
+"""Locates cube and gripper in a frame, and whether the cube is lifted, by a small network trained on true frames.
 
-It measures what a picture shows: blurred frames can have everything in its place, and sharp ones nothing. In training
-the true frames are moved and blurred, so that it reads blurred ones too (docs/results/miniature.md).
+The localiser measures what a picture shows: a blurred frame can have everything in its place, and a sharp frame
+nothing. In training, the true frames are moved and blurred, so that the network can also read blurred frames
+(docs/results/miniature.md).
 
 Axes: B frames, H×W pixels; 2 objects: cube, gripper.
 """
@@ -24,15 +25,15 @@ from rsjax.evaluation.registry import Places
 from rsjax.progress import Progress
 
 OBJECTS = ("cube", "gripper")
-BATCH = 64  # frames of a step
-MOVE = 8  # frames are moved by up to an eighth of their width
-SPREAD = 0.03  # of the Gaussian that the softmax is to be around an object, in widths of the frame
+BATCH = 64  # frames per training step
+MOVE = 8  # frames are moved by up to 1/MOVE of their width and height
+SPREAD = 0.03  # standard deviation of the Gaussian around an object that is the softmax's target, in frame widths
 
 
 def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, " B"]] | None:
-    """Returns what the simulator wrote into clips' provenance, for all frames (B, T, …), and the cubes' widths.
+    """Returns the places that the simulator recorded for all frames (B, T, …), and the cubes' widths.
 
-    None if one of the clips has nothing of this.
+    They are in the clips' provenance. Returns None if one of the clips does not have them.
     """
     objects = [clip["provenance"].get("objects") for clip in clips]
     if not all(objects):
@@ -44,7 +45,7 @@ def recorded_places(clips: Sequence[Record]) -> tuple[Places, Float[np.ndarray, 
 
 
 class Network(nn.Module):
-    """A U-Net; each object is at the mean place under a softmax over its cells, each cell with a correction."""
+    """A U-Net; an object's place is the mean under a softmax over cells, where each cell adds a learned correction."""
 
     @nn.compact
     def __call__(self, rgb: Array) -> tuple[Float[Array, "B 2 2"], Float[Array, " B"], Float[Array, "B n 2"]]:
@@ -91,7 +92,7 @@ class Localiser:
     params: Any
 
     def __call__(self, rgb: UInt8[np.ndarray, "B H W 3"], batch: int = 256) -> Places:
-        """Returns the places in frames."""
+        """Returns where cube and gripper are in frames, and whether the cube is lifted."""
         rows = [np.minimum(np.arange(i, i + batch), len(rgb) - 1) for i in range(0, len(rgb), batch)]
         parts = [_apply(self.params, rgb[each]) for each in rows]
         xy, logit = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(rgb)] for i in (0, 1))
@@ -123,7 +124,7 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
         places, logit, log_p = _apply(params, frames)
         apart = _centres(-(-frames.shape[1] // 2), -(-frames.shape[2] // 2))[:, None] - xy[:, None]  # B n 2 2
         near = jax.nn.softmax(-jnp.square(apart).sum(-1) / (2 * SPREAD**2), axis=1)
-        # Absolute errors: a hidden cube has a large one, which must not rule the others.
+        # Absolute, not squared, errors: a hidden cube has a large error, which must not dominate the others.
         error = 10 * jnp.abs(places - xy).mean() - 0.3 * (near * log_p).sum(1).mean()
         return error + optax.sigmoid_binary_cross_entropy(logit, lifted).mean()
 
@@ -138,7 +139,7 @@ def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[A
 def varied(
     rng: np.random.Generator, frames: UInt8[np.ndarray, "B H W 3"], xy: Float[np.ndarray, "B 2 2"]
 ) -> tuple[Float32[np.ndarray, "B H W 3"], Float[np.ndarray, "B 2 2"]]:
-    """Moves frames and their places at random, repeating borders, and blurs each frame more or less."""
+    """Moves frames and their places at random, repeating borders, and blurs each frame by a random amount."""
     size = np.array(frames.shape[2:0:-1])  # width, height
     moves = rng.integers(-(size // MOVE), size // MOVE + 1, (len(frames), 2))  # right, down
     images = np.empty(frames.shape, np.float32)

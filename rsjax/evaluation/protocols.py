@@ -1,4 +1,4 @@
-"""Protocols: how a model is evaluated, as data. Published ones differ in every field, so results name them all."""
+"""Protocols: how a model is evaluated, as data. Published ones differ in every field, so results record every field."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
@@ -14,24 +14,25 @@ SAMPLING = ("steps", "temperature", "top_k", "unmask", "mean_codes", "guidance")
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is generated and which frames of it count.
+    """What is generated, and which of its frames are scored.
 
     Attributes:
         name: one of :data:`PROTOCOLS`, or "run".
         prompt_frames: recorded frames that generation starts from.
-        horizon: predicted frames; 0: to the clips' end.
+        horizon: predicted frames; 0: up to the end of the clips.
         resolution: pixels per side of the frames that are scored; 0: those of the run's clips.
         steps, temperature, top_k, unmask, mean_codes, guidance: settings of sampling; None: the run's own.
-        samples: videos per clip. Scores are those of the first; with more, pixel scores are also reduced to the best
-            of each clip and metric, over all frames with the prompt as the model sees it, as ``NAME_bestN_incl_ctx``.
-        clips: how many of the split's clips, spread evenly; all if it has fewer.
-        repetitions: with other random draws; a clip's score is the mean over them.
+        samples: videos per clip. The scores are those of the first video. With several, each clip's best score of each
+            pixel metric is added as ``NAME_bestN_incl_ctx``; it covers all frames, the prompt as the model sees it
+            included.
+        clips: how many of the split's clips are scored, spread evenly; all if the split has fewer.
+        repetitions: evaluations with different random draws; a clip's score is the mean over them.
         action_draws: random action sequences per clip and kind of ΔPSNR; 0: no ΔPSNR.
         teacher_forced: whether each frame is predicted from the recorded frames before it, not from generated ones.
         reference: what predictions are compared with: recorded frames, or the tokenizer's reconstruction of them.
-        depth_alignment, depth_source: which of the depth scores tables show.
-        splits: the splits whose clips are scored, each by itself; one that ends in ``*`` stands for all that begin so.
-        origin: who evaluates so.
+        depth_alignment, depth_source: which depth scores the tables show.
+        splits: the splits whose clips are scored, each split separately; ``NAME*`` stands for all that start with NAME.
+        origin: who evaluates in this way.
     """
 
     name: str
@@ -72,7 +73,7 @@ class Protocol:
 
     @property
     def sampling(self) -> dict[str, Any]:
-        """The settings of sampling that it fixes."""
+        """The settings of sampling that the protocol fixes."""
         return {name: value for name in SAMPLING if (value := getattr(self, name)) is not None}
 
     @property
@@ -81,7 +82,7 @@ class Protocol:
         return "" if self.depth_alignment == "none" else f"_{self.depth_alignment}_{self.depth_source}"
 
     def described(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready, with the frames that count in words; added ones only where they are set."""
+        """Returns the fields, JSON-ready, and in words the frames that are scored; later-added fields only if set."""
         late = {field.name for field in fields(self) if field.metadata.get("added")}
         values = {name: value for name, value in to_dict(self).items() if name not in late or value is not None}
         frames = {
@@ -132,7 +133,7 @@ PROTOCOLS = {
 
 
 def of_run(config: Config) -> Protocol:
-    """Returns the protocol of a run's own configuration: its prompt, whole clips, its settings of sampling."""
+    """Returns the protocol of a run's own configuration: the run's prompt and sampling settings, and whole clips."""
     settings = config.eval
     return Protocol(
         OWN,
@@ -147,12 +148,12 @@ def of_run(config: Config) -> Protocol:
 
 
 def find(name: str, config: Config) -> Protocol:
-    """Returns a protocol; a preset that asks for more clips or repetitions than the protocol gets them.
+    """Returns the protocol of a name; its clips and repetitions are raised to the configuration's if these are larger.
 
-    A protocol of several samples keeps its own counts, which belong to what was published.
+    A protocol with several samples keeps its own counts, which are part of what was published.
 
     Raises:
-        UserError: there is none of this name.
+        UserError: there is no protocol of this name.
     """
     if name == OWN:
         return of_run(config)
@@ -180,10 +181,10 @@ def check(protocol: Protocol, frames: int, image_size: int, where: str) -> Proto
     """Returns the protocol with its horizon and resolution as numbers, for clips of this shape.
 
     Args:
-        where: the store, for the errors.
+        where: the name of the store, for error messages.
 
     Raises:
-        UserError: it predicts more frames than the clips have, or scores more pixels.
+        UserError: the protocol predicts more frames than the clips have, or scores more pixels.
     """
     horizon = protocol.horizon or frames - protocol.prompt_frames
     needed = protocol.prompt_frames + max(horizon, 1)

@@ -15,9 +15,9 @@ from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation.statistics import Statistic
 from rsjax.models.base import TeacherForced
 
-PerClip: TypeAlias = Float[np.ndarray, " B"]  # without the clips that have no score, if the truth alone decides that
+PerClip: TypeAlias = Float[np.ndarray, " B"]  # clips may be left out if the truth alone decides that they have no score
 PerFrame: TypeAlias = Float[np.ndarray, "B P"]  # P predicted frames; NaN where a frame has no score
-Score: TypeAlias = PerClip | float  # of each clip, or one of the whole set of clips
+Score: TypeAlias = PerClip | float  # one score per clip, or one for the whole set of clips
 Scores: TypeAlias = Score | dict[str, Score]  # a dict has several scores by suffix; "" is the metric itself
 # Videos generated under another clip's actions, or under uniform random actions.
 Need = Literal["other", "uniform"]
@@ -43,10 +43,10 @@ class EstimatedDepth:
 
 @dataclass(frozen=True)
 class Places:
-    """Where things are in the last frames of B clips, or in any frames.
+    """Where cube and gripper are in the last frames of B clips, or in any frames.
 
     Attributes:
-        xy: x (right) and y (down) of cube and gripper; 0 and 1 are the image's edges, to which points outside move.
+        xy: x (right) and y (down) of cube and gripper; 0 and 1 are the image's edges, and points outside are clipped.
         lifted: whether the cube is lifted.
     """
 
@@ -56,13 +56,13 @@ class Places:
 
 @dataclass(frozen=True)
 class Located:
-    """Places in the last frames of B clips: true ones, and as a network reads them from the pictures.
+    """Places in the last frames of B clips: the true places, and those that a network reads from the pictures.
 
     Attributes:
         truth: as the simulator recorded them.
         width: the cube's width in the unit of ``xy``.
-        on_truth: read from the recorded frames; None where that is reported elsewhere.
-        prediction: read from the generated frames.
+        on_truth: what the network reads from the recorded frames; None in the scenes of baselines.
+        prediction: what the network reads from the generated frames.
     """
 
     truth: Places
@@ -71,7 +71,7 @@ class Located:
     prediction: Places
 
     def read(self) -> dict[str, Places]:
-        """Returns what the network read, by suffix of the metrics' names."""
+        """Returns the places that the network read, by suffix of the metrics' names."""
         return {"": self.prediction} | ({"_truth": self.on_truth} if self.on_truth else {})
 
 
@@ -81,14 +81,14 @@ class Scene:
 
     Attributes:
         truth: the recorded clips, with depth where it is in metres.
-        prediction: videos generated under their own actions.
+        prediction: videos generated under the clips' own actions.
         alternatives: videos generated under other actions, by kind; one for each draw of actions.
         estimated: depth estimated from the frames; None without an estimator.
-        located: where things are in the last frame; None if the clips do not record it.
+        located: where cube and gripper are in the last frame; None if the clips do not record it.
         teacher_forced: how well the model predicts each frame's tokens; None for a baseline or a model without tokens.
         second_take: the same scenes recorded once more (same start, same task), for Physics-IQ's score.
-        settings: with the paths of weights.
-        truth_cache: what :meth:`of_truth` computed; scenes of the same truth share it.
+        settings: the settings of the evaluation, with the paths of weights.
+        truth_cache: what :meth:`of_truth` has computed; scenes with the same truth share it.
     """
 
     truth: Video
@@ -104,11 +104,11 @@ class Scene:
     _shared: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
     def shared(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Returns ``function(self, *arguments)``, which is computed once for all metrics that share it."""
+        """Returns ``function(self, *arguments)``, computed once for all metrics that call it."""
         return _once(self._shared, function, self, arguments)
 
     def of_truth(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Returns ``function(self, *arguments)``, which reads only the truth: computed once for all scenes of it."""
+        """Returns ``function(self, *arguments)``, which reads only the truth; computed once per truth."""
         return _once(self.truth_cache, function, self, arguments)
 
 
@@ -130,13 +130,13 @@ class Metric:
         unit: such as "dB"; empty for a pure number.
         better: whether higher or lower values are better.
         decimals: digits after the decimal point.
-        needs: videos that it needs beside the prediction.
+        needs: videos that it needs in addition to the prediction.
         watch: whether it is also computed during training.
         interval: whether its bootstrap interval is reported.
-        statistic: what summarises the clips.
+        statistic: how the clips' scores are summarised.
         column: whether tables have a column for it.
-        function: scores a scene, one number per clip or one for all, or raises :class:`Unavailable`; None for a number
-            that is not computed from videos.
+        function: scores a scene, with one number per clip or one for all clips, or raises :class:`Unavailable`; None
+            for a number that is not computed from videos.
         per_frame: scores every predicted frame of a scene, or raises :class:`Unavailable`; None for a metric without a
             curve over frames.
     """
@@ -161,7 +161,7 @@ class Metric:
         return f"{self.title}{unit} {'↑' if self.better == 'higher' else '↓'}"
 
 
-ABSENT = "–"  # in tables, in the place of a number
+ABSENT = "–"  # stands in tables in place of a missing number
 _SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -176,7 +176,7 @@ class Footnotes:
         self._numbers: dict[str, str] = {}
 
     def mark(self, reason: str | None) -> str:
-        """Returns a reason's mark, such as "²"; "" without a reason."""
+        """Returns the mark of a reason, such as "²"; "" without a reason."""
         if not reason:
             return ""
         return self._numbers.setdefault(reason, str(len(self._numbers) + 1).translate(_SUPERSCRIPT))

@@ -1,4 +1,4 @@
-"""The file of an evaluation: scores, and everything that they depend on, so that nothing unlike is ever compared."""
+"""The file of an evaluation: scores and all that they depend on, so that only like results are ever compared."""
 
 import hashlib
 from collections.abc import Mapping
@@ -22,27 +22,27 @@ NAME, FRAMES = "result.json", "frames.msgpack"
 
 @dataclass(frozen=True)
 class Result:
-    """An evaluation as it is written. All fields are JSON-ready.
+    """An evaluation as it is written to its file. All fields are JSON-ready.
 
     Attributes:
         label: the protocol's name with its changed fields.
-        key: changes with whatever decides the scores, the code excepted.
+        key: a key that changes with everything that determines the scores, except the code.
         protocol: every field of the protocol.
-        sampling: all settings of sampling, of which the protocol may fix some; empty for a family without any.
-        settings: of the metrics; their files, and those of the depth estimator, by a hash of their content.
+        sampling: all settings of sampling, some of which the protocol may fix; empty for a family without sampling.
+        settings: those of the metrics; the files of metrics and depth estimator as a hash of their content.
             ``physics_iq_threshold``: grey levels of 255 above which a pixel moves; results of earlier versions lack it.
         data: ``path``, ``key``, ``manifest_sha256``, ``split``, ``frames``, ``image_size`` and ``fps`` of the scored
-            clips; ``fps``, frames per second, is None where nothing says it and absent in results of earlier versions.
-        model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters``, ``weights_sha256``, the key of
-            the data that it learned from as ``trained_on``, and how it was trained as ``training``: the settings of the
-            training loops, but for seeds and starting points, and the tokenizer's. Earlier versions lack ``training``.
+            clips. ``fps``, in frames per second, is None if it is unknown; results of earlier versions lack it.
+        model: ``run``, ``preset``, ``family``, ``settings``, ``seed``, ``parameters`` and ``weights_sha256``;
+            ``trained_on``, the key of the training data; ``training``, the settings of the training loops without
+            seeds and starting points, and those of the tokenizer. Results of earlier versions lack ``training``.
         code: version and git revision of rsjax.
         made: when (ISO 8601, UTC), and on which ``machine``.
-        metrics: scores by name; None for a metric without, of which ``reasons`` says why.
+        metrics: scores by name; None for a metric without a score, for which ``reasons`` says why.
         repetitions: the scores of each repetition.
         curves: as in curves.json.
-        per_clip: the clips' scores by name, in the order of ``clips``, without clips that have no score: shorter where
-            only some clips have depth or motion. Earlier versions scored tokens on 20 of the clips, spread evenly.
+        per_clip: the clips' scores by name, in the order of ``clips``, without clips that have no score, so the list is
+            shorter where only some clips have depth or motion. Earlier versions scored tokens on 20 evenly spread ones.
         clips: the scored clips: ``number`` in the split, ``episode``, ``sha256``.
     """
 
@@ -64,7 +64,7 @@ class Result:
 
 
 def result_of(evaluation: Evaluation, **about: Any) -> Result:
-    """Returns the file's content; ``about`` are the fields that the evaluation does not know."""
+    """Returns the file's content; ``about`` contains the fields that the evaluation itself does not know."""
     return Result(
         metrics=evaluation.metrics | dict.fromkeys(evaluation.reasons),
         reasons=evaluation.reasons,
@@ -77,7 +77,7 @@ def result_of(evaluation: Evaluation, **about: Any) -> Result:
 
 
 def write_result(folder: Path, result: Result, frames: Mapping[str, np.ndarray]) -> None:
-    """Writes ``result.json``, and before it the frames that :attr:`Evaluation.kept` keeps.
+    """Writes the frames of :attr:`Evaluation.kept`, and then ``result.json``.
 
     Raises:
         FileError: the disk is full.
@@ -90,7 +90,7 @@ def read_result(folder: Path) -> Result:
     """Reads a result.
 
     Raises:
-        FileError: it is missing, damaged or of another version.
+        FileError: the file is missing, damaged or of another version.
     """
     path, cure = folder / NAME, "python -m experiments.evaluate makes it again"
     try:
@@ -100,10 +100,10 @@ def read_result(folder: Path) -> Result:
 
 
 def read_frames(folder: Path) -> dict[str, np.ndarray]:
-    """Reads the frames that were kept of some of the scored clips; see :attr:`Evaluation.kept`.
+    """Reads the kept frames of some of the scored clips; see :attr:`Evaluation.kept`.
 
     Raises:
-        StoreError: they are missing or damaged.
+        StoreError: the file is missing or damaged.
     """
     try:
         return decode((folder / FRAMES).read_bytes())

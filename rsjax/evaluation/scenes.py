@@ -1,4 +1,4 @@
-"""What metrics compare: recorded videos with the prediction and with both baselines, at the protocol's resolution."""
+"""Makes what metrics compare: recorded videos with the prediction and both baselines, at the protocol's resolution."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -35,12 +35,12 @@ def make_scenes(
     taught: TeacherForced | None = None,
     second_takes: Video | None = None,
 ) -> dict[str, Scene]:
-    """Returns the prediction's scene as "", and those of both baselines by their suffix of names.
+    """Returns the scenes by the suffix that names their scores: "" for the prediction, and one for each baseline.
 
     Args:
-        videos: by kind, one for each draw of actions; the first under the clips' own actions is the prediction.
+        videos: by kind of actions, one for each draw; the first under the clips' own actions is the prediction.
         taught: how well the model predicts tokens from true frames.
-        second_takes: the clips' scenes recorded once more.
+        second_takes: second recordings of the clips' scenes.
     """
     reconstruction = trained.model.reconstruct(trained.assets, clips.video)
     shown = {"": videos[OWN][0], "_repeat_first": _repeat_first(clips.metric_video, protocol.prompt_frames)}
@@ -72,7 +72,7 @@ def make_scenes(
 def scored_frames(
     trained: TrainedModel, protocol: Protocol, clips: Clips, reconstruction: Video | None = None
 ) -> Video:
-    """Returns what predictions are compared with: recorded frames, or their reconstruction; recorded depth.
+    """Returns what predictions are compared with: recorded frames or their reconstruction, with recorded depth.
 
     Raises:
         UserError: the protocol compares with reconstructions, and the model has no tokenizer.
@@ -91,13 +91,14 @@ def scored_frames(
 
 
 def locating(trained: TrainedModel, store: Store, records: Sequence[Record], last: int) -> Locate | None:
-    """Trains a localiser and returns a function that compares its reading of a video's last frames with the truth.
+    """Trains a localiser and returns a function that pairs its reading of a video's last frames with the truth.
 
-    None if the clips do not record where things are.
+    Returns None if the clips do not record where cube and gripper are.
 
     Args:
-        store: of the run, whose training clips the localiser learns from.
-        records: the scored clips, of which ``last`` is the last frame that counts.
+        store: the store of the run; the localiser learns from its training clips.
+        records: the scored clips.
+        last: the index of the last frame that is scored.
     """
     recorded, train = recorded_places(records), store.source("train")
     clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))] if recorded else []
@@ -111,13 +112,13 @@ def locating(trained: TrainedModel, store: Store, records: Sequence[Record], las
 
 
 def _repeat_first(video: Video, prompt_frames: int) -> Video:
-    """Returns the last prompt frame repeated for the whole video: the baseline without motion."""
+    """Returns a video that repeats the last prompt frame: the baseline without motion."""
     last, frames = video.frames(prompt_frames - 1, prompt_frames), video.rgb.shape[1]
     return Video(np.repeat(last.rgb, frames, 1), None if last.depth is None else np.repeat(last.depth, frames, 1))
 
 
 def scaled(video: Video, side: int) -> Video:
-    """Returns a video with so many pixels per side: means of the frames' pixels, the nearest of depth."""
+    """Returns a video resized to ``side`` pixels per side: RGB by area means, depth by nearest neighbour."""
     if video.rgb.shape[2] == side:
         return video
     lead = video.rgb.shape[:2]

@@ -1,4 +1,4 @@
-"""Scores of all metrics over clips, over repetitions, and over the best of several samples.
+"""Computes the scores of all metrics over clips, over repetitions, and for the best of several samples.
 
 Axes: B clips.
 """
@@ -22,12 +22,12 @@ PIXELS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")  # metrics that are also re
 
 @dataclass(frozen=True)
 class Scored:
-    """The clips' scores, and why others are missing.
+    """The clips' scores, and the reasons for missing scores.
 
     Attributes:
-        values: metric → name in metrics.json → score of each clip, or one of the whole set without axes; of the
-            prediction and of both baselines.
-        reasons: why a registered metric has none, by name.
+        values: metric → name in metrics.json → each clip's score, or one score of the whole set as an array without
+            axes; for the prediction and for both baselines.
+        reasons: why a registered metric has no score, by name.
         best: scores of the best of several samples, by name.
     """
 
@@ -45,7 +45,7 @@ def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bo
     """Scores the prediction and both baselines with all registered metrics.
 
     Args:
-        takes_actions: False for a model that has none, which no metric of other actions can score.
+        takes_actions: False for a model without actions, which metrics that need other actions cannot score.
     """
     values, reasons = {}, {}
     for metric in metrics().values():
@@ -59,10 +59,10 @@ def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bo
 
 
 def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> dict[str, PerClip]:
-    """Scores the clips of the prediction and of both baselines with a metric, by name.
+    """Returns a metric's scores of the prediction and of both baselines, by name.
 
     Raises:
-        Unavailable: the prediction cannot be scored. A baseline that cannot is left out.
+        Unavailable: the prediction cannot be scored. A baseline that cannot be scored is left out.
     """
     if not scenes[""].alternatives.keys() >= set(metric.needs):
         raise Unavailable(f"protocol {protocol.name} generates no videos under other actions")
@@ -84,7 +84,7 @@ def _named(metric: Metric, scene: Scene, suffix: str) -> dict[str, PerClip]:
 
 
 def sample_scores(truth: Video, video: Video, protocol: Protocol, settings: EvalConfig) -> dict[str, PerClip]:
-    """Scores one sample of each clip by pixels, over all frames: those of the prompt are as the model sees them."""
+    """Scores one sample of each clip with the pixel metrics, over all frames: prompt frames as the model sees them."""
     scene, scores = Scene(truth, scaled(video, protocol.resolution), 0, settings=settings), {}
     for name in PIXELS:
         with suppress(Unavailable):
@@ -93,10 +93,14 @@ def sample_scores(truth: Video, video: Video, protocol: Protocol, settings: Eval
 
 
 def with_best(scored: Scored, scene: Scene, samples: Sequence[Mapping[str, PerClip]], protocol: Protocol) -> Scored:
-    """Adds, for each metric of pixels, the best of the scored sample and of further ones; nothing without further ones.
+    """Adds the best score over all samples for each pixel metric; adds nothing if there is only one sample.
 
-    ``NAME_best100_incl_ctx`` takes each clip's best sample for each metric apart, over all frames, as iVideoGPT does;
-    ``NAME_n1_pred_only`` is the first sample's score over predicted frames alone.
+    ``NAME_best100_incl_ctx`` takes each clip's best sample separately for each metric, over all frames, as iVideoGPT
+    does; ``NAME_n1_pred_only`` is the first sample's score over the predicted frames only.
+
+    Args:
+        scene: with the first sample as its prediction.
+        samples: the scores of the further samples.
     """
     if not samples:
         return scored
@@ -111,7 +115,7 @@ def with_best(scored: Scored, scene: Scene, samples: Sequence[Mapping[str, PerCl
 
 
 def mean_scores(repetitions: Sequence[Scored]) -> Scored:
-    """Returns each clip's mean over repetitions with other random draws."""
+    """Returns each clip's mean scores over repetitions with different random draws."""
     if len(repetitions) == 1:
         return repetitions[0]
 
@@ -123,7 +127,7 @@ def mean_scores(repetitions: Sequence[Scored]) -> Scored:
 
 
 def mean_curves(repetitions: Sequence[Curves]) -> Curves:
-    """Returns the curves' mean over repetitions, point by point; bands are the mean of the bands."""
+    """Returns the mean of curves over repetitions, point by point; a band's edges are the means of the edges."""
     if len(repetitions) == 1:
         return repetitions[0]
     return {
@@ -138,7 +142,7 @@ def _mean(points: Sequence[float | None]) -> float | None:
 
 
 def summarised(scored: Scored, interval: bool = True) -> dict[str, float]:
-    """Returns the mean or median over clips of each score by name, and its interval as ``NAME_low``, ``NAME_high``."""
+    """Returns each score's mean or median over clips by name, and its interval as ``NAME_low`` and ``NAME_high``."""
     flat: dict[str, float] = {}
     for metric in (metrics()[name] for name in scored.values):
         for name, values in scored.values[metric.name].items():

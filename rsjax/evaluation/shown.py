@@ -1,4 +1,4 @@
-"""The clips in the report, typical ones and the worst ones, with their arrays; clips of both ends for comparisons."""
+"""Chooses the clips that reports show (typical and worst ones) and comparisons show (both extremes)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,21 +9,21 @@ from jaxtyping import Bool, Float, Int
 from rsjax.data.clips import Clips
 from rsjax.evaluation.registry import PerClip, Scene
 
-EXTREMES = 3  # clips of either end that comparisons show
+EXTREMES = 3  # clips at either end of the ranking that comparisons show
 
 
 def choose_clips(
     psnr: Float[np.ndarray, " B"], success: Bool[np.ndarray, " B"], count: int
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Chooses clips by PSNR: half of them typical, half the worst, by turns and a typical one first.
+    """Chooses clips by PSNR: typical and worst clips in turn, a typical one first.
 
-    Typical clips are those nearest to the median; successes and failures alternate while there are both.
+    Typical clips are those nearest to the median; successes and failures alternate as long as there are both.
 
     Args:
-        count: how many; one more is typical if it is odd. At most B are returned.
+        count: how many clips; if it is odd, one more of them is typical. At most B are returned.
 
     Returns:
-        The chosen clips, and each one's rank from below: 1 for the worst; 0 for a typical clip.
+        The rows of the chosen clips, and each one's rank from the worst: 1 for the worst; 0 for a typical clip.
     """
     count = min(count, len(psnr))
     worst = np.argsort(psnr, kind="stable")[: count // 2]
@@ -41,7 +41,7 @@ def extremes(
     """Returns the clips with the lowest scores, lowest first, and those with the highest, highest first.
 
     Args:
-        count: of each; fewer where they would overlap.
+        count: how many of each; fewer if they would overlap.
     """
     order, count = np.argsort(scores, kind="stable"), min(count, len(scores) // 2)
     return order[:count], order[::-1][:count]

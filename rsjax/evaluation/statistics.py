@@ -1,4 +1,4 @@
-"""Means over clips and seeds with their intervals, tests of differences, and what an interval says of a claim."""
+"""Means over clips and seeds with their intervals, tests of differences, and verdicts on claims."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,10 +33,10 @@ class Estimate:
 
 
 def over_predicted_frames(per_frame: Float[np.ndarray, "*B T"], prompt_frames: int = 1) -> Float[np.ndarray, "*B"]:
-    """Returns each clip's mean over its predicted frames, those after the first ``prompt_frames``.
+    """Returns each clip's mean over its predicted frames, which are those after the first ``prompt_frames``.
 
     Raises:
-        ValueError: no frame is left.
+        ValueError: there is no predicted frame.
     """
     per_frame = np.asarray(per_frame)
     if per_frame.shape[-1] <= prompt_frames:
@@ -60,10 +60,10 @@ def bootstrap(
         seed: of the resampling.
         level: the interval's coverage, between 0 and 1.
         resamples: the number of times that B clips are drawn with replacement.
-        statistic: what summarises the clips.
+        statistic: how the clips are summarised.
 
     Raises:
-        ValueError: no clips, or a value that is not finite.
+        ValueError: there are no clips, or a value is not finite.
     """
     values = np.asarray(per_clip, np.float64)
     if values.ndim != 1 or not values.size or not np.isfinite(values).all():
@@ -77,7 +77,7 @@ def bootstrap(
 def _resampled(
     scores: Float[np.ndarray, "S B"], seed: int, resamples: int, statistic: Statistic
 ) -> Float[np.ndarray, "R S"]:
-    """Returns each seed's mean or median over the clips of each resample, which all seeds share."""
+    """Returns each seed's mean or median over the clips of each resample; all seeds share the resamples."""
     clips = scores.shape[1]
     if statistic == "mean":
         return _share_of_clips(clips, resamples, seed) @ scores.T
@@ -85,7 +85,7 @@ def _resampled(
     return np.stack([np.median(each[drawn], axis=1) for each in scores], axis=1)
 
 
-@lru_cache(maxsize=2)  # of scores, and of the points of curves
+@lru_cache(maxsize=2)  # one entry for scores, one for the points of curves
 def _share_of_clips(clips: int, resamples: int, seed: int) -> Float[np.ndarray, "R B"]:
     """Returns how often each clip was drawn in each resample, as shares that add up to 1."""
     drawn = np.random.default_rng(seed).integers(clips, size=(resamples, clips))
@@ -101,26 +101,26 @@ def paired_bootstrap(
     resamples: int = 10_000,
     statistic: Statistic = "mean",
 ) -> Estimate:
-    """Returns the score of a less that of b, and its percentile-bootstrap interval over seeds and clips.
+    """Returns the score of a minus that of b, and its percentile-bootstrap interval over seeds and clips.
 
     A score is the mean over seeds of each seed's mean or median over clips. Each resample draws S seeds of ``a``, Z
-    seeds of ``b`` and B clips, which all share, so clips stay paired. With one seed each the interval says nothing
-    about other seeds, and of means this is :func:`bootstrap` of the clips' differences. Two or three seeds understate
-    how seeds vary; read :func:`welch` beside it.
+    seeds of ``b`` and B clips; all seeds share the drawn clips, so clips stay paired. With one seed each, the interval
+    says nothing about other seeds, and for means it is :func:`bootstrap` of the clips' differences. Two or three seeds
+    understate how much seeds vary, so read :func:`welch` as well.
 
     Args:
-        a, b: a number per seed and clip; the same clips in the same order. One seed may come without its axis.
+        a, b: one number per seed and clip; the same clips in the same order. For one seed, its axis may be left out.
         seed, level, resamples, statistic: as in :func:`bootstrap`.
 
     Raises:
-        ValueError: the clips differ in number, there are none, or a value is not finite.
+        ValueError: a and b differ in their number of clips, one is empty, or a value is not finite.
     """
     a, b = (np.atleast_2d(np.asarray(each, np.float64)) for each in (a, b))
     if a.shape[1:] != b.shape[1:] or not a.size or not b.size or not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ValueError(f"a paired interval needs a finite number per seed and clip, not {a.shape} and {b.shape}")
     if a.shape[1] == 1:
         return Estimate(float(a.mean() - b.mean()), None, None)
-    rng, summarise = np.random.default_rng([seed, 1]), _SUMMARIES[statistic]  # of seeds alone
+    rng, summarise = np.random.default_rng([seed, 1]), _SUMMARIES[statistic]  # rng draws seeds only, not clips
 
     def over_seeds(scores: Float[np.ndarray, "S B"]) -> Float[np.ndarray, " R"]:
         by_seed = _resampled(scores, seed, resamples, statistic)
@@ -146,10 +146,10 @@ class Welch:
     """Welch's t-test of two means, and the interval of their difference.
 
     Attributes:
-        difference: mean of a - mean of b, with its t interval.
+        difference: the mean of a minus the mean of b, with its t interval.
         t: the statistic; ±inf where neither group varies and the means differ.
         df: Welch–Satterthwaite degrees of freedom.
-        p: two-sided.
+        p: the two-sided p-value.
     """
 
     difference: Estimate
@@ -159,7 +159,9 @@ class Welch:
 
 
 def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float = 0.95) -> Welch | None:
-    """Tests whether the means of two groups of seeds differ; variances may differ. None with fewer than two seeds each.
+    """Tests whether the means of two groups of seeds differ; their variances may differ.
+
+    Returns None if a group has fewer than two seeds.
 
     Args:
         a, b: one number per seed, such as a run's mean over clips.
@@ -183,10 +185,10 @@ def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float =
 
 
 def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
-    """Returns a share and Wilson's score interval, which stays within [0, 1] and serves few trials too.
+    """Returns a share and Wilson's score interval, which stays within [0, 1] and is valid for few trials too.
 
     Raises:
-        ValueError: no trial, or not 0 ≤ successes ≤ trials.
+        ValueError: there is no trial, or 0 ≤ successes ≤ trials does not hold.
     """
     if not 0 <= successes <= trials or not trials:
         raise ValueError(f"{successes} successes of {trials} trials have no share")
@@ -199,12 +201,12 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
 def share_difference(one: ArrayLike, other: ArrayLike) -> Estimate:
     """Returns the difference of two shares of successes, one - other, with Newcombe's interval from Wilson's.
 
-    Unlike a bootstrap it has a width where all trials ended alike. It takes the two as independent, so that it is too
-    wide, not too narrow, where trials are paired by their start.
+    Unlike a bootstrap interval, it has a positive width even if all trials ended alike. It assumes that the two are
+    independent, so it is too wide, rather than too narrow, for trials that are paired by their start.
 
     Args:
         one: 1 for each success and 0 for each failure, of any shape.
-        other: likewise.
+        other: the same for the second share.
 
     Raises:
         ValueError: one of them is empty.
@@ -218,24 +220,25 @@ def share_difference(one: ArrayLike, other: ArrayLike) -> Estimate:
 
 
 def can_lose(success: ArrayLike, margin: float) -> bool:
-    """Returns whether trials succeed often enough for a loss of ``margin`` to show: Wilson's interval lies above it.
+    """Returns whether trials succeed often enough to show a loss of ``margin``: Wilson's interval lies above it.
 
-    Where nothing succeeds, nothing is worse by a margin, so "as good as this" would always hold.
+    Where no trial succeeds, nothing can be worse by a margin, so the claim "as good as this" would always hold.
     """
     low = wilson(int(np.sum(success)), np.size(success)).low
     return margin <= 0 or (low is not None and low > margin)
 
 
 def verdict(interval: Estimate | None, direction: Direction = "higher", margin: float = 0.0) -> Verdict:
-    """Returns what the interval of a difference a - b says of the claim that a is better than b by more than a margin.
+    """Judges the claim that a is better than b by more than a margin, from the interval of the difference a - b.
 
     Args:
-        interval: of the difference; without one, or with one bound missing, nothing can be told.
+        interval: of the difference; if it or one of its bounds is missing, the verdict is "cannot tell".
         direction: whether higher or lower values are better.
         margin: in the unit of the difference; a negative one claims that a is worse by less than ``-margin``.
 
     Returns:
-        "holds" if the whole interval lies beyond the margin, "does not hold" if it ends before it, else "cannot tell".
+        "holds" if the whole interval is above the margin, "does not hold" if it is all below, else "cannot tell"; for
+        ``direction`` "lower", the interval is that of b - a.
     """
     if interval is None or interval.low is None or interval.high is None:
         return "cannot tell"

@@ -16,7 +16,7 @@ GENIE_T = 4  # the predicted frame that Genie reports
 
 
 def _register(name: str, title: str, kind: Need) -> None:
-    """Registers ΔPSNR under one kind of actions: the mean over frames, and Δ₄ as ``_t4``."""
+    """Registers ΔPSNR for one kind of random actions: the mean over frames, and Δ₄ as ``_t4``."""
 
     def per_frame(scene: Scene) -> PerFrame:
         return scene.shared(_draws, kind).mean(0)[:, scene.prompt_frames :]
@@ -45,7 +45,7 @@ def clip_means(delta: Float[np.ndarray, "R B T"], prompt_frames: int = 1) -> dic
     """Returns each clip's ΔPSNR in dB, averaged over R draws of random actions.
 
     Returns:
-        "mean": over all predicted frames; "t4": Δ₄, of the fourth predicted frame, absent if there are fewer.
+        "mean": over all predicted frames; "t4": Δ₄, that of the fourth predicted frame, absent if there are fewer.
     """
     draws_mean = np.asarray(delta).mean(0)
     means = {"mean": over_predicted_frames(draws_mean, prompt_frames)}
@@ -82,7 +82,7 @@ def uniform_actions(
 
 
 def other_clips(clips: int, draws: int, seed: int) -> Int[np.ndarray, "R B"]:
-    """Draws for each clip the number of another one whose actions it gets, by permutations without fixed points.
+    """Draws for each clip another clip, whose actions it gets, by permutations without fixed points.
 
     Raises:
         ValueError: fewer than two clips.

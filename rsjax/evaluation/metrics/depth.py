@@ -1,7 +1,7 @@
 """AbsRel and δ_k of predicted depth, under the alignments that published work uses.
 
-Depth is z-depth along the optical axis. A depth branch trained on metres needs no alignment. The output of a monocular
-estimator is known up to a scale, or a scale and a shift, which are fitted to the truth once per video.
+Depth is z-depth along the optical axis. A depth branch trained on metres needs no alignment. A monocular estimator's
+output is known only up to a scale, or a scale and a shift, which are fitted to the truth once per video.
 """
 
 from dataclasses import dataclass
@@ -31,12 +31,12 @@ _MIN_L1_SCALE = 1e-3
 
 @dataclass(frozen=True)
 class Protocol:
-    """The pixels that count, and their averaging.
+    """Which pixels count, and how they are averaged.
 
     Attributes:
         min_truth: only pixels with a true depth strictly above this count.
         max_truth: only pixels with a true depth strictly below this count, unless the caller sets another bound.
-        averaging: "frame": pixels → frame → video → data set; "video": pixels of a video → data set;
+        averaging: "frame": over pixels, then frames, then videos; "video": over the pixels of a video, then videos;
             "pixel": all pixels of the data set have the same weight.
     """
 
@@ -60,7 +60,7 @@ class DepthScores:
     Attributes:
         abs_rel: each video's mean of |d̂ - d| / d.
         delta1: each video's share of pixels with max(d̂/d, d/d̂) < 1.25, 0–1.
-        delta2: the same with 1.25².
+        delta2: as delta1, but with 1.25².
         weight: each video's weight in the data set's mean: 1, or its number of pixels for averaging "pixel".
         frames: abs_rel, delta1 and delta2 of each frame's valid pixels; NaN for a frame without any.
     """
@@ -82,7 +82,7 @@ class DepthScores:
 
 
 def _register(measure: Measure, alignment: Alignment, source: DepthSource) -> None:
-    """Registers one score under one protocol; tables have a column for metres, and for WorldArena's protocol."""
+    """Registers one score under one protocol; tables have columns for metres and for WorldArena's protocol."""
     title, better, decimals = _MEASURES[measure]
     plain = result_key(measure, alignment, source) == f"depth_{measure}"
 
@@ -113,7 +113,7 @@ def _scores(scene: Scene, alignment: Alignment, source: DepthSource) -> DepthSco
 
 
 def _branch_depth(scene: Scene) -> tuple[Depths, Depths]:
-    """Returns recorded and generated depth of the clips with recorded depth."""
+    """Returns the recorded and the generated depth of the clips that have recorded depth."""
     rows = scene.truth.has_depth
     if scene.truth.depth is None or not rows.any():
         raise Unavailable("no test clip has depth in metres")
@@ -146,9 +146,9 @@ def align(
 ) -> Float[np.ndarray, "T H W"]:
     """Aligns the prediction with the truth by one fit over the video's masked pixels, in float64.
 
-    "none": unchanged. "median": times median(d) / median(d̂). "affine_disparity": a/d̂ + b fitted to 1/d by least
-    squares, disparities kept ≥ 1e-3. "l1_scale": times s, the minimiser of Σ|s·d̂ - d|, from 10
-    reweighted least-squares steps that start at mean(d) / mean(d̂); s ≥ 1e-3.
+    "none": unchanged. "median": multiplied by median(d) / median(d̂). "affine_disparity": a/d̂ + b is fitted to 1/d by
+    least squares, and disparities are kept ≥ 1e-3. "l1_scale": multiplied by s, the minimiser of Σ|s·d̂ - d|, found by
+    10 reweighted least-squares steps that start at mean(d) / mean(d̂); s ≥ 1e-3.
     """
     d, p = truth[mask].astype(np.float64), prediction[mask].astype(np.float64)
     full = prediction.astype(np.float64)
@@ -236,10 +236,10 @@ def _video_scores(
 
 
 def result_key(metric: str, alignment: Alignment = "none", source: DepthSource = "branch") -> str:
-    """Returns the name under which a depth score is published, which tells protocols apart.
+    """Returns the name of a depth score in results, which is different for each protocol.
 
-    ``depth_absrel`` is the depth branch's in metres, unaligned; all others contain alignment and source, such as
-    ``depth_absrel_median_estimator``.
+    ``depth_absrel`` is the score of the depth branch in metres, unaligned; all other names contain the alignment and
+    the source, such as ``depth_absrel_median_estimator``.
     """
     plain = alignment == "none" and source == "branch"
     return f"depth_{metric}" if plain else f"depth_{metric}_{alignment}_{source}"

@@ -1,8 +1,9 @@
-"""FVD: how far generated videos are from recorded ones as a set (Unterthiner et al. 2019, as in StyleGAN-V).
+"""FVD: the distance of the set of generated videos from the recorded set (Unterthiner et al. 2019, as in StyleGAN-V).
 
-The Fréchet distance between the features of an I3D network. The network is the file ``i3d_torchscript.pt``, which
-resizes frames to 224² itself, and runs in PyTorch; without both, the metric is unavailable. It is one number for all
-clips, without an interval, and depends on their number and length: compare only equal ones.
+FVD is the Fréchet distance between the features of an I3D network. The network is the file ``i3d_torchscript.pt``,
+which resizes frames to 224² itself and runs in PyTorch; without the file or PyTorch, the metric is unavailable. FVD is
+one number for all clips, without an interval. It depends on the number and length of the clips: compare only values
+where both are equal.
 """
 
 from functools import lru_cache
@@ -17,7 +18,7 @@ from rsjax.errors import UserError, first_line
 from rsjax.evaluation.registry import Scene, Scores, Unavailable, metric
 from rsjax.progress import Progress
 
-_CLIPS = 4  # at a time, for memory
+_CLIPS = 4  # clips at a time, to limit memory
 
 
 class FvdError(UserError):
@@ -31,9 +32,9 @@ def score(scene: Scene) -> Scores:
 
 
 def frechet_distance(one: Float[np.ndarray, "N D"], other: Float[np.ndarray, "M D"]) -> float:
-    """Returns |μ₁ - μ₂|² + tr(Σ₁ + Σ₂ - 2(Σ₁Σ₂)^½) of two sets of features; Σ divides by their number, not one less.
+    """Returns |μ₁ - μ₂|² + tr(Σ₁ + Σ₂ - 2(Σ₁Σ₂)^½) of two sets of features; Σ divides by N or M, not by one less.
 
-    With centred features A and B, tr (Σ₁Σ₂)^½ is the sum of the singular values of A·Bᵀ / √(N·M), which also holds for
+    With centred features A and B, tr (Σ₁Σ₂)^½ is the sum of the singular values of A·Bᵀ / √(N·M). This also works with
     fewer videos than features, where Σ₁Σ₂ has no stable square root.
     """
     one, other = (np.asarray(features, np.float64) for features in (one, other))
@@ -48,7 +49,7 @@ def check_i3d(path: str) -> None:
     """Checks the file of the network, as far as that is possible without PyTorch.
 
     Raises:
-        FvdError: it is missing or damaged.
+        FvdError: the file is missing or damaged.
     """
     if not Path(path).is_file():
         raise FvdError(f"{path}: no such I3D network; mend eval.fvd_weights, or leave it empty")

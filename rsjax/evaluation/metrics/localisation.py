@@ -1,7 +1,7 @@
-"""Where cube and gripper are in the last frame, read from the pictures by a small network trained on true frames.
+"""Errors of the places of cube and gripper in the last frame, which a small network trained on true frames reads.
 
-Errors are distances in the image in widths of the cube. ``…_truth`` is the network's own error on the true frames,
-which limits what the others can show.
+Errors are distances in the image, in widths of the cube. ``…_truth`` is the network's own error on the true frames,
+which limits what the other errors can show.
 """
 
 import numpy as np
@@ -12,19 +12,19 @@ from rsjax.evaluation.registry import Located, Scene, Scores, Unavailable, metri
 
 @metric("cube_error_widths", "cube's place", unit="widths", better="lower", statistic="median")
 def cube_error(scene: Scene) -> Scores:
-    """Scores the distance of the cube's centre from its true place."""
+    """Returns the distance of the cube's centre from its true place."""
     return _errors(scene, "cube")
 
 
 @metric("gripper_error_widths", "gripper's place", unit="widths", better="lower", statistic="median")
 def gripper_error(scene: Scene) -> Scores:
-    """Scores the distance of the point between the fingers from its true place."""
+    """Returns the distance of the point between the fingers from its true place."""
     return _errors(scene, "gripper")
 
 
 @metric("lifted_accuracy", "lifted or not", better="higher")
 def lifted_accuracy(scene: Scene) -> Scores:
-    """Scores whether the cube is lifted where it truly is, and only there."""
+    """Returns 1 for each clip where the network reads correctly whether the cube is lifted, otherwise 0."""
     located = _located(scene)
     return {part: (places.lifted == located.truth.lifted).astype(float) for part, places in located.read().items()}
 

@@ -1,6 +1,6 @@
-"""LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and with VGG16; the paper does not say which it takes.
+"""LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and VGG16; RoboScape does not say which one it uses.
 
-The weights are files that ``python -m rsjax.convert lpips`` makes; without one, the metric is unavailable.
+The weights are files that ``python -m rsjax.convert lpips`` makes; without its file, a metric is unavailable.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from rsjax.clip import Array
 from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
 from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
 
-_PAIRS = 8  # frames at a time, for memory: VGG's first layers hold 64 channels of full size
+_PAIRS = 8  # pairs of frames at a time, to limit memory: VGG's first layers hold 64 channels of full size
 
 
 def alex_frames(scene: Scene) -> PerFrame:
@@ -28,13 +28,13 @@ def vgg_frames(scene: Scene) -> PerFrame:
 
 @metric("lpips_alex", "LPIPS, AlexNet", better="lower", decimals=4, per_frame=alex_frames)
 def alex_score(scene: Scene) -> PerClip:
-    """Scores the mean over each clip's predicted frames."""
+    """Returns the mean over each clip's predicted frames, with AlexNet."""
     return scene.shared(alex_frames).mean(-1)
 
 
 @metric("lpips_vgg", "LPIPS, VGG", better="lower", decimals=4, per_frame=vgg_frames)
 def vgg_score(scene: Scene) -> PerClip:
-    """Scores the mean over each clip's predicted frames."""
+    """Returns the mean over each clip's predicted frames, with VGG16."""
     return scene.shared(vgg_frames).mean(-1)
 
 

@@ -1,7 +1,7 @@
 """The metrics of Physics-IQ (Motamed et al. 2025): where, when and how much a video moves, and its squared error.
 
-A mask of what moves is made of every frame; masks and frames are compared at a quarter of their size. The masks depend
-on the frame rate, since a frame is compared with a running average of those before it.
+A mask marks the pixels that move in each frame; masks and frames are compared at a quarter of their size. The masks
+depend on the frame rate, because a frame is compared with a running average of the frames before it.
 
 Axes: B clips, T frames, H×W pixels, h×w a quarter of them.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from rsjax.evaluation.registry import PerFrame, Scene, Scores, Unavailable, metric
 
 THRESHOLD = 10  # grey levels of 255 above which a pixel moves
-_KEPT = 0.7  # of the running average in the next frame
+_KEPT = 0.7  # share of the running average that is kept in the next frame
 _KERNEL = np.ones((5, 5), np.uint8)
 _SHRINK = 4
 
@@ -26,11 +26,11 @@ Kind = Literal["spatial", "spatiotemporal", "weighted", "mse"]
 
 @dataclass(frozen=True)
 class Small:
-    """Videos as they are compared.
+    """Videos at the size at which they are compared.
 
     Attributes:
-        masks: what moves.
-        frames: 0–255.
+        masks: the pixels that move.
+        frames: values 0–255.
     """
 
     masks: Bool[np.ndarray, "B T h w"]
@@ -43,8 +43,8 @@ class Four:
 
     Attributes:
         spatial: intersection over union of the pixels that ever move.
-        spatiotemporal: the same of each frame's pixels.
-        weighted: the same of the shares of the frames in which a pixel moves, as Σmin / Σmax.
+        spatiotemporal: intersection over union of the pixels that move in each frame.
+        weighted: Σmin / Σmax over pixels of the share of frames in which each pixel moves.
         mse: each frame's mean squared difference, values 0–1.
     """
 
@@ -60,10 +60,10 @@ def grey(frame: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
 
 
 def motion_masks(frames: UInt8[np.ndarray, "T H W 3"]) -> Bool[np.ndarray, "T H W"]:
-    """Returns what moves: pixels that differ by more than ``THRESHOLD`` from the running average; none in frame 0.
+    """Returns the pixels that move: those that differ by more than ``THRESHOLD`` from the running average.
 
-    The average is updated before the comparison, and rounded for it. Then specks are removed (opening by 5×5 pixels)
-    and gaps are filled (closing).
+    No pixel moves in frame 0. The average is updated before the comparison, and rounded for the comparison. Then
+    specks are removed (opening by 5×5 pixels) and gaps are filled (closing).
     """
     average = grey(frames[0]).astype(np.float64)
     masks = [np.zeros(average.shape, np.uint8)]
@@ -76,7 +76,7 @@ def motion_masks(frames: UInt8[np.ndarray, "T H W 3"]) -> Bool[np.ndarray, "T H 
 
 
 def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
-    """Makes the masks of videos, and reduces both to a quarter of their size with bilinear interpolation.
+    """Makes the masks of videos, and resizes masks and frames to a quarter of their size with bilinear interpolation.
 
     Raises:
         Unavailable: the frames are smaller than 4×4 pixels.
@@ -93,7 +93,7 @@ def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
 
 
 def four_metrics(truth: Small, prediction: Small, first: int = 0) -> Four:
-    """Scores the frames from ``first`` on. Masks of which both are empty score 1."""
+    """Scores the frames from ``first`` on. Where both masks are empty, the score is 1."""
     a, b = truth.masks[:, first:], prediction.masks[:, first:]
     one, other = (videos.frames[:, first:].astype(np.float32) / 255 for videos in (truth, prediction))
     return Four(
@@ -111,18 +111,18 @@ def _iou(one: np.ndarray, other: np.ndarray) -> Float[np.ndarray, "..."]:
 
 
 def physics_iq_score(prediction: Four, second_take: Four) -> float:
-    """Returns Physics-IQ's own score, 0–100: how near a prediction comes to what two recordings have in common.
+    """Returns Physics-IQ's own score, 0–100: how close a prediction comes to the agreement of two recordings.
 
-    100·[(ST / ST₂ + S / S₂ + W / W₂) / 3 - (MSE - MSE₂)], clipped, where each is a mean over all clips and frames and
-    the index 2 marks the scores of a second take. As in the public code, single frames are rounded to 4 decimals, the
-    second take's means to 4 (S₂ to 5), and the result to 2.
+    100·[(ST / ST₂ + S / S₂ + W / W₂) / 3 - (MSE - MSE₂)], clipped, where each symbol is a mean over all clips and
+    frames and the index 2 marks the scores of a second take. As in the public code, the scores of single frames are
+    rounded to 4 decimals, the second take's means to 4 (S₂ to 5), and the result to 2.
 
     Args:
         prediction: the model's metrics against the first take.
-        second_take: those of the second take against the first.
+        second_take: the metrics of the second take against the first.
 
     Raises:
-        Unavailable: no motion of the second take is where the first one's is.
+        Unavailable: ST₂, S₂ or W₂ is 0, because the motions of the two takes do not overlap.
     """
     mean, limit = _means(prediction), _means(second_take)
     limit = {name: round(value, 5 if name == "spatial" else 4) for name, value in limit.items()}
@@ -156,7 +156,7 @@ def _four(scene: Scene, first: int) -> Four:
 
 
 def _register(kind: Kind, title: str, better: Literal["higher", "lower"], **settings: Any) -> None:
-    """Registers one of the four: over the predicted frames, and as ``_all_frames`` over the prompt's too."""
+    """Registers one of the four metrics: over the predicted frames, and as ``_all_frames`` including the prompt."""
 
     @metric(f"physics_iq_{kind}", f"Physics-IQ {title}", better=better, column=False, **settings)
     def score(scene: Scene) -> Scores:
@@ -166,7 +166,7 @@ def _register(kind: Kind, title: str, better: Literal["higher", "lower"], **sett
 
 
 def _masks(scene: Scene) -> tuple[Bool[np.ndarray, "B P h w"], Bool[np.ndarray, "B P h w"]]:
-    """Returns what moves in the predicted frames: truth, prediction."""
+    """Returns the pixels that move in the predicted frames of truth and prediction."""
     truth, prediction = scene.of_truth(_small_truth), scene.shared(_small)
     return truth.masks[:, scene.prompt_frames :], prediction.masks[:, scene.prompt_frames :]
 
@@ -201,5 +201,5 @@ _register("mse", "MSE", "lower", decimals=4, per_frame=mse_frames)
 
 @metric("physics_iq_score", "Physics-IQ score", better="higher", decimals=2, column=False)
 def score(scene: Scene) -> Scores:
-    """Scores all clips together, with their prompts."""
+    """Scores all clips together, including their prompts."""
     return physics_iq_score(scene.shared(_four, 0), scene.of_truth(_second_take))

@@ -19,7 +19,7 @@ def per_frame(scene: Scene) -> PerFrame:
 
 @metric("psnr", "PSNR", unit="dB", better="higher", decimals=2, watch=True, per_frame=per_frame)
 def score(scene: Scene) -> Scores:
-    """Scores the mean over each clip's predicted frames, and over the second half of them as ``_second_half``."""
+    """Returns the mean over each clip's predicted frames, and over the second half of them as ``_second_half``."""
     frames = scene.shared(per_frame)
     return {"": frames.mean(-1), "_second_half": frames[:, frames.shape[-1] // 2 :].mean(-1)}
 

@@ -2,7 +2,7 @@
 
 A pixel counts in a frame if, in this or an earlier predicted frame, the true clip differed from the last prompt frame
 by more than 10 grey levels of 255, after the grey frames were blurred by a Gaussian of 5×5 pixels (the threshold and
-blur of Physics-IQ). So a pixel counts on when things have moved away again, and only the truth decides.
+blur of Physics-IQ). So a pixel still counts after things have moved away from it, and only the truth decides.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ def per_frame(scene: Scene) -> PerFrame:
 
 @metric("psnr_motion", "PSNR where it moves", unit="dB", better="higher", decimals=2, per_frame=per_frame)
 def score(scene: Scene) -> PerClip:
-    """Scores the mean over the predicted frames that have a score; clips in which nothing moves are left out."""
+    """Returns the mean over the predicted frames that have a score; clips in which nothing moves are left out."""
     frames = scene.shared(per_frame)
     moving = frames[np.isfinite(frames).any(1)]
     if not len(moving):
@@ -42,7 +42,7 @@ def moved(frames: UInt8[np.ndarray, "T H W 3"], prompt_frames: int = 1) -> Bool[
 def psnr_where(
     truth: UInt8[np.ndarray, "*B H W 3"], prediction: UInt8[np.ndarray, "*B H W 3"], mask: Bool[np.ndarray, "*B H W"]
 ) -> Float[np.ndarray, "*B"]:
-    """Returns the PSNR in dB over the masked pixels of each frame, at most 100 dB; NaN without any."""
+    """Returns the PSNR in dB over the masked pixels of each frame, at most 100 dB; NaN without masked pixels."""
     squares = np.square(truth.astype(np.float32) - prediction.astype(np.float32)).mean(-1)
     pixels = mask.sum((-2, -1))
     mse = np.where(mask, squares, 0).sum((-2, -1), dtype=np.float64) / np.maximum(pixels, 1)

@@ -29,7 +29,7 @@ def per_frame(scene: Scene) -> PerFrame:
 
 @metric("ssim", "SSIM", better="higher", decimals=3, per_frame=per_frame)
 def score(scene: Scene) -> PerClip:
-    """Scores the mean over each clip's predicted frames."""
+    """Returns the mean over each clip's predicted frames."""
     return scene.shared(per_frame).mean(-1)
 
 
@@ -50,7 +50,7 @@ def ssim(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"]) -> F
     rows, columns = _blur_matrix(height), _blur_matrix(width)
 
     def blur(x: Array) -> Array:
-        # The GPU's default precision is too low for the small differences that are the variances.
+        # The GPU's default precision is too low: the variances are small differences of large numbers.
         return jnp.einsum("ih,...hwc,jw->...ijc", rows, x, columns, precision=jax.lax.Precision.HIGHEST)
 
     mean_x, mean_y = blur(truth), blur(prediction)

@@ -1,6 +1,6 @@
 """Cross-entropy and accuracy of each frame's tokens, predicted from the true frames before it (as 1xgpt reports them).
 
-The whole frame is masked. Both compare models that share a tokenizer, and say nothing across tokenizers.
+The whole predicted frame is masked. Both scores compare only models that share a tokenizer.
 """
 
 import numpy as np
@@ -29,13 +29,13 @@ def accuracy_frames(scene: Scene) -> PerFrame:
     per_frame=cross_entropy_frames,
 )
 def cross_entropy(scene: Scene) -> Scores:
-    """Scores the sum over vocabularies, of RGB's tokens and, as ``_depth``, of depth's."""
+    """Returns the cross-entropy, summed over vocabularies, of RGB tokens and, as ``_depth``, of depth tokens."""
     return _by_branch(_result(scene).cross_entropy)
 
 
 @metric("token_accuracy", "token accuracy", better="higher", decimals=4, column=False, per_frame=accuracy_frames)
 def accuracy(scene: Scene) -> Scores:
-    """Scores the share of cells whose most probable token is right, of RGB and, as ``_depth``, of depth."""
+    """Returns the share of cells whose most probable token is right, for RGB and, as ``_depth``, for depth."""
     return _by_branch(_result(scene).accuracy)
 
 
