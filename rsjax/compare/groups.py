@@ -1,4 +1,4 @@
-"""The groups of a comparison: runs that differ in their seed alone, with their results by one protocol."""
+"""Reads the groups of a comparison: runs that differ only in their seed, with their results under one protocol."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,24 +14,24 @@ from rsjax.evaluation.protocols import OWN
 from rsjax.evaluation.results import NAME, Result, read_result
 from rsjax.pipeline.evaluations import FOLDER
 
-# What results must have in common, by field of :class:`Result`; the rest is told, not refused.
+# What results must have in common, by field of :class:`Result`. Differences in NOTED are reported, not refused.
 ALIKE = {
     "protocol": None,
     "settings": None,
     "data": ("key", "split", "frames", "image_size", "fps"),
 }
 MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
-SEEDED = ("family", "preset", "settings", "training")  # of a result's model, what the runs of a group have in common
+SEEDED = ("family", "preset", "settings", "training")  # fields of a result's model that are equal within a group
 NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs of one kind, with a result each.
+    """Runs that differ only in their seed, with one result for each.
 
     Attributes:
-        results: one for each run, mostly seeds.
-        folders: of the results, in the same order.
+        results: one for each run.
+        folders: the folders of the results, in the same order.
     """
 
     name: str
@@ -40,12 +40,12 @@ class Group:
 
 
 def parse_group(text: str) -> tuple[str, tuple[Path, ...]]:
-    """Returns name and run directories of ``NAME=RUN,RUN…`` or of one ``RUN``, which is named by its directory.
+    """Returns the name and the run directories of ``NAME=RUN,RUN…``, or of one ``RUN``, whose directory is the name.
 
     A run may be a pattern such as ``runs/grid/model.use_depth=True,*``. Directories may have commas in their names.
 
     Raises:
-        ConfigError: a directory does not exist, or a pattern fits none.
+        ConfigError: a directory does not exist or is named twice, or a pattern matches no directory.
     """
     if Path(text).is_dir():
         return Path(text).resolve().name, (Path(text),)
@@ -76,11 +76,12 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
 
     Args:
         texts: groups as :func:`parse_group` takes them.
-        label: the results' label, such as ``paper``; None: the only one that all runs have, but "run" only if alone.
+        label: the results' label, such as ``paper``; None: the only label that all runs have in common, where "run"
+            counts only if there is no other.
 
     Raises:
-        UserError: two groups have one name, a run has no such result, results cannot be put side by side, or runs of a
-            group differ in more than their seed or are one training.
+        UserError: two groups have the same name, a run has no such result, results cannot be put side by side, or runs
+            of a group differ in more than their seed or are the same training.
     """
     named = [parse_group(text) for text in texts]
     for name, count in Counter(name for name, _ in named).items():
@@ -98,13 +99,13 @@ def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
 
 
 def results_of(run: Path) -> dict[str, Path]:
-    """Returns the folders of a run's results by label; "run" is that of its evaluation stage."""
+    """Returns the folders of a run's results by label; "run" is the label of its evaluation stage."""
     own = {OWN: run / "evaluation"} if (run / "evaluation" / NAME).exists() else {}
     return own | {path.parent.name: path.parent for path in sorted((run / FOLDER).glob(f"*/{NAME}"))}
 
 
 def _common(runs: Sequence[Path]) -> str:
-    """Returns the label that all runs have."""
+    """Returns the label that all runs have in common."""
     common = set.intersection(*(set(results_of(run)) for run in runs))
     chosen = sorted(common - {OWN} or common)
     labels = " ".join(map(str, runs))
@@ -142,11 +143,11 @@ def check_alike(groups: Sequence[Group]) -> None:
 
 
 def check_seeds(group: Group) -> None:
-    """Raises :class:`UserError` if a group's runs differ in more than their seed, or two of them are one training."""
+    """Raises :class:`UserError` if a group's runs differ in more than their seed, or two are the same training."""
     first, trained = group.results[0].model, dict[str, str]()
     for model in (result.model for result in group.results):
         there, here = _deciding(first), _deciding(model)
-        pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some
+        pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some fields
         lines = [f"model.{name} is {a} in the first, {b} in the other" for name, (a, b) in pairs.items() if a != b]
         runs = f"{group.name}: {first['run']} and {model['run']}"
         require(not lines, f"{runs} differ in more than their seed: {'; '.join(lines)}; make them groups of their own")
@@ -157,7 +158,7 @@ def check_seeds(group: Group) -> None:
 
 
 def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the :data:`SEEDED` fields of a result's model that decide scores, by dotted name."""
+    """Returns the :data:`SEEDED` fields of a result's model that affect scores, by dotted name."""
     known = _known(model)
     later = {f"settings.{name}": leaf.value for name, leaf in known.items() if leaf.added}
     named = later | _flat({name: model[name] for name in SEEDED if name in model})
@@ -166,7 +167,7 @@ def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _known(model: Mapping[str, Any]) -> dict[str, Leaf]:
-    """Returns the default settings of a model's family by dotted name; results from before one was added lack it."""
+    """Returns a family's default settings by dotted name; a result lacks settings that were added after it was made."""
     kind = FAMILIES.get(model["family"])
     return leaves(kind()) if kind else {}
 
@@ -179,7 +180,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...] | None]) -> list[str]:
-    """Returns a line for each of these fields in which two results are known to differ."""
+    """Returns a line for each of the wanted fields in which two results are known to differ."""
     lines = []
     for section, names in wanted.items():
         there, here = _section(first, section), _section(other, section)
@@ -200,7 +201,7 @@ def _section(result: Result, name: str) -> dict[str, Any]:
 
 
 def noted(groups: Sequence[Group]) -> list[str]:
-    """Returns what the results differ in that does not forbid a comparison, one line for each group."""
+    """Returns the differences between results that do not forbid a comparison, one per line."""
     first, lines = groups[0].results[0], []
     for group in groups:
         found = dict.fromkeys(line for result in group.results for line in differing(first, result, NOTED))

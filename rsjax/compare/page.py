@@ -1,4 +1,4 @@
-"""A comparison as one self-contained HTML page: tables, curves over the frames, film strips of the same clips."""
+"""Writes a comparison as one self-contained HTML page: tables, curves over frames, film strips of the same clips."""
 
 import textwrap
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ from rsjax.report.figures import ClipFigure, filmstrip
 from rsjax.report.page import template_environment
 from rsjax.report.video import webp_uri
 
-LABEL = 18  # letters in a line of a film strip's labels
+LABEL = 18  # letters per line in a film strip's labels
 COLORS = ("#3b7dd8", "#d9480f", "#3f9a63", "#8f5bd1", "#b8860b", "#c2417c", "#1b8a9c", "#6b7280")
 
 
 @dataclass(frozen=True)
 class ComparedClip(ClipFigure):
-    """A clip with the frames of every entry.
+    """A clip with frames for each entry.
 
     Attributes:
         others: label and frames of each row below the truth.
@@ -48,7 +48,7 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
     """Writes the page atomically.
 
     Args:
-        command: the command that repeats it.
+        command: the command that repeats the comparison.
     """
     notes, shown = Footnotes(), strips(comparison)
     html = (
@@ -74,7 +74,7 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
 
 
 def strips(comparison: Comparison) -> list[ComparedClip]:
-    """Returns the clips of :func:`_chosen` with the frames of the first run of each group."""
+    """Returns the clips of :func:`_chosen` with the frames of each group's first run."""
     try:
         kept = [read_frames(group.folders[0]) for group in comparison.groups]
     except UserError as error:
@@ -93,13 +93,14 @@ def strips(comparison: Comparison) -> list[ComparedClip]:
 
 
 def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, str]:
-    """Returns the clips to show by row, and why: those that move most and least, then the worst and the best.
+    """Returns the rows of the clips to show, and why: most and least motion, then the worst and the best.
 
-    The first frame repeated has the lowest PSNR where most moves. All clips are ranked by it, as every result keeps
-    both ends; the worst and the best by the reference's own PSNR are of the kept clips alone.
+    The baseline that repeats the first frame has the lowest PSNR where most moves. All clips are ranked by it, because
+    every result keeps the frames of both ends. The worst and the best clips by the reference's own PSNR are chosen
+    among the kept clips only.
 
     Args:
-        rows: of the clips whose frames every group has.
+        rows: the rows of the clips whose frames every group has.
     """
     results, name = comparison.reference.group.results, comparison.reference.name
     own = np.mean([each.per_clip["psnr"] for each in results], axis=0)
@@ -123,7 +124,7 @@ def _of_clip(frames: dict[str, np.ndarray], row: int) -> dict[str, np.ndarray]:
 
 
 def _reconstructions(comparison: Comparison, kept: Sequence[dict[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
-    """Returns the reconstruction by each tokenizer that differs from those before it."""
+    """Returns the reconstructions by the groups' tokenizers, each distinct one once."""
     found: list[tuple[str, np.ndarray]] = []
     for group, frames in zip(comparison.groups, kept, strict=True):
         if "reconstruction" in frames:
@@ -138,7 +139,7 @@ def _label(name: str) -> str:
 
 
 def _curves(comparison: Comparison) -> str:
-    """Draws each metric's curve over the predicted frames, a line for each entry, the mean over its seeds."""
+    """Draws a chart for each metric over the predicted frames; a line is the mean over an entry's seeds."""
     charts = [_chart(comparison, metric) for metric in comparison.metrics if _lines(comparison, metric)]
     return charts_svg(charts, "scores frame by frame", legend=True, height=2.3) if charts else ""
 

@@ -1,6 +1,7 @@
 """Published numbers of RoboScape (arXiv 2506.23135): Tables 1 and 2, and the authors' answers to reviewers.
 
-They are of other data (AgiBot-World), resolution and clips, so they stand beside ours and no test compares them.
+They were measured on other data (AgiBot-World), at another resolution and on other clips. So they are shown next to
+our numbers, but no statistical test compares them.
 """
 
 from collections.abc import Mapping
@@ -37,7 +38,7 @@ _FAMILIES |= {"cogvideox": "CogVideoX"}
 
 
 def published_name(model: Mapping[str, Any]) -> str | None:
-    """Returns the row of the paper's tables that a model of this family and these settings stands for, if any."""
+    """Returns the row of the paper's tables that corresponds to a model's family and settings, if there is one."""
     name, settings = _FAMILIES.get(model["family"]), model.get("settings", {})
     if name != "RoboScape":
         return name
@@ -47,7 +48,7 @@ def published_name(model: Mapping[str, Any]) -> str | None:
 
 
 def published(name: str, protocol: str) -> dict[str, float]:
-    """Returns the published scores of one row by metric, "lpips" and "depth_absrel" without net or alignment."""
+    """Returns the published scores of one row by metric; the names leave out LPIPS network and depth alignment."""
     if protocol == "unseen":
         return dict(_UNSEEN.get(name, {}))
     if protocol not in ("paper", "run"):
@@ -58,7 +59,10 @@ def published(name: str, protocol: str) -> dict[str, float]:
 
 
 def score_of(scores: Mapping[str, float], metric: str, depth_suffix: str) -> float | None:
-    """Returns the published score that belongs beside one of our metrics; the paper names neither net nor alignment."""
+    """Returns the published score to show next to one of our metrics.
+
+    The paper states neither the LPIPS network nor the depth alignment.
+    """
     if metric in ("lpips_alex", "lpips_vgg"):
         return scores.get("lpips")
     if metric in _PHYSICS:

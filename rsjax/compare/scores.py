@@ -1,4 +1,4 @@
-"""The numbers of a comparison: means over seeds, intervals over seeds and clips, differences and what they show.
+"""Computes the numbers of a comparison: means over seeds, intervals over seeds and clips, differences and findings.
 
 Axes: S seeds, B clips.
 """
@@ -20,7 +20,7 @@ from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
 
 BASELINES = {"_repeat_first": "first frame repeated", "_tokenizer": "tokenizer's reconstruction"}
-BEST = "_incl_ctx"  # ends the names of scores of the best of several samples
+BEST = "_incl_ctx"  # the names of scores of the best of several samples end with this
 Finding = Literal["better", "worse", "cannot tell", "same"]
 
 
@@ -29,7 +29,7 @@ class Entry:
     """A column of the comparison: a group's prediction, or a baseline of one.
 
     Attributes:
-        suffix: of the names of its scores: "" for the prediction, otherwise one of :data:`BASELINES`.
+        suffix: the suffix of its scores' names: "" for the prediction, otherwise one of :data:`BASELINES`.
     """
 
     name: str
@@ -37,18 +37,18 @@ class Entry:
     suffix: str = ""
 
     def score(self, metric: Metric) -> str:
-        """Returns the name of its score in a result, such as ``psnr_tokenizer_second_half``."""
+        """Returns the name of the entry's score in a result, such as ``psnr_tokenizer_second_half``."""
         base = base_of(metric.name)
         return f"{base}{self.suffix}{metric.name.removeprefix(base)}"
 
     def seeds(self, metric: Metric) -> list[float]:
-        """Returns each seed's score over all clips; empty where a result has none."""
+        """Returns each seed's score over all clips; an empty list if any result has no score."""
         values = [result.metrics.get(self.score(metric)) for result in self.group.results]
         known = [float(value) for value in values if value is not None and math.isfinite(value)]
         return known if len(known) == len(values) else []
 
     def per_clip(self, metric: Metric) -> Float[np.ndarray, "S B"] | None:
-        """Returns the clips' scores; None where a result has none."""
+        """Returns the clips' scores; None if a result has none, or the results' numbers of scores differ."""
         rows = [result.per_clip.get(self.score(metric), []) for result in self.group.results]
         return np.array(rows) if rows[0] and len({len(row) for row in rows}) == 1 else None
 
@@ -64,7 +64,7 @@ class Cell:
 
     Attributes:
         spread: mean and standard deviation over seeds; None without a score.
-        interval: of the same mean, over seeds and clips; None for a score of the whole set.
+        interval: the interval of this mean over seeds and clips; None for a score of the whole set.
         reason: why there is no score.
     """
 
@@ -75,12 +75,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Difference:
-    """An entry's score less the reference's.
+    """An entry's score minus the reference's.
 
     Attributes:
-        interval: over seeds and clips, paired; None where clips have no scores of their own.
-        welch: over seeds; None with fewer than two seeds each.
-        finding: "better" or "worse" only if every interval there is says so; "same": all clips score alike.
+        interval: over seeds and clips, paired; None if single clips have no scores.
+        welch: over seeds; None for baselines and with fewer than two seeds each.
+        finding: "better" or "worse" only if all existing intervals say so; "same" if they are all exactly 0.
     """
 
     interval: Estimate | None
@@ -89,7 +89,7 @@ class Difference:
 
 
 def entries_of(groups: Sequence[Group]) -> list[Entry]:
-    """Returns the groups' predictions, and both baselines: once if they score alike for all groups."""
+    """Returns the groups' predictions and both baselines; a baseline appears once if it scores alike in all groups."""
     entries = [Entry(group.name, group) for group in groups]
     psnr = metrics()["psnr"]
     for suffix, name in BASELINES.items():
@@ -103,10 +103,10 @@ def entries_of(groups: Sequence[Group]) -> list[Entry]:
 
 
 def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
-    """Returns the metrics to compare: those of tables and the protocol's depth scores, or those that fit patterns.
+    """Returns the metrics to compare: those of tables with the protocol's depth scores, or those that match patterns.
 
     Raises:
-        ConfigError: no metric of the results fits a pattern.
+        ConfigError: a pattern matches no metric of the results.
     """
     results = [result for group in groups for result in group.results]
     names = dict.fromkeys(name for result in results for name in result.metrics)
@@ -134,12 +134,12 @@ def _depth_suffix(groups: Sequence[Group]) -> str:
 
 
 def base_of(score: str) -> str:
-    """Returns the name of the registered metric that a score belongs to, the longest that begins it; "" without."""
+    """Returns the registered metric that a score belongs to: the longest name that the score's begins with, or ""."""
     return max((name for name in metrics() if f"{score}_".startswith(f"{name}_")), key=len, default="")
 
 
 def _parts(names: Collection[str]) -> list[Metric]:
-    """Returns the metrics of scores such as ``delta_psnr_t4``, of which those of the best of samples are for tables."""
+    """Returns metrics for scores such as ``delta_psnr_t4``; only those of the best of samples are table columns."""
     found = []
     for name in names:
         base = base_of(name)

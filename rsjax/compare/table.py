@@ -1,4 +1,4 @@
-"""A comparison as Markdown, CSV and JSON."""
+"""Computes a comparison and writes it as Markdown, CSV and JSON."""
 
 import csv
 import io
@@ -22,11 +22,12 @@ class Comparison:
 
     Attributes:
         entries: groups, then baselines.
-        reference: the group that the others are compared with.
+        reference: the entry that the others are compared with.
         cells: by metric, one for each entry.
-        differences: likewise, from the reference; None for the reference itself and where a score is missing.
+        differences: from the reference, by metric, one for each entry; None for the reference itself and where a score
+            is missing.
         papers: published row → its scores by metric.
-        notes: what the results differ in that does not forbid a comparison.
+        notes: differences between the results that do not forbid a comparison.
     """
 
     groups: Sequence[Group]
@@ -45,7 +46,7 @@ class Comparison:
 
     @property
     def title(self) -> str:
-        """Says what was compared on what."""
+        """The protocol, the scored clips and their size, in words."""
         result = self.groups[0].results[0]
         data = result.data
         return (
@@ -55,11 +56,11 @@ class Comparison:
 
 
 def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = "") -> Comparison:
-    """Computes all numbers.
+    """Computes all numbers of a comparison.
 
     Args:
         only: names or patterns of metrics; empty: those of tables.
-        against: the group that others are compared with; empty: the first.
+        against: the group that the others are compared with; empty: the first one.
 
     Raises:
         ConfigError: there is no such group or metric.
@@ -87,7 +88,7 @@ def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = ""
 
 
 def published_score(comparison: Comparison, metric: Metric, name: str) -> float | None:
-    """Returns a published score of the row ``name`` beside one of our metrics."""
+    """Returns the score in the published row ``name`` to show next to one of our metrics."""
     protocol = comparison.protocol
     plain = protocol["depth_alignment"] == "none"
     suffix = "" if plain else f"_{protocol['depth_alignment']}_{protocol['depth_source']}"
@@ -102,7 +103,7 @@ def header(comparison: Comparison) -> list[str]:
 
 
 def score_rows(comparison: Comparison, notes: Footnotes) -> list[list[str]]:
-    """Returns a row for each metric: mean ± deviation over seeds and the interval, then the published numbers."""
+    """Returns a row for each metric: each entry's mean ± deviation over seeds and interval, then published numbers."""
     rows = []
     for metric in comparison.metrics:
         cells = [_cell_text(each, metric, notes) for each in comparison.cells[metric.name]]
@@ -162,7 +163,7 @@ def legend(comparison: Comparison) -> list[str]:
 
 
 def as_markdown(comparison: Comparison) -> str:
-    """Returns both tables with their legend and the reasons for absent numbers."""
+    """Returns the tables of scores and of differences, with their legend and the reasons for absent numbers."""
     notes = Footnotes()
     scores = _markdown(header(comparison), score_rows(comparison, notes))
     differences = _markdown(DIFFERENCES, difference_rows(comparison))
@@ -195,7 +196,7 @@ _FIELDS = (
 
 
 def _records(comparison: Comparison) -> list[dict[str, Any]]:
-    """Returns a record for each metric and entry, and for each published number, by the names in the CSV."""
+    """Returns a record for each metric and entry, and for each published number; its keys are the CSV's columns."""
     out = []
     for metric in comparison.metrics:
         found = zip(comparison.entries, comparison.cells[metric.name], comparison.differences[metric.name], strict=True)
@@ -218,12 +219,12 @@ def _change(change: Difference) -> dict[str, Any]:
         row |= named | {"difference_high": change.interval.high}
     if change.welch is None:
         return row
-    t = change.welch.t if math.isfinite(change.welch.t) else None  # infinite where no seed varies, which JSON is not
+    t = change.welch.t if math.isfinite(change.welch.t) else None  # t is infinite if no seed varies; JSON has no infinity
     return row | {"t": t, "df": change.welch.df, "p": change.welch.p}
 
 
 def as_json(comparison: Comparison) -> dict[str, Any]:
-    """Returns the same with protocol, data and what made each result."""
+    """Returns the records of the CSV with protocol, data and the origin of each result."""
     first = comparison.groups[0].results[0]
     made = {
         group.name: [
