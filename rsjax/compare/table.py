@@ -219,7 +219,7 @@ def _change(change: Difference) -> dict[str, Any]:
         row |= named | {"difference_high": change.interval.high}
     if change.welch is None:
         return row
-    t = change.welch.t if math.isfinite(change.welch.t) else None  # t is infinite if no seed varies; JSON has no infinity
+    t = change.welch.t if math.isfinite(change.welch.t) else None  # infinite if no seed varies; JSON has no infinity
     return row | {"t": t, "df": change.welch.df, "p": change.welch.p}
 
 
