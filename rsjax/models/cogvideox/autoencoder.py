@@ -1,8 +1,8 @@
 """Trains CogVideoX's autoencoder on the frames of clips, and encodes and decodes videos with the trained one.
 
-Videos are filled up to 8k + 1 frames by repeating the last, as in the public fine-tuner: of other lengths the public
-code loses frames. Latents are standardised channel by channel by numbers in the parameters ("latents"): the public
-factor for public weights, and for a trained autoencoder what its training fits to its latents.
+Videos are padded to 8k + 1 frames by repeating the last frame, as in the public fine-tuner: the public code loses
+frames of videos of other lengths. Latents are standardised channel by channel, with numbers in the parameters
+("latents"): for public weights the public factor, and for a trained autoencoder numbers that its training fits.
 
 Axes: B videos, T frames, H×W pixels, t latent frames of h×w cells, z latent channels, D draws.
 """
@@ -35,14 +35,14 @@ from rsjax.tokenizers.magvit2 import to_pixels, to_unit
 from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
-Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's noise
+Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's noise
 
-CHUNK_PIXELS = CHUNK * 64**2  # of frames per pass, to bound memory
+CHUNK_PIXELS = CHUNK * 64**2  # pixels per pass, at most, to bound memory
 FREE = {"kl_weight", "image_draws", "image_noise"}
 
 
 def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
-    """Returns fresh parameters of "encoder", "decoder" and "latents"."""
+    """Returns initial parameters of "encoder", "decoder" and "latents"."""
     z, size = config.latent_channels, 2 * config.downsampling
     return {
         "encoder": vae.Encoder(config).init(key, jnp.zeros((1, 1, size, size, 3)))["params"],
@@ -53,7 +53,7 @@ def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
 
 @dataclass(frozen=True)
 class CausalVAETraining(Autoencoder[Batch]):
-    """Learns to reconstruct consecutive frames from a sample of their posterior."""
+    """Trains the autoencoder to reconstruct consecutive frames from a sample of their posterior."""
 
     config: CausalVAEConfig
     train: TokenizerTrainConfig
@@ -85,7 +85,7 @@ class CausalVAETraining(Autoencoder[Batch]):
         return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and perhaps "perceptual"."""
+        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and "perceptual" if it is on."""
         frames = to_unit(batch["frames"])
         mean, log_variance = distributions.posterior(vae.encode(self.config, params, frames))
         latents = distributions.draw(mean, log_variance, key, batch["index"])
@@ -124,7 +124,7 @@ class CausalVAETraining(Autoencoder[Batch]):
         """Returns the shapes of saved weights.
 
         Raises:
-            UserError: they are missing or of another network; the message names the differing fields.
+            UserError: the weights are missing or of another network; the message names the differing fields.
         """
         saved = read_model(directory, CogVideoXConfig, "tokenizer").autoencoder
         check_alike(directory, saved, self.config, FREE, "model.autoencoder")
@@ -132,19 +132,19 @@ class CausalVAETraining(Autoencoder[Batch]):
 
 
 def notes_on_filling(what: str, frames: int) -> list[str]:
-    """Returns a line that says how many frames are encoded, unless they are those given."""
+    """Returns a line that says to how many frames videos are padded; none if they need no padding."""
     whole = padded_frames(frames)
     return [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"] * (whole != frames)
 
 
 def filled(frames: np.ndarray, axis: int) -> np.ndarray:
-    """Repeats the last frame until there are 8k + 1."""
+    """Repeats the last frame until there are 8k + 1 frames."""
     count = frames.shape[axis]
     return frames.take(np.minimum(np.arange(padded_frames(count)), count - 1), axis)
 
 
 def _window(count: int, flip: bool, record: Record, rng: np.random.Generator) -> Arrays:
-    """Returns ``frames``: consecutive ones of a clip, at most ``count``, filled up to 8k + 1."""
+    """Returns ``frames``: at most ``count`` consecutive frames of a clip, padded to 8k + 1."""
     rgb = record["rgb"]
     first = rng.integers(0, max(0, len(rgb) - count) + 1)
     frames = filled(rgb[first : first + count], 0)
@@ -153,7 +153,7 @@ def _window(count: int, flip: bool, record: Record, rng: np.random.Generator) ->
 
 @dataclass(frozen=True)
 class CausalCodec:
-    """A trained autoencoder that takes and returns numpy arrays. Its latents are standardised."""
+    """A trained autoencoder that takes and returns numpy arrays. The latents are standardised."""
 
     config: CausalVAEConfig
     params: Params
@@ -164,7 +164,7 @@ class CausalCodec:
         return self._encode(filled(video.rgb, 1)) | {"frames": count}
 
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
-        """Returns the frames of latents "mean", an odd number of latent frames, cut to "frames" if there are any."""
+        """Decodes "mean", the latents of an odd number of latent frames, and keeps "frames" frames if that is given."""
         latents = np.asarray(tokens["mean"])
         pixels = latents.shape[1] * 4 * (latents.shape[-2] * self.config.downsampling) ** 2
         frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, CHUNK_PIXELS // pixels))
@@ -173,10 +173,10 @@ class CausalCodec:
     def images(
         self, rgb: UInt8[np.ndarray, "B H W 3"], rng: np.random.Generator | None = None
     ) -> dict[str, np.ndarray]:
-        """Returns the latents of images that a video begins with, "mean" and "deviation", (B, D, h, w, z).
+        """Returns the latents of the images that videos begin with, "mean" and "deviation", (B, D, h, w, z).
 
         Args:
-            rng: draws the noise of ``config.image_draws`` noisy images; None: of the images as they are, D = 1.
+            rng: draws the noise of ``config.image_draws`` noisy copies; None: the images get no noise and D is 1.
         """
         draws = self.config.image_draws if rng is not None else 0
         pixels = np.repeat(rgb[:, None], max(1, draws), axis=1).astype(np.float32)

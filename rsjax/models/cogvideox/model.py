@@ -1,4 +1,4 @@
-"""CogVideoX as a family: latents of the clips, the error of the velocity, rollouts from pixels to pixels.
+"""The CogVideoX family: makes the clips' latents, computes the velocity's error, and generates videos.
 
 Axes: B clips, T frames, F latent frames of h×w cells with C channels, D noisy encodings of an image.
 """
@@ -70,7 +70,7 @@ class CogVideoX(WorldModel[Batch]):
         return Transformer(self.architecture).init_params(key)
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns "error": the mean square error of the velocity in all latent frames that carry noise."""
+        """Returns "error": the mean squared error of the velocity over all noisy latent frames."""
         noise, latents, channels = self.config.noise, batch["latents"], self.config.image == "channels"
 
         def draw(index: Int[Array, ""]) -> tuple[Array, Array]:
@@ -95,7 +95,7 @@ class CogVideoX(WorldModel[Batch]):
         check_store(self.config.text, clips)
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
-        """Makes the latents of every clip and its image, stored beside the clips for all runs with this autoencoder.
+        """Encodes every clip and its image; stores the latents beside the clips for all runs with this autoencoder.
 
         Raises:
             UserError: a task of the clips has no text.
@@ -139,7 +139,7 @@ class CogVideoX(WorldModel[Batch]):
         index: Int[np.ndarray, " B"] | None = None,
         depth: bool = True,
     ) -> Video:
-        """Generates the videos that follow the prompts' last frames and their tasks; of actions only T counts."""
+        """Generates videos from the prompts' last frames and tasks; reads only the length T of the actions."""
         numbers, frames = np.arange(len(prompt)) if index is None else np.asarray(index), actions.shape[1]
         codec = self._codec(assets)
         return Video(rollout(self.architecture, codec, self.clips.frames, params, prompt, frames, numbers))
@@ -164,7 +164,7 @@ class CogVideoX(WorldModel[Batch]):
 
 
 def latent_arrays(text: TextConfig, image_dropout: float, record: Record, rng: np.random.Generator) -> Arrays:
-    """Returns samples of a record's posteriors, of one of its noisy images or zeros, and its text or the empty one."""
+    """Samples the latents of a record and of one of its noisy images (or zeros); adds its text or the empty text."""
     latents, images = (
         record[f"{name}mean"].astype(np.float32)
         + record[f"{name}deviation"] * rng.standard_normal(record[f"{name}mean"].shape, np.float32)
@@ -173,6 +173,6 @@ def latent_arrays(text: TextConfig, image_dropout: float, record: Record, rng: n
     image = images[rng.integers(len(images))] * np.float32(rng.random() >= image_dropout)
     if rng.random() < text.dropout:
         shown = empty_texts(text, 1)[0]
-    else:  # random records for benchmarks have their own text
+    else:  # the random records of benchmarks contain their text
         shown = record["text"] if "text" in record else texts_of(text, [record["task"]], 1)[0]
     return {"latents": latents, "image": image, "text": shown}

@@ -1,4 +1,4 @@
-"""Starts training from another run's transformer, or from a public one that was converted."""
+"""Starts training from another run's transformer, or from a converted public one."""
 
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from rsjax.models.saved import check_alike, read_model
 from rsjax.progress import note
 from rsjax.trainable import Params
 
-# Settings that parameters do not depend on, or that are compared below.
+# Settings that the parameters do not depend on, or that are compared below.
 FREE = {"autoencoder", "text", "image", "image_dropout", "stretch", "learned_positions", "compute_dtype", "remat"}
 FREE |= {"error_weight", "noise", "sample"}
 
 
 def saved_architecture(saved: CogVideoXConfig) -> Architecture:
-    """Returns a network with the parameters of saved settings, for any clips if it has no learned positions."""
+    """Returns a network whose parameters are those of saved settings; without learned positions it suits any clips."""
     frames, rows, columns = saved.learned_positions or (1, 1, 1)
     return Architecture(saved, frames, rows * saved.patch_size, columns * saved.patch_size)
 
@@ -28,7 +28,7 @@ def shapes_of(directory: Path, own: CogVideoXConfig) -> Params:
     """Returns the shapes of the weights in a directory.
 
     Raises:
-        UserError: they are missing or of another network; the message names the differing fields.
+        UserError: the weights are missing or of another network; the message names the differing fields.
     """
     saved = read_model(directory, CogVideoXConfig, "world_model")
     check_alike(directory, saved, own, FREE, "model")
@@ -52,7 +52,8 @@ def shapes_of(directory: Path, own: CogVideoXConfig) -> Params:
 def completed(fresh: Params, saved: Params) -> Params:
     """Returns the saved parameters, in the form of the fresh ones.
 
-    Channels for an image that the saved network lacks begin at zero, and learned tokens that fit no more are fresh.
+    If the saved network lacks the channels for an image, they begin at zero. If the learned tokens do not fit, fresh
+    ones take their place.
     """
     own, there = flatten_dict(fresh), flatten_dict(saved)
     patches = ("patches", "kernel")

@@ -1,6 +1,6 @@
-"""Generates videos chunk by chunk: each chunk continues the last frame of the one before it, as an image.
+"""Generates videos chunk by chunk: the image of each chunk is the last frame of the chunk before.
 
-Axes: B clips, T frames, P of the prompt, F latent frames of h×w cells with C channels.
+Axes: B clips, T frames, P prompt frames, F latent frames of h×w cells with C channels.
 """
 
 from functools import partial
@@ -29,11 +29,11 @@ def rollout(
     frames: int,
     index: Int[np.ndarray, " B"],
 ) -> UInt8[np.ndarray, "B T H W 3"]:
-    """Returns T frames, of which the first P are the prompt as the autoencoder sees it; only the last is read.
+    """Returns T frames: the P prompt frames as the autoencoder reconstructs them, and what follows the last of them.
 
     Args:
-        clip_frames: of a training clip; a chunk adds one less.
-        index: each clip's number, which decides its noise.
+        clip_frames: frames of a training clip; a chunk adds one frame less.
+        index: each clip's number, which determines its noise.
     """
     made, image, number = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1], 0
     count, text = len(prompt), arch.model.text

@@ -1,7 +1,7 @@
-"""Files of text embeddings, and which text each clip has.
+"""Reads and writes files of text embeddings, and finds the text of each clip.
 
-A file of ``python -m rsjax.convert text`` has a tensor ``embeddings``, (texts, tokens, width), and in its metadata the
-texts in the same order, the first of which is empty. Learned tokens are numbered alike.
+A file of ``python -m rsjax.convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists the
+texts in the same order; the first text is empty. Learned tokens are numbered in the same way.
 """
 
 import json
@@ -38,7 +38,7 @@ def read_texts(file: str, tokens: int, width: int) -> Texts:
     """Reads a file of embeddings.
 
     Raises:
-        UserError: it is missing, damaged, something else, or of another shape.
+        UserError: the file is missing, damaged, no file of embeddings, or of another shape.
     """
     path = Path(file)
     if not path.is_file():
@@ -67,10 +67,10 @@ def write_texts(names: Sequence[str], embeddings: Float32[np.ndarray, "texts n w
 
 
 def texts_of(config: TextConfig, tasks: Iterable[str] | None, count: int) -> np.ndarray:
-    """Returns what the network reads of ``count`` clips' tasks: embeddings (B, n, w), or numbers of learned ones.
+    """Returns the network's input for the tasks of ``count`` clips: embeddings (B, n, w), or numbers of learned ones.
 
     Args:
-        tasks: in words; None: unknown. The text of an unknown task is empty, or the only learned one.
+        tasks: in words; None: unknown. An unknown task has the empty text, or the only learned one.
 
     Raises:
         UserError: a task has no embedding, or the file is missing or does not fit.
@@ -84,12 +84,12 @@ def texts_of(config: TextConfig, tasks: Iterable[str] | None, count: int) -> np.
 
 
 def empty_texts(config: TextConfig, count: int) -> np.ndarray:
-    """Returns :func:`texts_of` the empty text."""
+    """Returns the network's input for the empty text, as :func:`texts_of` does."""
     return texts_of(config, None, count) if config.file else np.zeros(count, np.int32)
 
 
 def known_tasks(config: TextConfig, tasks: Iterable[str] | None, count: int) -> list[str]:
-    """Returns clips' tasks, the empty text for one that has none of its own; a note says so once for each task."""
+    """Returns clips' tasks, with the empty text for tasks that have no text; prints one note for each such task."""
     wanted = [UNKNOWN] * count if tasks is None else list(map(str, tasks))
     if not (config.file or config.tasks):
         return wanted
@@ -110,7 +110,7 @@ def _note_empty(config: TextConfig, task: str) -> None:
 
 
 def check_store(config: TextConfig, store: Store) -> None:
-    """Checks the tasks of a store's records, where they are labelled. Errors as in :func:`check_tasks`."""
+    """Checks the tasks of a store's records, if they are labelled. Errors as in :func:`check_tasks`."""
     for split in filter(store.labelled, store.splits):
         check_tasks(config, store.labels(split).words.get("task", ()))
 

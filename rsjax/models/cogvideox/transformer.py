@@ -1,7 +1,7 @@
-"""CogVideoX's transformer: noisy latents, a text and an image to the velocity.
+"""CogVideoX's transformer, which predicts the velocity from noisy latents, a text and an image.
 
 Axes: B clips, F latent frames of h×w cells with C channels, n tokens of text with w numbers each, N tokens in all
-(first the text's), S of the video, D width, K heads, e channels of a head.
+(the text's first), S tokens of the video, D width, K heads, e channels of a head.
 """
 
 from dataclasses import dataclass
@@ -47,25 +47,25 @@ class Architecture:
 
     @property
     def channels(self) -> int:
-        """Channels of latents, without those of the image."""
+        """Channels of latents, without the image's channels."""
         return self.model.autoencoder.latent_channels
 
     @property
     def texts(self) -> int:
-        """Sets of learned tokens: of the empty text, and of each task, or of all together; 0 if they are in a file."""
+        """Sets of learned tokens: for the empty text, and for each task or for all together; 0 with a text file."""
         text = self.model.text
         return 0 if text.file else 1 + max(1, len(text.tasks))
 
 
 class Rotation(NamedTuple):
-    """Cosines and sines of the angles by which pairs of channels turn; 1 and 0 for the text."""
+    """Cosines and sines of the angles by which pairs of channels are rotated; 1 and 0 for the text."""
 
     cos: Float32[np.ndarray, "N e2"]
     sin: Float32[np.ndarray, "N e2"]
 
 
 def rotation(arch: Architecture) -> Rotation:
-    """Returns the angles of rotary positions: a quarter of a head's channels for time, then rows, then columns."""
+    """Returns the rotation for rotary positions: a quarter of a head's channels for time, then rows, then columns."""
     rows, columns = _stretched(arch)
     head = arch.model.width // arch.model.heads
     sizes, grid = (head // 4, 3 * head // 8, 3 * head // 8), (np.arange(arch.frames), rows, columns)
@@ -76,7 +76,7 @@ def rotation(arch: Architecture) -> Rotation:
 
 
 def _stretched(arch: Architecture) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rows and columns, as they count or stretched over ``model.stretch`` as in the public sampler."""
+    """Returns rows' and columns' positions: 0, 1, …, or stretched over ``model.stretch`` as in the public sampler."""
     rows, columns = arch.grid
     if not arch.model.stretch:
         return np.arange(rows), np.arange(columns)
@@ -108,7 +108,7 @@ def _norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:
 
 
 class Block(nn.Module):
-    """Attention among all tokens, then an MLP. The step shifts, scales and gates text and video apart."""
+    """Attention among all tokens, then an MLP. The step shifts, scales and gates text and video separately."""
 
     arch: Architecture
 
@@ -129,7 +129,7 @@ class Block(nn.Module):
         return x + gate * dense(cfg.width, name="fc2")(hidden), None
 
     def _modulated(self, name: str, x: Tokens, time: Float[Array, "B E"]) -> tuple[Tokens, Tokens]:
-        """Returns the norm of x, shifted and scaled, and the gates."""
+        """Returns the normalised x, shifted and scaled, and the gates."""
         cfg = self.arch.model
         parts = nn.Dense(6 * cfg.width, kernel_init=ZEROS, name=f"{name}_linear")(nn.silu(time))[:, None]
         video, text = jnp.split(parts, 2, axis=-1)
@@ -155,9 +155,9 @@ class Transformer(nn.Module):
         """Returns the velocity of latents at step ``t``.
 
         Args:
-            latents: noisy.
+            latents: noisy latents.
             text: embeddings, or numbers of learned ones: 0 is the empty text.
-            image: the latents of the image, for its channels; None without such channels.
+            image: the latents of the image, for the image's channels; None if the network has none.
         """
         arch, cfg = self.arch, self.arch.model
         if latents.shape[1:] != (arch.frames, arch.rows, arch.columns, arch.channels):
@@ -200,7 +200,7 @@ class Transformer(nn.Module):
         return x.reshape(len(x), arch.frames, arch.rows, arch.columns, arch.channels)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
-        """Returns fresh parameters, with which the network predicts zeros."""
+        """Returns initial parameters, with which the network predicts zeros."""
         arch, text = self.arch, self.arch.model.text
         latents = jnp.zeros((1, arch.frames, arch.rows, arch.columns, arch.channels))
         given: Any = jnp.zeros(1, jnp.int32) if arch.texts else jnp.zeros((1, text.tokens, text.width))

@@ -1,1 +1,1 @@
-"""What diffusion models share: noise schedules, samplers, fixed positions and adaptive norms."""
+"""Parts that diffusion models share: noise schedules, samplers, fixed positions and adaptive norms."""

@@ -1,4 +1,4 @@
-"""Training of autoencoders with a Gaussian posterior, whose latents are standardised channel by channel.
+"""Loss terms and standardised latents of autoencoders with a Gaussian posterior.
 
 Axes: B rows of a batch, z latent channels.
 """
@@ -11,19 +11,19 @@ from jaxtyping import Array, Float, Int, Key
 
 from rsjax.trainable import Params, Scalar
 
-LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's, as in the public code
+LOG_VARIANCE = (-30.0, 20.0)  # limits of the posterior's log-variance, as in the public code
 Pixels = Float[Array, "*N 3"]
 Latents = Float[Array, "*M z"]
 
 
 def posterior(made: Float[Array, "*M z2"]) -> tuple[Latents, Latents]:
-    """Returns the mean and the log-variance that an encoder made."""
+    """Splits an encoder's output into the mean and the log-variance, which is clipped to ``LOG_VARIANCE``."""
     mean, log_variance = jnp.split(made, 2, axis=-1)
     return mean, jnp.clip(log_variance, *LOG_VARIANCE)
 
 
 def draw(mean: Latents, log_variance: Latents, key: Key[Array, ""], index: Int[Array, " B"]) -> Latents:
-    """Returns a sample of the posterior, whose noise each row's number decides."""
+    """Returns a sample of the posterior; each row's number determines its noise."""
     noise = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), mean.shape[1:]))
     return mean + jnp.exp(log_variance / 2) * noise(index)
 
@@ -31,13 +31,13 @@ def draw(mean: Latents, log_variance: Latents, key: Key[Array, ""], index: Int[A
 def means_of_terms(
     images: Pixels, output: Pixels, mean: Latents, log_variance: Latents, latents: Latents, fitted: Params
 ) -> dict[str, Scalar]:
-    """Returns the terms "l1" and "l2" of the reconstruction, and
+    """Returns the terms "l1" and "l2" of the reconstruction, and two of the latents.
 
     - "kl": the divergence of the posterior from the normal distribution, per number;
-    - "standard": -log p of the latents under ``fitted``, which so become their mean and deviation.
+    - "standard": -log p of the latents under ``fitted``, which therefore learns their mean and deviation.
 
     Args:
-        fitted: the channels' "mean" and "log_deviation" among the parameters.
+        fitted: the parameters "mean" and "log_deviation" of each channel.
     """
     own = (jax.lax.stop_gradient(latents) - fitted["mean"]) * jnp.exp(-fitted["log_deviation"])
     return {
@@ -56,5 +56,5 @@ def standardised(made: Float[Array, "*M z2"], fitted: Params) -> Float[Array, "*
 
 
 def original(latents: Any, fitted: Params) -> Latents:
-    """Returns latents as the decoder takes them: the inverse of :func:`standardised`."""
+    """Returns latents in the decoder's scale: the inverse of :func:`standardised`."""
     return latents * jnp.exp(fitted["log_deviation"]) + fitted["mean"]

@@ -19,7 +19,7 @@ def positions(count: int, width: int) -> Float32[np.ndarray, "count width"]:
 
 
 def grid_positions(rows: int, columns: int, width: int, scale: float = 1.0) -> Float32[np.ndarray, "S width"]:
-    """Returns the positions of a grid's cells ÷ ``scale``, row by row: the column in the first half of the channels."""
+    """Returns sines and cosines of cells' positions ÷ ``scale``: columns in the first half of channels, then rows."""
     row, column = (x / scale for x in np.divmod(np.arange(rows * columns), columns))
     return np.concatenate([_waves(column, width // 2), _waves(row, width // 2)], axis=1).astype(np.float32)
 
@@ -30,14 +30,14 @@ def _waves(at: np.ndarray, width: int) -> np.ndarray:
 
 
 def time_waves(t: Int[Array, " B"], width: int = TIME_CHANNELS) -> Float[Array, "B width"]:
-    """Returns cosines, then sines, of the steps of the forward process."""
+    """Returns cosines, then sines, of the step of the forward process."""
     half = width // 2
     angles = t[:, None].astype(jnp.float32) * jnp.exp(-np.log(PERIOD) * jnp.arange(half) / half)
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
 
 
 class TimeEmbedding(nn.Module):
-    """An MLP on :func:`time_waves`, as many as ``channels``."""
+    """An MLP on ``channels`` :func:`time_waves`."""
 
     width: int
     channels: int = TIME_CHANNELS
@@ -50,11 +50,11 @@ class TimeEmbedding(nn.Module):
 
 
 def plain_norm(x: Float[Array, "*N C"], epsilon: float = 1e-6) -> Float[Array, "*N C"]:
-    """LayerNorm without scale and shift."""
+    """Returns LayerNorm of x without scale and shift."""
     centred = x - jnp.mean(x, axis=-1, keepdims=True)
     return centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + epsilon)
 
 
 def modulate(x: Float[Array, "*N C"], shift: Float[Array, "*N C"], scale: Float[Array, "*N C"]) -> Float[Array, "*N C"]:
-    """Returns the norm of x with the condition's shift and scale: norm(x)·(1 + scale) + shift."""
+    """Returns the normalised x with the condition's shift and scale: norm(x)·(1 + scale) + shift."""
     return plain_norm(x) * (1 + scale) + shift

@@ -1,8 +1,8 @@
 """DDIM and PNDM as tables of coefficients, and one loop that follows such a table.
 
 Both move latents from step t to an earlier step t' by x' = keep · x + add · e, where e is a weighted sum of the
-network's outputs (PNDM, https://arxiv.org/abs/2202.09778, eq. 9–12; for e = one output it is DDIM's step without
-noise). The definitions of ``diffusers`` decide the rest, such as t' = t - steps // sampled steps.
+network's outputs (PNDM, https://arxiv.org/abs/2202.09778, eq. 9–12). If e is a single output, this is DDIM's step
+without noise. All else follows ``diffusers``, such as t' = t - steps // sampled steps.
 """
 
 from collections.abc import Callable
@@ -18,21 +18,21 @@ from rsjax.config import DenoiseConfig, NoiseConfig
 from rsjax.models.diffusion.schedule import Latents, alphas
 
 PAST = 3  # outputs that PNDM remembers
-RK_GROUPS = 3  # steps that begin PNDM, of four calls each
-MULTISTEP = np.array([55, -59, 37, -9]) / 24  # Adams-Bashforth: this output, and the remembered ones from the newest on
+RK_GROUPS = 3  # Runge-Kutta steps at the beginning of PNDM, of four calls each
+MULTISTEP = np.array([55, -59, 37, -9]) / 24  # Adams-Bashforth: this output, then the remembered ones, newest first
 
 
 class Plan(NamedTuple):
-    """What each network call does, K calls in order.
+    """The coefficients of each network call, K calls in order.
 
     Attributes:
-        t: step of the forward process, which the network is told.
+        t: step of the forward process, an input of the network.
         keep, add: coefficients of the latents and of e.
-        restart: 1 where the latents to move are this call's; 0: those of the last call with 1.
-        remember: 1 where the output joins the remembered ones.
-        weights: of this output and of the remembered ones in e.
-        summed: weight in e of the running sum.
-        share: of this output in the running sum, which starts again with ``restart``.
+        restart: 1: moves the current latents; 0: moves the latents of the last call whose ``restart`` is 1.
+        remember: 1 if the output joins the remembered outputs.
+        weights: weights of this output and of the remembered ones in e.
+        summed: weight of the running sum in e.
+        share: weight of this output in the running sum, which ``restart`` sets back to zero.
     """
 
     t: Int[np.ndarray, " K"]
@@ -96,7 +96,7 @@ def _pndm(noise: NoiseConfig, sample: DenoiseConfig) -> Plan:
 def _coefficients(
     noise: NoiseConfig, sample: DenoiseConfig, begin: Int[np.ndarray, " K"], end: Int[np.ndarray, " K"]
 ) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
-    """Returns ``keep`` and ``add`` of moves between steps; an end below 0 is the clean end."""
+    """Returns ``keep`` and ``add`` of moves between steps; an end below 0 is the last move, to clean latents."""
     left = alphas(noise)
     a, b = left[begin], np.where(end >= 0, left[end], 1.0 if sample.end_clean else left[0])
     if noise.prediction == "velocity":
@@ -110,12 +110,12 @@ def denoise(
     start: Latents,
     restore: Callable[[Latents], Latents] = lambda x: x,
 ) -> Latents:
-    """Returns the clean latents that ``plan`` makes of noise.
+    """Returns the clean latents that ``plan`` makes from noise.
 
     Args:
-        predict: the network: noisy latents and their step to its output.
+        predict: the network, which maps noisy latents and their step to its output.
         start: noise of unit variance.
-        restore: puts known latents back; called before the first network call and after every one.
+        restore: puts known latents back; called before the first network call and after each call.
     """
 
     def call(carry: tuple[Any, ...], row: Any) -> tuple[tuple[Any, ...], None]:

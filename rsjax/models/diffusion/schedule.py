@@ -1,4 +1,4 @@
-"""The forward process: x_t = √ᾱ_t · x + √(1 - ᾱ_t) · noise, and what the network predicts of it.
+"""The forward process, x_t = √ᾱ_t · x + √(1 - ᾱ_t) · noise, and the network's target.
 
 Axes: B clips; latents have any number of axes, the first over clips.
 """
@@ -15,7 +15,7 @@ Latents: TypeAlias = Float[Array, "*N"]
 
 
 def alphas(noise: NoiseConfig) -> Float64[np.ndarray, " steps"]:
-    """Returns ᾱ_t, the share of the signal's power that is left after step t, falling with t; in the end perhaps 0."""
+    """Returns ᾱ_t, the remaining share of the signal's power after step t; it falls, to 0 with ``zero_terminal``."""
     if noise.betas == "linear":
         betas = np.linspace(noise.beta_start, noise.beta_end, noise.steps)
     else:
@@ -29,7 +29,7 @@ def alphas(noise: NoiseConfig) -> Float64[np.ndarray, " steps"]:
 
 
 def scales(noise: NoiseConfig, t: Int[Array, " B"], axes: int) -> tuple[Latents, Latents]:
-    """Returns √ᾱ_t and √(1 - ᾱ_t) with ones for the axes after the first, ``axes`` in all."""
+    """Returns √ᾱ_t and √(1 - ᾱ_t), with ``axes`` axes: all after the first have length 1."""
     left = alphas(noise)
     shape = (-1, *(1,) * (axes - 1))
     signal, spread = (jnp.asarray(np.sqrt(x), jnp.float32)[t].reshape(shape) for x in (left, 1 - left))
@@ -37,13 +37,13 @@ def scales(noise: NoiseConfig, t: Int[Array, " B"], axes: int) -> tuple[Latents,
 
 
 def add_noise(noise: NoiseConfig, latents: Latents, drawn: Latents, t: Int[Array, " B"]) -> Latents:
-    """Returns x_t for drawn noise of unit variance."""
+    """Returns x_t for the drawn noise of unit variance."""
     signal, spread = scales(noise, t, latents.ndim)
     return signal * latents + spread * drawn
 
 
 def target(noise: NoiseConfig, latents: Latents, drawn: Latents, t: Int[Array, " B"]) -> Latents:
-    """Returns what the network is trained to predict: the noise, or the velocity √ᾱ·noise - √(1-ᾱ)·x."""
+    """Returns the network's training target: the noise, or the velocity √ᾱ·noise - √(1-ᾱ)·x."""
     if noise.prediction == "noise":
         return drawn
     signal, spread = scales(noise, t, latents.ndim)

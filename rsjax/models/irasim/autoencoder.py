@@ -1,7 +1,7 @@
-"""IRASim's autoencoder: its networks, training and codec. SDXL's with public weights, or a small one that a run trains.
+"""IRASim's autoencoder (networks, training, codec): SDXL's with public weights, or a small one that a run trains.
 
-Latents are standardised channel by channel. The parameters hold the channels' means and deviations ("latents"): the
-public factor for SDXL, and for a trained one numbers that its training fits to what its encoder makes.
+Latents are standardised channel by channel. The parameters contain the channels' means and deviations ("latents"): for
+SDXL the public factor, and for a trained autoencoder numbers that its training fits to its encoder's latents.
 
 Axes: B images, H×W pixels, h×w cells, z latent channels, T frames.
 """
@@ -35,22 +35,22 @@ from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weight
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Images = Float[Array, "B H W 3"]
-Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which decides an image's noise
+Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which determines an image's noise
 Latents = Float[Array, "B h w z"]
 
-SDXL_FACTOR = 0.13025  # by which the public code multiplies latents
-CHUNK_PIXELS = CHUNK * 64**2  # of images per pass, to bound memory
+SDXL_FACTOR = 0.13025  # the public code multiplies latents by it
+CHUNK_PIXELS = CHUNK * 64**2  # pixels per pass, at most, to bound memory
 
 
 def networks(config: KLConfig) -> tuple[Any, Any]:
-    """Returns the modules of encoder and decoder."""
+    """Returns the modules of the encoder and the decoder."""
     if config.network == "sdxl":
         return Encoder(config), Decoder(config)
     return magvit2.Encoder(config.convolutions), magvit2.Decoder(config.convolutions)
 
 
 def init(config: KLConfig, key: Key[Array, ""]) -> Params:
-    """Returns fresh parameters of "encoder", "decoder" and "latents"."""
+    """Returns initial parameters of "encoder", "decoder" and "latents"."""
     encoder, decoder = networks(config)
     z, size = config.latent_channels, 2 * config.downsampling
     scale = -math.log(SDXL_FACTOR) if config.network == "sdxl" else 0.0
@@ -62,18 +62,18 @@ def init(config: KLConfig, key: Key[Array, ""]) -> Params:
 
 
 def posterior(config: KLConfig, params: Params, images: Images) -> tuple[Latents, Latents]:
-    """Returns the mean and the log-variance of images' latents, not standardised."""
+    """Returns the mean and the log-variance of images' latents, which are not standardised."""
     return distributions.posterior(networks(config)[0].apply({"params": params["encoder"]}, images))
 
 
 def decode(config: KLConfig, params: Params, latents: Latents) -> Images:
-    """Returns the images of latents that are not standardised."""
+    """Decodes latents that are not standardised to images."""
     return networks(config)[1].apply({"params": params["decoder"]}, latents)
 
 
 @dataclass(frozen=True)
 class KLTraining(Autoencoder[Batch]):
-    """Learns to reconstruct RGB frames from a sample of their posterior."""
+    """Trains the autoencoder to reconstruct RGB frames from a sample of their posterior."""
 
     config: KLConfig
     train: TokenizerTrainConfig
@@ -101,7 +101,7 @@ class KLTraining(Autoencoder[Batch]):
         return {"lpips": lpips_weights(self.train, self.image_size)}
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and perhaps "perceptual"."""
+        """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and "perceptual" if it is on."""
         images = to_unit(batch["images"])
         mean, log_variance = posterior(self.config, params, images)
         latents = distributions.draw(mean, log_variance, key, batch["index"])
@@ -117,7 +117,7 @@ class KLTraining(Autoencoder[Batch]):
         return TokenizerImages(self.train.frames_per_clip, 0.0, "linear", self.train.flip)
 
     def batch(self, arrays: Arrays) -> Batch:
-        count = arrays["images"].shape[1]  # of a clip
+        count = arrays["images"].shape[1]  # frames of a clip
         index = count * arrays["index"][:, None] + np.arange(count, dtype=np.int32)
         return {"images": image_batch(arrays), "index": index.reshape(-1)}
 
@@ -139,7 +139,7 @@ class KLTraining(Autoencoder[Batch]):
 
 @dataclass(frozen=True)
 class KLCodec:
-    """A trained autoencoder that takes and returns numpy arrays. Its latents are standardised."""
+    """A trained autoencoder that takes and returns numpy arrays. The latents are standardised."""
 
     config: KLConfig
     params: Params
@@ -151,7 +151,7 @@ class KLCodec:
         return {"mean": mean, "deviation": deviation}
 
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
-        """Returns the frames of latents "mean"."""
+        """Decodes the latents "mean" to frames."""
         latents = np.asarray(tokens["mean"])
         side = latents.shape[-2] * self.config.downsampling
         frames = in_chunks(partial(self._run, _decode), latents, 3, self._most(side))

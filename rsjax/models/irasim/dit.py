@@ -1,4 +1,4 @@
-"""IRASim's transformer: noisy latents of a clip and its actions to the noise.
+"""IRASim's transformer, which predicts the noise from a clip's noisy latents and actions.
 
 Axes: B clips, T frames (t: T, or 1 for all), h×w cells of latents with C channels, S tokens of a frame, D width, A
 action inputs.
@@ -27,10 +27,10 @@ class Architecture(DiTConfig):
     """All settings of the network.
 
     Attributes:
-        frames: of a clip that the network processes at once.
-        rows, columns: cells of a frame's latents.
-        channels: of latents.
-        action_inputs: numbers of an action and, with ``integrate_actions``, of their sum.
+        frames: frames that the network processes at once.
+        rows, columns: rows and columns of cells in a frame's latents.
+        channels: channels of the latents.
+        action_inputs: numbers of an action and, with ``integrate_actions``, of the sum of actions so far.
     """
 
     frames: int = 16
@@ -61,7 +61,7 @@ def architecture(config: Config) -> Architecture:
 
 
 class Block(nn.Module):
-    """Attention among tokens along one axis, then an MLP, each with adaptive LayerNorm and gate (adaLN-Zero)."""
+    """Attention along one axis of tokens, then an MLP, each with adaptive LayerNorm and gate (adaLN-Zero)."""
 
     config: Architecture
     over_time: bool
@@ -88,7 +88,7 @@ class Block(nn.Module):
 
 
 class Pair(nn.Module):
-    """A block within frames, then one over time; the signature is that of ``nn.scan``."""
+    """A block within frames, then a block over time; ``nn.scan`` prescribes the signature."""
 
     config: Architecture
 
@@ -118,9 +118,9 @@ class DiT(nn.Module):
         """Returns the noise in latents at step ``t``.
 
         Args:
-            latents: noisy, except for frames that are known.
+            latents: noisy, except in known frames.
             t: step of the forward process.
-            actions: row t led into frame t; row 0 is not read.
+            actions: row t led to frame t; row 0 is not read.
             drop: clips whose actions are replaced by the learned embedding.
         """
         cfg = self.config
@@ -133,7 +133,8 @@ class DiT(nn.Module):
         x = x.reshape(*x.shape[:2], -1, cfg.width) + grid_positions(*cfg.grid, cfg.width)
         time = TimeEmbedding(cfg.width, name="time")(t)[:, None, None]
         acted = time + self._action(actions, drop)[:, :, None]
-        # In the public Frame-Ada model the last layer does not see the actions, an oversight that its weights carry.
+        # In the public Frame-Ada model the last layer does not see the actions. This is an oversight, but the public
+        # weights were trained so.
         plain = acted if cfg.conditioning == "video" else time
         pair = nn.remat(Pair) if cfg.remat == "blocks" else Pair
         scan = nn.scan(pair, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=(nn.broadcast, 0))
@@ -142,7 +143,7 @@ class DiT(nn.Module):
         return self._unpatchify(self._final(x, plain))
 
     def _action(self, actions: Float[Array, "B T A"], drop: Bool[Array, " B"] | None) -> Float[Array, "B t D"]:
-        """Returns the actions' embedding: of each frame, or of all together."""
+        """Returns the embedding of the actions: one for each frame, or one for all."""
         cfg = self.config
         unknown = self.param("unknown_action", nn.initializers.normal(1.0), (1, cfg.width))  # torch's default
         known = actions[:, 1:]
@@ -168,7 +169,7 @@ class DiT(nn.Module):
         return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.channels)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
-        """Returns fresh parameters, with which the network predicts zeros."""
+        """Returns initial parameters, with which the network predicts zeros."""
         cfg = self.config
         latents = jnp.zeros((1, cfg.frames, cfg.rows, cfg.columns, cfg.channels))
         actions = jnp.zeros((1, cfg.frames, cfg.action_inputs))
@@ -179,7 +180,7 @@ def forward_flops(config: Architecture) -> int:
     """Returns the floating-point operations of one pass over a clip: its matrix products, 2·m·n·k each."""
     width, cells, frames = config.width, config.grid[0] * config.grid[1], config.frames
     linear = (4 + 2 * config.mlp_ratio) * width**2  # qkv, proj, fc1, fc2
-    attention = (cells + frames) * width  # scores and weighted sums, on the average of both kinds of blocks
+    attention = (cells + frames) * width  # scores and weighted sums, averaged over both kinds of blocks
     patches = 2 * config.patch_size**2 * config.channels * width
     acted = frames if config.conditioning == "frame" else 1
     conditions = config.blocks // 2 * (acted + 1) * 6 * width**2 + 2 * width**2 + (TIME_CHANNELS + width) * width

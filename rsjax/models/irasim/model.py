@@ -1,6 +1,6 @@
-"""IRASim: the transformer with its autoencoder, loss and sampler, behind the interface of world models.
+"""The IRASim family: the transformer with its autoencoder, loss and sampler, behind the interface of world models.
 
-Axes: B clips, T frames, P of the prompt, h×w cells of latents with C channels, A action inputs.
+Axes: B clips, T frames, P prompt frames, h×w cells of latents with C channels, A action inputs.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class IRASim(WorldModel[Batch]):
     Attributes:
         config: the family's settings.
         architecture: the network's settings.
-        prompt_frames: frames that are clean in training and given in generation.
+        prompt_frames: frames that are free of noise in training and form the prompt in generation.
         clips: the shape of the training clips.
     """
 
@@ -65,7 +65,7 @@ class IRASim(WorldModel[Batch]):
         return DiT(self.architecture).init_params(key)
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns "error": the mean square error of the predicted noise in the frames after the prompt."""
+        """Returns "error": the mean squared error of the predicted noise over the frames after the prompt."""
         noise, latents, past = self.config.noise, batch["latents"], self.prompt_frames
 
         def draw(index: Int[Array, ""]) -> tuple[Array, Array, Array]:
@@ -85,7 +85,7 @@ class IRASim(WorldModel[Batch]):
         return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
-        """Makes the latents of every clip, stored beside the clips for all runs with this autoencoder."""
+        """Encodes every clip; stores the latents beside the clips for all runs with this autoencoder."""
         codec = self._codec(assets)
 
         def encode(clip: Record) -> Record:

@@ -1,7 +1,7 @@
-"""Starts training from the weights of another run, or of a public checkpoint that was converted.
+"""Starts training from the weights of another run, or of a converted public checkpoint.
 
-Both directories contain ``config.json`` and weights. A run's ``config.json`` is its configuration; a converted
-checkpoint's has a section ``kl_autoencoder`` or ``irasim``.
+Both directories contain ``config.json`` and weights. The ``config.json`` of a run is its configuration; that of a
+converted checkpoint has a section ``kl_autoencoder`` or ``irasim``.
 """
 
 from pathlib import Path
@@ -19,8 +19,8 @@ from rsjax.progress import note
 from rsjax.trainable import Params
 
 AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
-# Fields that may differ between the saved network and the one to train: parameters do not depend on them, or begin
-# fresh.
+# Fields that may differ between the saved network and the one to train: parameters do not depend on them, or those
+# that do begin afresh.
 FREE = ("rows", "columns", "action_inputs", "compute_dtype", "remat")
 C = TypeVar("C")
 
@@ -29,7 +29,7 @@ def saved_autoencoder(directory: Path) -> KLConfig:
     """Returns the settings of a directory's autoencoder.
 
     Raises:
-        UserError: there is none, or its settings are missing, damaged or of another family.
+        UserError: there is no autoencoder, or its settings are missing, damaged or of another family.
     """
     saved = _section(directory, AUTOENCODER, KLConfig, "tokenizer", "sdxl")
     return saved.autoencoder if isinstance(saved, Config) else saved
@@ -42,7 +42,7 @@ def saved_network(directory: Path) -> Architecture:
 
 
 def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
-    """Returns :func:`saved_autoencoder`, and raises also if it is another network than ``own``."""
+    """Returns :func:`saved_autoencoder`; also raises UserError if its network differs from ``own``."""
     saved = saved_autoencoder(directory)
     if differing := differences(saved, own, ("kl_weight",)):
         raise UserError(
@@ -52,7 +52,7 @@ def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
 
 
 def check_network(directory: Path, own: Architecture) -> Architecture:
-    """Returns :func:`saved_network`, and raises also if it is another network than ``own``."""
+    """Returns :func:`saved_network`; also raises UserError if its network differs from ``own``."""
     saved = saved_network(directory)
     free = FREE if own.conditioning == "video" else (*FREE, "frames")
     if differing := differences(saved, own, free):
@@ -66,7 +66,7 @@ def check_network(directory: Path, own: Architecture) -> Architecture:
 
 
 def completed(fresh: Params, saved: Params) -> Params:
-    """Returns the saved parameters; the action encoder's first layer is a fresh one for actions of another length."""
+    """Returns the saved parameters; if actions have another length, the action encoder's first layer is a fresh one."""
     own, there = flatten_dict(fresh, sep="/"), flatten_dict(saved, sep="/")
     first = "action_fc1/kernel"
     if there[first].shape != own[first].shape:

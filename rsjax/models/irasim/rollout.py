@@ -1,6 +1,6 @@
-"""Generates latents chunk by chunk: each chunk continues the last frames of the one before it.
+"""Generates latents chunk by chunk: each chunk continues the last frames of the chunk before.
 
-Axes: B clips, T frames, P of the prompt, F of a chunk, h×w cells of latents with C channels, A action inputs.
+Axes: B clips, T frames, P prompt frames, F frames of a chunk, h×w cells of latents with C channels, A action inputs.
 """
 
 from functools import partial
@@ -30,18 +30,18 @@ def rollout(
     """Returns the latents of T frames, of which the first P are the prompt's.
 
     Args:
-        shared: frames that two chunks have in common, and of the prompt that the first chunk continues.
-        actions: normalised, without sums; row t leads into frame t.
-        index: each clip's number, which decides its noise.
+        shared: frames that a chunk has in common with the chunk before, or with the prompt.
+        actions: normalised, without sums; row t leads to frame t.
+        index: each clip's number, which determines its noise.
     """
     frames, made, number = actions.shape[1], prompt, 0
     shared = min(shared, prompt.shape[1])
     while made.shape[1] < frames:
         first = made.shape[1] - shared
         rows = actions[:, first : first + arch.frames]
-        # As in the public code, a short tail is filled up with its first action.
+        # As in the public code, the actions of a short last chunk are padded with its first action.
         rows = np.concatenate([rows, np.repeat(rows[:, 1:2], arch.frames - rows.shape[1], axis=1)], axis=1)
-        rows[:, 0] = 0.0  # where the sums begin, as in a training clip
+        rows[:, 0] = 0.0  # the sums begin here, as in a training clip
         rows = with_sums(rows, np.cumsum(rows, axis=1) if arch.integrate_actions else None)
         key = jax.random.fold_in(jax.random.key(config.sample.seed), number)
         batch = divide((made[:, first:], rows, index), params)

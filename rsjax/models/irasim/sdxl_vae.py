@@ -1,6 +1,6 @@
 """The autoencoder of Stable Diffusion XL (``diffusers``' AutoencoderKL).
 
-Images are in [-1, 1]; latents are as the network makes them, unscaled.
+Images are in [-1, 1]; latents are the network's output, unscaled.
 
 Axes: B images, H×W pixels, h×w cells, z latent channels.
 """
@@ -25,7 +25,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Maps latents to images, not clipped."""
+    """Maps latents to images, without clipping."""
 
     config: KLConfig
 

@@ -1,6 +1,7 @@
 """Trains iVideoGPT's tokenizer, and encodes and decodes videos with the trained one.
 
-The public code adds a discriminator at 256² pixels after 250,000 steps, and crops and recolours clips; both are absent.
+The public code adds a discriminator at 256² pixels after 250,000 steps, and crops and recolours clips; this code does
+neither.
 
 Axes: B clips, T frames of which the first c are context, F = T - c, g×g cells, n tokens of a later frame.
 """
@@ -32,14 +33,14 @@ from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
-Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which decides a clip's dropout
+Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's dropout
 
-FRAMES = 128  # most frames per pass, to bound memory
+FRAMES = 128  # frames per pass, at most, to bound memory
 
 
 @dataclass(frozen=True)
 class ConditionalVQTraining(Autoencoder[Batch]):
-    """Learns to reconstruct the first frames of a clip and some later ones."""
+    """Trains the tokenizer to reconstruct the first frames of a clip and some later frames."""
 
     config: ConditionalVQConfig
     train: TokenizerTrainConfig
@@ -72,7 +73,7 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
-        """Returns the terms; those of pixels are the sum of a mean over context and one over later frames."""
+        """Returns the terms; those of pixels are the mean over context frames plus the mean over later frames."""
         frames, first = jnp.asarray(batch["frames"], jnp.float32) / 255, self.config.context_frames
         inputs = ({"params": params}, frames, batch["index"])
         made = cast(Reconstruction, ConditionalVQ(self.config).apply(*inputs, rngs={"dropout": key}))
@@ -115,10 +116,10 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         return {half: number // count for half, number in whole.items()}
 
     def pretrained_shapes(self, directory: Path) -> Params:
-        """Returns the shapes of saved weights, of as many context frames as this network's or of more.
+        """Returns the shapes of saved weights, whose network has at least as many context frames as this one.
 
         Raises:
-            UserError: they are missing or of another network; the message names the differing fields.
+            UserError: the weights are missing or of another network; the message names the differing fields.
         """
         saved = read_model(directory, IVideoGPTConfig, "tokenizer").autoencoder
         free = {"dropout", "codebook_scale", "codebook_weight"}
@@ -129,13 +130,13 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         return ConditionalVQTraining(saved, TokenizerTrainConfig(frames_per_clip=99), self.image_size).shapes()
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        """Returns the saved parameters; of positions of more context frames the last ones, as in the public code."""
+        """Returns the saved parameters; of more context frames, keeps the last positions, as the public code does."""
         own, params = flatten_dict(fresh), flatten_dict(saved)
         return unflatten_dict({path: x[-own[path].shape[0] :] if x.ndim else x for path, x in params.items()})
 
 
 def _draw(context: int, count: int, flip: bool, record: Record, rng: np.random.Generator) -> Arrays:
-    """Returns ``frames``: the first ``context`` frames of a clip and drawn later ones in order, ``count`` in all."""
+    """Returns ``frames``, ``count`` in all: a clip's first ``context`` frames and random later frames, in order."""
     rgb = record["rgb"]
     later = np.arange(context, len(rgb))
     drawn = np.sort(rng.choice(later, count - context, replace=count - context > len(later)))
@@ -145,7 +146,7 @@ def _draw(context: int, count: int, flip: bool, record: Record, rng: np.random.G
 
 @dataclass(frozen=True)
 class ConditionalCodec:
-    """The trained tokenizer that takes and returns numpy arrays."""
+    """A trained tokenizer that takes and returns numpy arrays."""
 
     config: ConditionalVQConfig
     params: Params
@@ -153,7 +154,7 @@ class ConditionalCodec:
     def encode(self, video: Video) -> dict[str, np.ndarray]:
         """Returns tokens: "context" of the first c frames, (B, c, g, g), and "future" of the others, (B, F, n).
 
-        If the video has fewer than c frames, its first is repeated in front.
+        If the video has fewer than c frames, its first frame is repeated at the beginning.
         """
         lacking = max(0, self.config.context_frames - video.rgb.shape[1])
         frames = np.concatenate([np.repeat(video.rgb[:, :1], lacking, 1), video.rgb], axis=1)
@@ -164,13 +165,13 @@ class ConditionalCodec:
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
         """Decodes tokens to frames; there is no depth."""
         context, future = (np.asarray(tokens[name]) for name in ("context", "future"))
-        alone = future.shape[1] == 0  # without later frames a stand-in is decoded
+        alone = future.shape[1] == 0  # if there are no later frames, a placeholder is decoded
         future = np.zeros((len(future), 1, future.shape[2]), np.int32) if alone else future
         (frames,) = self._chunked("decode", context, future)
         return Video(np.round(frames[:, : frames.shape[1] - alone]).astype(np.uint8))
 
     def _chunked(self, method: Literal["encode", "decode"], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Applies the network to some clips at a time, as many as a power of two."""
+        """Applies the network to a power of two of clips at a time."""
         total, frames = len(arrays[0]), sum(x.shape[1] for x in arrays)
         size = min(2 ** (total - 1).bit_length(), 2 ** (max(1, FRAMES // frames).bit_length() - 1))
         parts = []

@@ -28,8 +28,8 @@ class Architecture:
 
     Attributes:
         config: the family's settings.
-        layout: of its sequences.
-        action_inputs: numbers that are added at a slot; 0: none are.
+        layout: the layout of its sequences.
+        action_inputs: numbers of the action at a slot; 0: the model has no actions.
     """
 
     config: IVideoGPTConfig
@@ -55,7 +55,7 @@ class Block(nn.Module):
         """Returns the output and, with a cache, the tokens' own keys and values.
 
         Args:
-            scanned: the cache of this block, and its number.
+            scanned: the cache of this block, and the block's number.
             first: position of the first token.
             keys: of the dropout of each clip; None: no dropout.
         """
@@ -85,7 +85,7 @@ class Block(nn.Module):
 
 
 def folded(keys: Key[Array, " B"], numbers: Int[Array, " B"]) -> Key[Array, " B"]:
-    """Returns a key for each clip's key and number."""
+    """Folds each clip's number into its key."""
     return jax.vmap(jax.random.fold_in)(keys, numbers)
 
 
@@ -96,7 +96,7 @@ def _attend_with_dropout(
     keys: Key[Array, " B"],
     config: IVideoGPTConfig,
 ) -> Float[Array, "B L h e"]:
-    """Returns softmax(q·kᵀ/√e)·v in the past with dropout of the weights; products as in :func:`attend_cells`."""
+    """Returns causal softmax(q·kᵀ/√e)·v with dropout of the weights; products as in :func:`attend_cells`."""
     if config.compute_dtype == "bfloat16" and jax.default_backend() != "cpu":
         q, k, v = (x.astype(jnp.bfloat16) for x in (q, k, v))
     scores = jnp.einsum("bqhe,bkhe->bhqk", q, k, preferred_element_type=jnp.float32) * q.shape[-1] ** -0.5
@@ -107,7 +107,7 @@ def _attend_with_dropout(
 
 
 class LLaMA(nn.Module):
-    """Sequences of :mod:`rsjax.models.ivideogpt.sequence` and actions to the logits of the next number."""
+    """Maps sequences of :mod:`rsjax.models.ivideogpt.sequence` and actions to the logits of the next number."""
 
     architecture: Architecture
 
@@ -121,17 +121,17 @@ class LLaMA(nn.Module):
         keys: Key[Array, " B"] | None = None,
         skip: int = 0,
     ) -> tuple[Float[Array, "B M V"], KeyValues | None]:
-        """Returns logits of what follows each token after the first ``skip``, float32, and the cache.
+        """Returns the logits, float32, of the number that follows each token after the first ``skip``, and the cache.
 
         Args:
-            actions: of the later frames, in order; not read by a model without actions.
+            actions: actions that led to the later frames, in order; a model without actions does not read them.
             first: position of the first token; may be traced.
-            cache: from :func:`empty_cache` or an earlier call, perhaps taken apart (:mod:`rsjax.models.apart`); tokens
-                before ``first`` are read from it.
+            cache: from :func:`empty_cache` or an earlier call, whole or in parts (:mod:`rsjax.models.apart`); holds the
+                keys and values of tokens before ``first``.
             keys: of the dropout of each clip; None: no dropout.
 
         Returns:
-            The logits, and the cache with these tokens written in (None without a cache).
+            The logits, and the cache with these tokens written to it (None without a cache).
         """
         arch, cfg, layout = self.architecture, self.architecture.config, self.architecture.layout
         x = nn.Embed(layout.vocabulary, cfg.width, embedding_init=NORMAL, name="embed_tokens")(tokens)
@@ -158,14 +158,14 @@ class LLaMA(nn.Module):
         return head(x), None if cache is None else put_frames(cache, new, first, ring=False)
 
     def init_params(self, key: Array) -> Params:
-        """Returns fresh parameters; blocks are stacked along a leading axis."""
+        """Returns initial parameters; blocks are stacked along a leading axis."""
         return self.init(key, jnp.zeros((1, 1), jnp.int32), jnp.zeros((1, 1, self.architecture.action_inputs)))[
             "params"
         ]
 
 
 def empty_cache(arch: Architecture, clips: int, length: int) -> KeyValues:
-    """Returns keys and values of ``length`` positions for every block: zeros, never read before they are written."""
+    """Returns a cache of zeros with ``length`` positions for every block; none is read before it is written."""
     cfg = arch.config
     zeros = jnp.zeros((cfg.blocks, clips, cfg.heads, length, cfg.width // cfg.heads), cfg.sample.cache_dtype)
     return KeyValues(zeros, zeros)

@@ -1,4 +1,4 @@
-"""iVideoGPT as a family: tokens of the clips, cross-entropy of the next token, rollouts from pixels to pixels.
+"""The iVideoGPT family: makes the clips' tokens, computes the next token's cross-entropy, and generates videos.
 
 Axes: B clips, T frames of which the first c are context, A action dimensions, L tokens of a clip's sequence.
 """
@@ -72,9 +72,10 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
     def loss_terms(
         self, params: Params, batch: dict[str, Array], key: Key[Array, ""], context: StepContext
     ) -> dict[str, Term]:
-        """Returns the cross-entropy of all numbers after the first slot, later slots among them, in nats.
+        """Returns the cross-entropy of all numbers after the first slot, including later slots, in nats.
 
-        Each clip's index decides its dropout, in validation too, so that a step does not depend on how it is split.
+        Each clip's index determines its dropout, also in validation, so that a step gives the same result however the
+        batch is split over devices.
         """
         arch, tokens, index = self.architecture, batch["tokens"], batch["index"]
         keys = folded(jnp.broadcast_to(key, index.shape), index) if self.config.dropout else None
@@ -86,7 +87,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return {"token": (jnp.sum(error * weight), jnp.sum(weight))}
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
-        """Makes the tokens of every clip, stored beside the clips for all runs with this tokenizer."""
+        """Encodes every clip; stores the tokens beside the clips for all runs with this tokenizer."""
         codec = self._codec(assets)
 
         def encode(clip: Record) -> Record:
@@ -126,7 +127,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return codec.decode(codec.encode(video))
 
     def pretrained_shapes(self, directory: Path) -> Params:
-        """Returns the shapes of a saved LLaMA, perhaps one without actions.
+        """Returns the shapes of a saved LLaMA, with or without actions.
 
         Raises:
             UserError: the weights are missing or of another network; the message names the differing fields.
@@ -146,7 +147,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return jax.eval_shape(LLaMA(like).init_params, jax.random.key(0))
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
-        """Returns the saved parameters; a model without actions gets the fresh layer of actions, which is zero."""
+        """Returns the saved parameters; if they lack the layer of actions, the fresh one, which is zero, is added."""
         return {name: saved.get(name, x) for name, x in fresh.items()}
 
     def cache_shapes(self, frames: int) -> Any:
@@ -154,7 +155,7 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return jax.eval_shape(lambda: empty_cache(arch, 1, arch.layout.length(frames) + 1))
 
     def flops(self, frames: int) -> dict[str, int]:
-        """Counts matrix products, 2 per multiply-add; attention as if it were not causal, as it is computed."""
+        """Counts matrix products, 2 per multiply-add; attention in full, because masked products are computed too."""
         cfg, layout = self.config, self.architecture.layout
         length = layout.length(frames) - 1
         block = 2 * length * cfg.width * (4 * cfg.width + 3 * cfg.mlp_width) + 4 * length**2 * cfg.width
@@ -170,6 +171,6 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
 def _arrays(
     layout: Layout, normalization: Normalization, integrate: bool, record: Record, rng: np.random.Generator
 ) -> Arrays:
-    """Returns ``tokens`` (L,), a clip's sequence, and ``actions`` (F, A), those that led into its later frames."""
+    """Returns ``tokens`` (L,), a clip's sequence, and ``actions`` (F, A), which led to its later frames."""
     tokens = layout.join(record["context"][None], record["future"][None])[0]
     return {"tokens": tokens, "actions": normalization.action_inputs(record["actions"], integrate)[layout.context :]}

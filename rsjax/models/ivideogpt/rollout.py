@@ -1,7 +1,7 @@
-"""Samples later frames token by token, and rollouts longer than a sequence.
+"""Samples later frames token by token, also in rollouts that are longer than a sequence.
 
-A pass of the network takes one token, but that of a frame's last token also takes the next frame's slot. A rollout
-beyond ``positions`` goes on in a new sequence, whose context are the last frames as they were decoded.
+Each pass of the network takes one token; the pass of a frame's last token also takes the next frame's slot. A rollout
+beyond ``positions`` continues in a new sequence, whose context is the last decoded frames.
 
 Axes: B clips, T frames (the first P are the prompt), c context frames, F later frames, A action inputs, V vocabulary.
 """
@@ -35,11 +35,11 @@ def generate(
     """Returns all frames, the first P as the tokenizer reconstructs them.
 
     Args:
-        actions: inputs of the network; row t led into frame t. T may exceed what a sequence holds.
-        index: each clip's number, which decides its random draws.
+        actions: inputs of the network; row t led to frame t. T may exceed the frames of a sequence.
+        index: each clip's number, which determines its random draws.
     """
     layout, past = arch.layout, prompt.shape[1]
-    lacking = max(0, layout.context - past)  # a prompt shorter than the context begins with its first frame repeated
+    lacking = max(0, layout.context - past)  # a prompt shorter than the context is padded with its first frame
     frames = np.concatenate([np.repeat(prompt[:, :1], lacking, axis=1), prompt], axis=1)
     rows = np.concatenate([np.repeat(actions[:, :1], lacking, axis=1), actions], axis=1)
     count = rows.shape[1] if rows.shape[1] <= layout.most_frames else layout.most_frames  # frames of a sequence
@@ -50,7 +50,7 @@ def generate(
     keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), jnp.asarray(index))
     while begin + given < rows.shape[1]:
         tokens = codec.encode(Video(window))
-        used = rows[:, begin : begin + count].copy()  # shorter in the last sequence, whose surplus is cut
+        used = rows[:, begin : begin + count].copy()  # may be shorter in the last sequence; surplus frames are cut
         if arch.config.integrate_actions:  # sums begin with the sequence, as in training
             used[..., used.shape[-1] // 2 :] -= used[:, :1, used.shape[-1] // 2 :]
         used = np.pad(used, ((0, 0), (0, count - used.shape[1]), (0, 0)))[:, layout.context :]
@@ -72,12 +72,12 @@ def sample(
     actions: Float[Array, "B F A"],
     keys: Key[Array, " B"],
 ) -> Int[Array, "B N"]:
-    """Returns a sequence's part after the context, of F later frames, from the sequence of the given frames.
+    """Continues the sequences of given frames, and returns their part after the context: F later frames.
 
     Args:
-        given: context and perhaps later frames.
-        actions: of all later frames.
-        keys: of each clip's draws.
+        given: sequences of the context and possibly of later frames.
+        actions: actions of all later frames.
+        keys: keys of each clip's draws.
     """
     layout, (clips, begin) = arch.layout, given.shape
     network, later = LLaMA(arch), actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
@@ -108,7 +108,7 @@ def sample(
         pair = jnp.stack([last, jnp.full_like(last, layout.slot)], axis=1)
         return forward(cache, pair, places[-1]), jnp.concatenate([pair[None, :, 1], drawn, last[None]])
 
-    # One position more, since the last frame is also followed by a slot.
+    # One more position, because a slot follows the last frame too.
     cache = apart(empty_cache(arch, clips, end + 1), blocks, unroll)
     slot = jnp.full((clips, 1), layout.slot, given.dtype)
     start = forward(cache, jnp.concatenate([given, slot], axis=1), 0)
@@ -118,7 +118,7 @@ def sample(
 
 
 def pick(settings: TopKConfig, logits: Float[Array, "B V"], keys: Key[Array, " B"]) -> Int[Array, " B"]:
-    """Draws a number for each clip from its ``top_k`` most probable ones; at temperature 0 takes the most probable."""
+    """Draws a number for each clip from its ``top_k`` most probable ones; at temperature 0, the most probable one."""
     if settings.temperature == 0:
         return jnp.argmax(logits, axis=-1).astype(jnp.int32)
     if 0 < settings.top_k < logits.shape[-1]:

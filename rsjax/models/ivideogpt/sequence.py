@@ -1,9 +1,9 @@
-"""A clip as one sequence of numbers: the tokens of its context frames, then a slot and a few tokens a later frame.
+"""Lays out a clip as one sequence of numbers: the tokens of context frames, then a slot and few tokens per later frame.
 
-Context tokens are 0 … K-1, a later frame's K … 2K-1, 2K separates context frames, 2K+1 is the slot at whose place the
-action is added that led into the frame after it.
+Context tokens are 0 … K-1 and tokens of later frames K … 2K-1. 2K separates context frames. 2K+1 is the slot before a
+later frame; the model adds the action that led to that frame at the slot's position.
 
-Axes: B clips, c context frames, F later frames, S tokens of a context frame, n of a later one, L length.
+Axes: B clips, c context frames, F later frames, S tokens of a context frame, n tokens of a later frame, L length.
 """
 
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from rsjax.config import IVideoGPTConfig
 
 @dataclass(frozen=True)
 class Layout:
-    """Lengths and numbers of such sequences.
+    """The lengths and numbers of these sequences.
 
     Attributes:
-        codes: K, in each codebook.
-        context: frames at the beginning with all their tokens, c.
-        cells: tokens of such a frame, S.
-        tokens: tokens of a later frame, n.
+        codes: K, the number of codes in each codebook.
+        context: c, the number of context frames, which have all their tokens.
+        cells: S, the tokens of a context frame.
+        tokens: n, the tokens of a later frame.
         positions: the length of the longest sequence.
     """
 
@@ -41,7 +41,7 @@ class Layout:
 
     @property
     def vocabulary(self) -> int:
-        """How many numbers there are: 2K + 2."""
+        """The size of the vocabulary: 2K + 2."""
         return 2 * self.codes + 2
 
     @property
@@ -70,7 +70,7 @@ class Layout:
         return self.context + (self.positions - self.first_slot) // self.per_frame
 
     def length(self, frames: int) -> int:
-        """Returns the length of a sequence of so many frames, context included."""
+        """Returns the length of a sequence of ``frames`` frames, context included."""
         return self.first_slot + self.per_frame * (frames - self.context)
 
     def join(self, context: Int[np.ndarray, "B c ..."], future: Int[np.ndarray, "B F n"]) -> Int[np.ndarray, "B L"]:
@@ -85,7 +85,7 @@ class Layout:
     def future(self, tail: Int[np.ndarray, "B N"]) -> Int[np.ndarray, "B F n"]:
         """Returns the tokens 0 … K-1 of later frames from a sequence's part after the context.
 
-        Numbers that are no such token, which sampling may draw, become the nearest one.
+        Sampling may draw numbers that are not tokens of later frames; each becomes the nearest such token.
         """
         slotted = tail.reshape(len(tail), -1, self.per_frame)
         return np.clip(slotted[:, :, 1:] - self.codes, 0, self.codes - 1)
