@@ -1,7 +1,8 @@
-"""Writes a store of clips as a LeRobotDataset v3.0 or v2.1, which LeRobot's and openpi's own training reads.
+"""Writes a store of clips as a LeRobotDataset v3.0 or v2.1, which the training code of LeRobot and openpi reads.
 
-Each clip becomes an episode. LeRobot's row t has the frame at t and the action that leads out of it, a clip's row t the
-action that leads into it: so actions move up by one row, and the last row repeats the one before, as nothing follows.
+Each clip becomes an episode. LeRobot's row t has the frame at t and the action that leads out of it; a clip's row t has
+the action that leads into it. So actions move up by one row, and the last row repeats the one before it, because no
+action follows the last frame.
 """
 
 import shutil
@@ -26,7 +27,7 @@ from rsjax.progress import note
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
-# Of a constant state; with one number it would come as (B, T) from LeRobot, whose policies want (B, T, D).
+# Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
 ZEROS = ("zero_0", "zero_1")
 
 
@@ -35,11 +36,11 @@ class LeRobotOptions:
     """How a store is exported.
 
     Attributes:
-        version: of the format; v3.0 for LeRobot 0.4 and later, v2.1 for earlier ones and openpi.
+        version: version of the format; v3.0 for LeRobot 0.4 and later, v2.1 for earlier ones and openpi.
         split: the clips to export. LeRobot trains on all episodes of a data set, so the default leaves test clips out.
         state: ``observation.state``, which most policies ask for and clips do not have. zeros: two zeros;
             command: the action that led into the frame; none: no such column.
-        codec: of the videos; LeRobot's own default is av1.
+        codec: codec of the videos; LeRobot's own default is av1.
         crf: constant rate factor of the codec, 0 to 63 (av1) or 51 (h264): lower is larger and sharper (LeRobot: 30).
         fps: frames per second; 0: as the clips say.
         robot: ``robot_type`` in ``meta/info.json``.
@@ -63,19 +64,19 @@ def export_lerobot(
     options: LeRobotOptions = LeRobotOptions(),
     report: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Writes a LeRobotDataset to ``out``, which is there when it is whole.
+    """Writes a LeRobotDataset to ``out``, which appears only when it is complete.
 
     Args:
-        store: of clips, all of one size and rate; those that cannot be read are left out with a note.
+        store: a store of clips, all of one size and rate; clips that cannot be read are left out with a note.
         out: a directory that does not exist.
         report: called with (episodes done, episodes in all).
 
     Returns:
-        The content of its ``meta/info.json``.
+        The content of the data set's ``meta/info.json``.
 
     Raises:
-        UserError: ``out`` exists, the store has no clips, or their frame rates are unknown or differ.
-        FileError: the disk is full or refuses.
+        UserError: ``out`` exists, the store has no clips, or their sizes or frame rates differ or do not suit a video.
+        FileError: the disk is full, or ``out`` cannot be written.
     """
     if out.exists():
         raise UserError(f"{out}: exists; choose another place for the data set, or move it away")
@@ -128,7 +129,7 @@ def _clips(store: Store, split: str) -> Iterator[Record]:
 
 
 def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> LayoutV30 | LayoutV21:
-    """Returns the layout for clips like the first one."""
+    """Returns the layout for clips of the first clip's size and rate."""
     fps = options.fps or frame_rate(clip, store.manifest)
     if not fps:
         raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
@@ -137,7 +138,7 @@ def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> 
         raise UserError(
             f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0.001 to 1000 Hz"
         )
-    fps = float(video_rate(fps))  # timestamps of a long video of many episodes have to be those of its frames
+    fps = float(video_rate(fps))  # timestamps have to be those of the frames, even in a long video of many episodes
     width = clip["actions"].shape[1]
     states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
     video = VideoSettings(options.codec, options.crf, fps, size)
@@ -149,7 +150,7 @@ def _camera(clip: Record) -> str:
 
 
 def _names(store: Store, width: int) -> list[str]:
-    """Returns a name for each dimension of the actions; those of simulated Lift are several controls in a row."""
+    """Returns a name for each dimension of the actions; an action of simulated Lift is a sequence of controls."""
     steps = width // len(CONTROLS)
     if store.manifest.get("source", "").startswith("robosuite/") and width == steps * len(CONTROLS):
         return [f"{name}_{step}" for step in range(steps) for name in CONTROLS]

@@ -23,8 +23,8 @@ from rsjax.export.lerobot_meta import (
 )
 from rsjax.export.lerobot_video import VideoFile, VideoSettings
 
-CHUNK = 1000  # episodes (v2.1) or files (v3.0) of a folder
-DATA_MEGABYTES, VIDEO_MEGABYTES = 100, 200  # after which v3.0 begins another file
+CHUNK = 1000  # episodes (v2.1) or files (v3.0) in a folder
+DATA_MEGABYTES, VIDEO_MEGABYTES = 100, 200  # sizes after which v3.0 begins another file
 BUFFERED = 1000  # episodes whose metadata are written together
 
 
@@ -33,8 +33,8 @@ class Episode:
     """One episode to write.
 
     Attributes:
-        rgb: its frames.
-        columns: its ``action`` and, if it has one, ``observation.state``.
+        rgb: the episode's frames.
+        columns: its ``action`` and, if it has one, its ``observation.state``.
         task: in words.
     """
 
@@ -44,7 +44,7 @@ class Episode:
 
 
 class _Layout(ABC):
-    """What both versions share: counters, tasks, statistics and ``info.json``."""
+    """The part common to both versions: counters, tasks, statistics and ``info.json``."""
 
     data_path: str
     video_path: str
@@ -57,7 +57,7 @@ class _Layout(ABC):
         (root / "meta").mkdir()
 
     def add(self, episode: Episode) -> None:
-        """Writes one episode after those before."""
+        """Writes the next episode."""
         count = len(episode.rgb)
         task = self.tasks.setdefault(episode.task, len(self.tasks))
         steps = np.arange(count)
@@ -76,7 +76,7 @@ class _Layout(ABC):
         self.episodes, self.rows = self.episodes + 1, self.rows + count
 
     def finish(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Completes all files and writes ``info.json``, whose content it returns."""
+        """Completes all files, writes ``info.json`` and returns its content."""
         info |= {
             "total_episodes": self.episodes,
             "total_frames": self.rows,
@@ -96,11 +96,11 @@ class _Layout(ABC):
 
     @abstractmethod
     def _finish(self) -> dict[str, Any]:
-        """Completes the version's own files; returns its own fields of ``info.json``."""
+        """Completes the files specific to a version; returns the fields of ``info.json`` specific to it."""
 
 
 class LayoutV21(_Layout):
-    """v2.1: a table and a video of each episode, metadata in JSON lines."""
+    """v2.1: a table and a video for each episode, metadata in JSON lines."""
 
     data_path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     video_path = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -186,7 +186,7 @@ class LayoutV30(_Layout):
 
 
 class _Tables:
-    """Parquet files to which tables are appended; after :data:`DATA_MEGABYTES` another one begins."""
+    """Parquet files to which tables are appended; after :data:`DATA_MEGABYTES` another file begins."""
 
     def __init__(self, root: Path, template: str) -> None:
         self._root, self._template = root, template
@@ -194,7 +194,7 @@ class _Tables:
         self._number = self._bytes = 0
 
     def place(self) -> dict[str, int]:
-        """Returns where the next table goes."""
+        """Returns the chunk and file that the next table goes to."""
         if self._bytes and self._bytes >= DATA_MEGABYTES * 2**20:
             self.close()
             self._number, self._bytes = self._number + 1, 0

@@ -25,7 +25,7 @@ Stats = dict[str, dict[str, np.ndarray]]  # feature → min, max, mean, std, cou
 def describe_features(
     video: VideoSettings, camera: str, action: Sequence[str], state: Sequence[str] | None
 ) -> dict[str, dict[str, Any]]:
-    """Returns the ``features`` of ``info.json``: one camera, the action, perhaps a state, and the row counters."""
+    """Returns the ``features`` of ``info.json``: one camera, the action, a state if there is one, and row counters."""
     pictures = {"dtype": "video", "shape": [video.size, video.size, 3], "names": ["height", "width", "channels"]}
     features: dict[str, dict[str, Any]] = {f"observation.images.{camera}": pictures | {"info": video.describe()}}
     numbers = {"observation.state": state, "action": action}
@@ -36,9 +36,9 @@ def describe_features(
 
 
 def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
-    """Returns columns as a table; those of several numbers a row as lists of fixed length, as LeRobot writes them.
+    """Returns columns as a table; columns with several numbers per row become lists of fixed length, as in LeRobot.
 
-    A column of one number a row is one of scalars, also if it has two axes: LeRobot reads the shape [1] as that.
+    A column with one number per row becomes scalars, even if it has two axes: that is how LeRobot reads the shape [1].
     """
     arrays: dict[str, pa.Array] = {}
     for name, values in columns.items():
@@ -48,7 +48,7 @@ def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
 
 
 def column_stats(values: Num[np.ndarray, "T ..."]) -> dict[str, np.ndarray]:
-    """Returns the statistics of one column over an episode, each (D,) or (1,); standard deviations of the whole."""
+    """Returns one column's statistics over an episode, each (D,) or (1,); "std" is that of the population (1 / T)."""
     wide = values.astype(np.float64).reshape(len(values), -1)
     return _stats(wide, len(values))
 
@@ -67,7 +67,7 @@ def _stats(rows: Num[np.ndarray, "N D"], count: int) -> dict[str, np.ndarray]:
 
 
 def merged_stats(one: Stats, other: Stats) -> Stats:
-    """Returns the statistics of both; quantiles become weighted means, as LeRobot's own aggregation has them."""
+    """Returns the statistics of both together; quantiles become weighted means, as in LeRobot's own aggregation."""
     return {name: _merged(one[name], other[name]) for name in one} if one else other
 
 
@@ -81,7 +81,7 @@ def _merged(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[st
 
 
 def plain_stats(stats: Stats, quantiles: bool = True) -> dict[str, Any]:
-    """Returns statistics JSON-ready, perhaps without quantiles, which v2.1 does not have."""
+    """Returns statistics JSON-ready, on request without quantiles, which v2.1 does not have."""
     return {
         feature: {name: value.tolist() for name, value in values.items() if quantiles or name not in QUANTILES}
         for feature, values in stats.items()

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
-KEY_FRAMES = 2  # frames from one to the next: LeRobot's choice, as training reads frames in random order
+KEY_FRAMES = 2  # frames from one key frame to the next: LeRobot's choice, as training reads frames in random order
 
 
 def video_rate(fps: float) -> Fraction:
-    """Returns the frames per second that a video file can say: fractions, up to those of 24000/1001."""
+    """Returns the nearest frame rate that a video file can state: a fraction with a denominator of at most 1001."""
     return Fraction(fps).limit_denominator(1001)
 
 
@@ -30,7 +30,7 @@ class VideoSettings:
 
     @property
     def number(self) -> float:
-        """The frame rate as ``info.json`` has it: a whole number where it is one."""
+        """Returns the frame rate as ``info.json`` states it: an int if it is a whole number."""
         return int(self.fps) if self.fps == int(self.fps) else self.fps
 
     def describe(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class VideoFile:
         self.frames += len(rgb)
 
     def close(self) -> None:
-        """Writes what the encoder still has, and the file's index."""
+        """Writes the frames that the encoder still holds, and the file's index."""
         self._mux(self._stream.encode())
         self._container.close()
 
