@@ -1,4 +1,4 @@
-"""CogVideoX as in ``diffusers``, its public implementation, with settings and shapes of this project's networks.
+"""CogVideoX from ``diffusers``, its public implementation, with the settings and shapes of this project's networks.
 
 Axes: B clips, T frames, F latent frames, C channels, h×w cells.
 """
@@ -19,7 +19,7 @@ from rsjax.models.diffusion.schedule import alphas
 
 
 def autoencoder(config: CausalVAEConfig) -> tuple[nn.Module, Any, Any]:
-    """Returns the autoencoder, and its functions from frames (B, 3, T, H, W) to latents and back."""
+    """Returns the autoencoder, and its functions that map frames (B, 3, T, H, W) to latents and back."""
     levels, patch = len(config.widths), config.patch_size
     vae = AutoencoderKLCogVideoX(
         in_channels=3 * patch**2,
@@ -42,7 +42,7 @@ def autoencoder(config: CausalVAEConfig) -> tuple[nn.Module, Any, Any]:
 
 
 def transformer(arch: Architecture) -> tuple[nn.Module, Any]:
-    """Returns the transformer and its rotary positions, None for others."""
+    """Returns the transformer and its rotary positions (None for other positions)."""
     cfg = arch.model
     network = CogVideoXTransformer3DModel(
         num_attention_heads=cfg.heads,
@@ -68,7 +68,7 @@ def transformer(arch: Architecture) -> tuple[nn.Module, Any]:
 
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
-    """Returns what is timed; sampling goes from pixels to pixels, in chunks of a clip's frames."""
+    """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip."""
     model, clips = config.model, config.clips
     assert isinstance(model, CogVideoXConfig)
     arch = Architecture.create(model, clips)

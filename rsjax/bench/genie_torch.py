@@ -122,7 +122,7 @@ def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, actions:
 
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
-    """Returns what is timed; sampling is that of one frame, whose steps each pass over its whole window."""
+    """Returns the work to time; sampling decodes one frame, and each of its steps passes over the whole window."""
     arch, model = Architecture.create(config), config.model
     assert isinstance(model, TokenModelConfig)
     network = GenieTorch(arch).to(device)

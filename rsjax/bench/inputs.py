@@ -40,9 +40,9 @@ def assets(config: Config) -> Assets:
 
 @contextmanager
 def random_texts(config: Config) -> Iterator[Config]:
-    """Provides the configuration with a temporary file of text embeddings, random ones, in place of the one it names.
+    """Yields the configuration with a temporary file of random text embeddings in place of the file that it names.
 
-    A configuration that names none is left as it is.
+    A configuration that names no such file is left as it is.
     """
     if not (isinstance(config.model, CogVideoXConfig) and config.model.text.file):
         yield config
@@ -80,7 +80,7 @@ def batch_shapes(model: WorldModel[Any], config: Config) -> Any:
 
 
 def prompt(arch: Architecture, size: int, frames: int) -> dict[str, Int[Array, "B T H W"]]:
-    """Returns random tokens of ``frames`` prompt frames by branch."""
+    """Returns random tokens of ``frames`` prompt frames for each branch."""
     keys = jax.random.split(jax.random.key(0), len(arch.branches))
     shape = (size, frames, arch.grid, arch.grid)
     drawn = (jax.random.randint(key, shape, 0, 2**arch.code_bits, "int32") for key in keys)

@@ -81,7 +81,7 @@ def modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
 
 
 class IRASimTorch(nn.Module):
-    """Noisy latents (B, T, C, h, w), steps (B,) and actions (B, T - 1, A) to the noise."""
+    """Maps noisy latents (B, T, C, h, w), steps (B,) and actions (B, T - 1, A) to the noise."""
 
     def __init__(self, config: Architecture) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class IRASimTorch(nn.Module):
 
 
 def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
-    """Returns the autoencoder, and its functions from images (N, 3, H, W) to latents and back."""
+    """Returns the autoencoder, and its functions that map images (N, 3, H, W) to latents and back."""
     if config.network == "magvit2":
         halves = nn.ModuleList(
             [
@@ -150,7 +150,7 @@ def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
 
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
-    """Returns what is timed; sampling goes from pixels to pixels, in chunks of a clip's frames."""
+    """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip."""
     model, clips, arch = config.model, config.clips, architecture(config)
     assert isinstance(model, IRASimConfig)
     network = IRASimTorch(arch).to(device)

@@ -1,6 +1,6 @@
 """iVideoGPT in plain eager PyTorch, with the LLaMA of ``transformers``; both are optional packages.
 
-Axes: B clips, c context frames, F later frames, L numbers of a sequence, A action dimensions.
+Axes: B clips, c context frames, F later frames, L tokens of a sequence, A action dimensions.
 """
 
 import torch
@@ -14,7 +14,7 @@ from rsjax.models.ivideogpt.sequence import Layout
 
 
 class Sampler:
-    """The public way from prompts to videos: each frame begins with a pass over all tokens before it."""
+    """Generates videos from prompts as the public code does: each frame begins with a pass over all earlier tokens."""
 
     def __init__(self, config: IVideoGPTConfig, clips: ClipShape) -> None:
         self.layout = Layout.create(config, clips.image_size)
@@ -42,7 +42,7 @@ class Sampler:
     def generate(self, frames: Tensor, actions: Tensor) -> Tensor:
         """Returns videos (B, c + F, 3, H, W) from context frames (B, c, 3, H, W) and actions (B, F, A)."""
         layout, (clips, count) = self.layout, frames.shape[:2]
-        stand_in = torch.cat([frames, frames[:, -1:]], 1)  # the tokenizer takes a later frame, too
+        stand_in = torch.cat([frames, frames[:, -1:]], 1)  # the tokenizer needs at least one later frame
         context = self.tokenizer.tokenize(stand_in)[0]
         separators = torch.full((clips, count, 1), layout.separator, device=frames.device)
         tokens = torch.cat([separators, context], 2).flatten(1)[:, 1:]
@@ -67,7 +67,7 @@ class Sampler:
 
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
-    """Returns what is timed; sampling goes from pixels to pixels."""
+    """Returns the work to time; sampling goes from pixels to pixels."""
     model, clips = config.model, config.clips
     assert isinstance(model, IVideoGPTConfig)
     sampler, context = Sampler(model, clips), model.autoencoder.context_frames

@@ -1,4 +1,4 @@
-"""iVideoGPT's tokenizer in plain eager PyTorch, as a reference of results and speed, with the public parameter names.
+"""iVideoGPT's tokenizer in plain eager PyTorch, a reference for results and speed, with the public parameter names.
 
 It needs torch, an optional dependency, so import this module only where it is used.
 
@@ -42,7 +42,7 @@ class Resample(nn.Module):
 
 
 class Level(nn.Module):
-    """Residual blocks, then perhaps a change of size."""
+    """Residual blocks, followed by a change of size in all levels but the last."""
 
     def __init__(self, width_in: int, width: int, blocks: int, groups: int, up: bool, last: bool) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Level(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """One head over all cells of an image, plus the input."""
+    """Attention with one head over all cells of an image, plus the input."""
 
     def __init__(self, width: int, groups: int) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class SelfAttention(nn.Module):
 
 
 class Middle(nn.Module):
-    """Two residual blocks, in the conditional pair with attention between."""
+    """Two residual blocks, in the conditional pair with attention between them."""
 
     def __init__(self, width: int, groups: int, attention: bool) -> None:
         super().__init__()
@@ -104,7 +104,10 @@ class CrossAttention(nn.Module):
 
 
 class Half(nn.Module):
-    """An encoder or a decoder; with ``size``, the cells a side where it begins, that of later frames."""
+    """An encoder or a decoder.
+
+    With ``size``, the number of cells per side of its input, it is the conditional one of later frames.
+    """
 
     def __init__(self, config: ConditionalVQConfig, up: bool, size: int | None) -> None:
         super().__init__()
@@ -128,7 +131,7 @@ class Half(nn.Module):
         self.conv_out = nn.Conv2d(widths[-1], pixels if up else config.latent, 3, padding=1)
 
     def forward(self, x: Tensor, context: list[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
-        """Returns the output and the features after each stage; ``context`` are another half's."""
+        """Returns the output and the features after each stage; ``context`` holds such features of another half."""
         cross, stages = iter(self.cross_att_blocks), [self.mid_block] * self.up
         stages = [*stages, *getattr(self, "up_blocks" if self.up else "down_blocks")]
         x = self.conv_in(x)
@@ -143,7 +146,7 @@ class Half(nn.Module):
 
 
 class Codebook(nn.Module):
-    """The nearest of a set of vectors."""
+    """A codebook that maps each vector to its nearest entry."""
 
     def __init__(self, config: ConditionalVQConfig) -> None:
         super().__init__()
@@ -151,12 +154,12 @@ class Codebook(nn.Module):
         nn.init.uniform_(self.embedding.weight, -1 / config.codes, 1 / config.codes)
 
     def nearest(self, z: Tensor) -> Tensor:
-        """Returns numbers (…) of vectors (…, C)."""
+        """Returns the indices (…) of the entries nearest to vectors (…, C)."""
         return torch.cdist(z.reshape(-1, z.shape[-1]).float(), self.embedding.weight).argmin(1).reshape(z.shape[:-1])
 
 
 class ConditionalVQTorch(nn.Module):
-    """Frames (B, c + F, 3, H, W) in [0, 1] to tokens (B, c, g²) and (B, F, n), and back."""
+    """Maps frames (B, c + F, 3, H, W) in [0, 1] to tokens (B, c, g²) and (B, F, n), and back."""
 
     def __init__(self, config: ConditionalVQConfig, image_size: int) -> None:
         super().__init__()
@@ -170,7 +173,7 @@ class ConditionalVQTorch(nn.Module):
         self.quantize, self.dynamics_quantize = Codebook(config), Codebook(config)
 
     def latents(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns what the codebooks quantise, (B, c, g², C) and (B, F, n, C)."""
+        """Returns the latents that the codebooks quantise, (B, c, g², C) and (B, F, n, C)."""
         cfg, (clips, count) = self.config, frames.shape[:2]
         later = count - cfg.context_frames
         unshuffled = [self._to_channels(x.flatten(0, 1)) for x in frames.split([cfg.context_frames, later], 1)]
@@ -183,7 +186,7 @@ class ConditionalVQTorch(nn.Module):
         return h.reshape(clips, cfg.context_frames, grid**2, cfg.latent), d
 
     def tokenize(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the tokens of context and of later frames."""
+        """Returns the tokens of context frames and of later frames."""
         context, later = self.latents(frames)
         return self.quantize.nearest(context), self.dynamics_quantize.nearest(later)
 
@@ -192,7 +195,7 @@ class ConditionalVQTorch(nn.Module):
         return self.images(self.quantize.embedding(context), self.dynamics_quantize.embedding(later))
 
     def images(self, context: Tensor, later: Tensor) -> Tensor:
-        """Decodes quantised latents, laid out as :meth:`latents`."""
+        """Decodes quantised latents, laid out as :meth:`latents` returns them."""
         cfg, (clips, count) = self.config, later.shape[:2]
         grid, p = int(context.shape[2] ** 0.5), cfg.future_patch
         h = context.flatten(0, 1).transpose(1, 2).reshape(-1, cfg.latent, grid, grid)
@@ -212,7 +215,7 @@ class ConditionalVQTorch(nn.Module):
         return out
 
     def _to_channels(self, x: Tensor) -> Tensor:
-        p = self.config.patch_size  # channels are ordered (p, p, 3), in PyTorch's function (3, p, p)
+        p = self.config.patch_size  # channels are ordered (p, p, 3); PyTorch's own function orders them (3, p, p)
         n, c, h, w = x.shape
         return x.reshape(n, c, h // p, p, w // p, p).permute(0, 3, 5, 1, 2, 4).reshape(n, -1, h // p, w // p)
 

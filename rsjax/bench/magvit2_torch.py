@@ -13,7 +13,7 @@ from rsjax.config import TokenizerConfig
 
 
 class CellNorm(nn.GroupNorm):
-    """GroupNorm of each cell for itself."""
+    """GroupNorm that normalises each cell by itself."""
 
     def forward(self, x: Tensor) -> Tensor:
         n, c, h, w = x.shape
@@ -25,7 +25,7 @@ def _norm(config: TokenizerConfig, width: int, local: bool) -> nn.GroupNorm:
 
 
 class Block(nn.Module):
-    """GroupNorm → SiLU → convolution, twice, plus the input; ``local``: no cell sees another."""
+    """GroupNorm → SiLU → convolution, twice, plus the input; with ``local`` no cell sees another."""
 
     def __init__(self, config: TokenizerConfig, width_in: int, width: int, local: bool = False) -> None:
         super().__init__()

@@ -34,15 +34,15 @@ from rsjax.training.step import train_step
 
 Numbers = dict[str, Any]
 
-# (N, K, M) of the products whose fastest is the ceiling: the layers of the 32×256 model, and larger ones.
+# (N, K, M) of the measured products, the fastest of which is the ceiling: layers of the 32×256 model, and larger ones.
 CPU_PRODUCTS = ((4096, 256, 1024), (4096, 1024, 256), (2048, 2048, 2048))
 ACCELERATOR_PRODUCTS = ((4096, 256, 1024), (8192, 8192, 8192), (16384, 4096, 16384))
 PRODUCTS_PER_RUN = 10  # to hide the cost of a launch
-PROMPT_FRAMES = 1  # of rollouts, as in the paper, for every preset
+PROMPT_FRAMES = 1  # of each rollout, as in the paper, for every preset
 UNCACHED_FRAMES = 2  # frames decoded without the cache; all cost the same, so few are enough
 LOADER_CLIPS, LOADER_BATCHES = 64, 16
 FEED_CLIPS = 256
-ENVIRONMENTS = (1, 64)  # numbers of them that are stepped at once
+ENVIRONMENTS = (1, 64)  # numbers of environments that are stepped at once
 WARM_UP, LEAST, MOST = 3, 10, 200  # steps of the part "feed"
 
 
@@ -62,7 +62,7 @@ def matmul(dtype: str, budget: float) -> Numbers:
 
 
 def train_adamw(config: Config, batch: int, budget: float) -> Numbers:
-    """Measures the training step with AdamW, PyTorch's optimizer in the baseline, if the preset has another one."""
+    """Measures the training step with AdamW, the PyTorch baseline's optimizer, if the preset has another one."""
     if config.train.optimizer.kind == "adamw":
         return {}
     optimizer = dataclasses.replace(config.train.optimizer, kind="adamw")
@@ -104,8 +104,8 @@ def train(config: Config, batch: int, budget: float) -> Numbers:
 def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
     """Measures seconds per generated frame of a batch for each rollout length, with and without the temporal cache.
 
-    Without it, only the last frames of a rollout are decoded, since each costs a pass over all frames. Families other
-    than RoboScape and Genie are measured from pixels to pixels.
+    Without the cache, only the last frames of a rollout are decoded, since each step on each of them passes over all
+    frames. Families other than RoboScape and Genie are measured from pixels to pixels.
     """
     model, key = create_model(config), jax.random.key(0)
     if not isinstance(model, RoboScape):
@@ -161,7 +161,7 @@ def environment(config: Config, budget: float) -> Numbers:
     """Measures steps a second of 1 and of 64 environments in the world model, summed over them, without a judge.
 
     A step goes from an action on the host to a frame on the host, with depth if the model has it, in windows that are
-    on average half full. Empty for a model that takes no actions or cannot generate frame by frame.
+    on average half full. The result is empty for a model that takes no actions or cannot generate frame by frame.
     """
     model, size = create_model(config), config.clips.image_size
     trained = TrainedModel(config, model, jax.jit(model.init)(jax.random.key(0)), inputs.assets(config))

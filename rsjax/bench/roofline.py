@@ -1,11 +1,11 @@
-"""Rooflines: the time of each kind of operation beside the least that this machine allows.
+"""Rooflines: the time of each kind of operation, compared with the least time that this machine allows.
 
 They cover a training step, the tokenizer's products for one image, and a pass of cached sampling.
 
-The least time is that of its matrix products at the measured ceiling, or of its reads and writes at the measured
-bandwidth, whichever is longer: every operand is read once and every result written once, in float32 (Williams et al.
-2009). So it is the limit of a program that runs the operations one after another, as XLA does on a CPU; only fusing
-them across these borders, or operands that fit the processor's caches, go below.
+The least time of an operation is that of its matrix products at the measured ceiling, or of its reads and writes at
+the measured bandwidth, whichever is longer. Every operand is read once and every result is written once, in float32
+(Williams et al. 2009). This limits a program that runs the operations one after another, as XLA does on a CPU. A
+program can be faster only if it fuses operations, or if operands fit the processor's caches.
 
 Axes: R rows (clips · frames · cells), C width.
 """
@@ -38,7 +38,7 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
 from rsjax.training.state import make_optimizer
 
-STREAM = 2**24  # numbers in each of the arrays by which the bandwidth is measured: 64 MiB, more than a cache holds
+STREAM = 2**24  # numbers in each array that measures the bandwidth: 64 MiB, more than a cache holds
 FLOAT = 4  # bytes
 
 
@@ -47,12 +47,12 @@ class Operation:
     """An operation of the forward pass.
 
     Attributes:
-        name: of it, for all places with operands of these shapes.
-        times: places in a step.
-        run: from operands to the result; a module's parameters are operands too.
-        shapes: of the operands.
-        flops: of its matrix products, forward; its gradient has twice as many.
-        passes_on: whether its operands' gradients are the result's, so that the gradient moves nothing.
+        name: its name, common to all places in a step where operands have these shapes.
+        times: number of these places.
+        run: maps operands to the result; a module's parameters are operands too.
+        shapes: shapes of the operands.
+        flops: floating-point operations of its forward matrix products; its gradient has twice as many.
+        passes_on: whether the operands' gradients equal the result's gradient, so that the gradient moves no data.
     """
 
     name: str
@@ -64,15 +64,15 @@ class Operation:
 
 
 def roofline(config: Config, batch: int, ceiling: float, budget: float) -> dict[str, Any]:
-    """Measures each kind of operation alone: of a training step, forward and gradient, and of the tokenizer.
+    """Measures each kind of operation alone: those of a training step, with gradient, and those of the tokenizer.
 
     Args:
         ceiling: operations a second of matrix products.
         budget: seconds per quantity.
 
     Returns:
-        For each operation seconds in a whole step, or for one image; the least seconds; and the share of the second in
-        the first; the sums; the same of one pass of cached sampling; and the bandwidth. Empty for a family other than
+        For each operation, for their sums and for one pass of cached sampling: the seconds in a whole step (or for one
+        image), the least seconds, and the ratio least / measured. Also the bandwidth. Empty for a family other than
         RoboScape and Genie.
     """
     model = create_model(config)
@@ -93,20 +93,20 @@ def _row(name: str, seconds: float, least: float) -> dict[str, float]:
 
 
 def _rows(prefix: str, rows: dict[str, tuple[float, float]]) -> dict[str, float]:
-    """Returns the numbers of several operations, seconds and least seconds of each, and of their sum."""
+    """Returns the numbers of several operations and of their sum; ``rows`` holds seconds and least seconds of each."""
     rows = rows | {"sum": (sum(row[0] for row in rows.values()), sum(row[1] for row in rows.values()))}
     return {key: x for name, row in rows.items() for key, x in _row(f"{prefix}_{name}", *row).items()}
 
 
 def bandwidth(budget: float) -> float:
-    """Returns bytes a second, read and written, of the sum of two large arrays."""
+    """Returns the bytes a second that adding two large arrays reads and writes."""
     x, y = jnp.ones(STREAM), jnp.ones(STREAM)
     add = jax.jit(jnp.add)
     return 3 * FLOAT * STREAM / median_seconds(lambda: add(x, y), budget)
 
 
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
-    """Returns the operations of a training step's forward pass without rematerialisation, embeddings excepted."""
+    """Returns the operations of a training step's forward pass, without rematerialisation and without embeddings."""
     width, hidden, heads, frames = arch.width, arch.mlp_ratio * arch.width, arch.heads, config.clips.frames
     cells, blocks = arch.grid**2, arch.blocks * len(arch.branches)
     rows, bf16 = batch * frames * cells, arch.compute_dtype == "bfloat16"
@@ -159,7 +159,7 @@ def tokenizer_operations(config: TokenizerConfig, image_size: int) -> dict[str, 
 
 
 def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
-    """Yields a float32 program's products, named after kernel, stride, channels and side of the result.
+    """Yields the products of a float32 program, named after kernel, stride, channels and side of the result.
 
     Args:
         bf16: whether to run convolutions as a tokenizer in bf16 does.
@@ -182,7 +182,7 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
 
 
 def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
-    """Returns a pass over the last frame of a full window, from parameters and the cache of the frames before."""
+    """Returns a pass over the last frame of a full window; it takes parameters and the cache of the earlier frames."""
     arch, sample = model.architecture, model.config.sample
     actions, hidden = inputs.actions(arch, batch, 1), jnp.ones((batch, 1, arch.grid**2), bool)
     tokens = {name: cells.reshape(hidden.shape) for name, cells in inputs.prompt(arch, batch, 1).items()}
@@ -200,13 +200,13 @@ def full_cache(model: RoboScape, batch: int) -> StackedCache:
 
 
 def pass_flops(arch: Architecture, cache: StackedCache) -> int:
-    """Returns the operations of a pass over one frame that reads the cache and itself."""
+    """Returns the floating-point operations of a pass over one frame that attends to the cache and to itself."""
     _, clips, _, _, slots, _ = cache["rgb"].k.shape
     return clips * forward_flops(arch, slots + 1) // (slots + 1)
 
 
 def _cached_pass(model: RoboScape, batch: int, ceiling: float, speed: float, budget: float) -> tuple[float, float]:
-    """Returns seconds and least seconds of a pass, which reads parameters and cache once."""
+    """Returns seconds and least seconds of a cached pass, which reads parameters and cache once."""
     params = jax.jit(model.init)(jax.random.key(0))
     cache = full_cache(model, batch)
     run = jax.jit(cached_pass(model, batch))
@@ -241,7 +241,7 @@ def _measure(
     run = partial(both, cotangent, *operands) if gradient else partial(forward, *operands)
     seconds = median_seconds(run, budget)
     read = sum(x.size for x in operands)
-    # Forward: operands and result. Gradient: operands, the result's gradient, and the operands' gradients.
+    # Forward moves operands and result; the gradient moves operands, the result's gradient and the operands' gradients.
     moved = FLOAT * (read + out.size + (gradient and not operation.passes_on) * (2 * read + out.size))
     products = (3 if gradient else 1) * operation.flops
     return operation.times * seconds, operation.times * max(products / ceiling, moved / speed)

@@ -37,8 +37,8 @@ def bench(
     Args:
         batch: clips per training step, rollout and loader batch; the tokenizer processes their frames. The part
             ``feed`` uses the preset's batch size.
-        horizons: lengths of rollouts in frames, one prompt frame included; if empty, the clips' length and three times
-            that. PyTorch decodes in a window of the first length.
+        horizons: lengths of rollouts in frames, including one prompt frame; if empty, once and three times the clips'
+            length. PyTorch decodes in a window of the first length.
         torch: whether to measure the PyTorch baseline too.
         budget: seconds after which repetitions of a quantity end, but at least three are run.
         say: takes a message before each part.
@@ -82,7 +82,7 @@ def bench(
 
 
 def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int], torch: bool) -> None:
-    """Raises :class:`UserError` if a part cannot be measured, before any is."""
+    """Raises :class:`UserError` if any part cannot be measured; called before the first measurement."""
     for name in only:
         known = f"{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})"
         require(name in PARTS, f"--only has no part {name!r}{known}")
@@ -97,10 +97,10 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
 
 
 def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:
-    """Returns ratios of two measured quantities if both were measured.
+    """Returns ratios of measured quantities, each if both of its quantities were measured.
 
-    PyTorch's is the faster of the plain one and its variant, if there is one; ``…_fastest_torch_…`` names it. Its
-    training step has AdamW, so ours is taken with AdamW too.
+    PyTorch's quantity is the faster of the plain one and its variant, if there is one; ``…_fastest_torch_…`` says which
+    is faster. PyTorch's training step uses AdamW, so it is compared with our step with AdamW.
     """
     over = {
         "train_share_of_ceiling": ("train_flops", "matmul_ceiling_flops"),

@@ -13,7 +13,7 @@ def median_seconds(call: Callable[[], Any], budget: float, most: int = 20, least
     """Returns the median wall time of ``call`` in seconds, after a warm-up run that compiles and fills caches.
 
     Args:
-        call: returns its arrays, so that the time until they are ready is measured.
+        call: returns its arrays, so that the time until they are ready is included.
         budget: seconds after which no further run begins, but at least ``least`` runs are timed.
         most: largest number of timed runs.
         least: smallest number of timed runs.
@@ -28,7 +28,7 @@ def median_seconds(call: Callable[[], Any], budget: float, most: int = 20, least
 
 
 def peak_memory_bytes() -> int:
-    """Returns the peak since the process began of the device's memory or, on a CPU, of the resident set."""
+    """Returns the peak device memory since the process began or, on a CPU, the peak resident set."""
     stats = jax.local_devices()[0].memory_stats()
     if stats:
         return stats["peak_bytes_in_use"]

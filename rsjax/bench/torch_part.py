@@ -37,8 +37,8 @@ class Baseline:
 
     Attributes:
         module: has a function ``create``, which returns a :class:`rsjax.bench.torch_work.TorchWork`.
-        packages: that it needs beside torch.
-        check: raises :class:`ConfigError` for settings that it lacks.
+        packages: the packages that it needs besides torch.
+        check: raises :class:`ConfigError` for settings that the baseline lacks.
     """
 
     module: str
@@ -59,7 +59,7 @@ def check_torch(config: Config) -> Baseline:
     """Returns the baseline of the model's family.
 
     Raises:
-        UserError: there is none, the model has options that it lacks, or a package is not installed.
+        UserError: the family has no baseline, the model has options that the baseline lacks, or a package is missing.
     """
     family = config.model.family
     if family not in FAMILIES:
@@ -86,14 +86,14 @@ def check_plain(model: Architecture) -> None:
 
 
 def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
-    """Measures the model in PyTorch, float32 and bf16 autocast, like the public code of its family.
+    """Measures the model in PyTorch, in float32 and under bf16 autocast, like the public code of its family.
 
-    That is training step, sampling and the autoencoder; of RoboScape the RGB branch. All are eager; the training step
-    is compiled besides. It uses the GPU if jax and PyTorch
-    both do, otherwise the CPU (``torch_device``).
+    This covers the training step, sampling and the autoencoder; for RoboScape, only the RGB branch. All run eagerly;
+    the training step is also measured compiled. PyTorch runs on the GPU if both jax and PyTorch can use one, otherwise
+    on the CPU (``torch_device``).
 
     Args:
-        horizon: length in frames of a rollout. Of RoboScape and Genie its last frame alone is decoded.
+        horizon: length of a rollout in frames. For RoboScape and Genie only its last frame is decoded.
 
     Raises:
         UserError: as :func:`check_torch`.
@@ -107,7 +107,7 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
 
     def timed(call: Callable[[], Any]) -> float:
-        return median_seconds(lambda: (call(), wait())[:0], budget)  # jax has nothing to wait for
+        return median_seconds(lambda: (call(), wait())[:0], budget)  # returns no arrays that jax could wait for
 
     torch.manual_seed(0)
     work = import_module(baseline.module).create(config, batch, horizon, device)

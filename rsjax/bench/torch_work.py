@@ -1,4 +1,4 @@
-"""What is timed of a family in PyTorch, and how: the same steps for every family.
+"""Times a family's networks in PyTorch, with the same steps for every family.
 
 It needs torch, an optional dependency, so import this module only where it is used.
 """
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rsjax.config import OptimizerConfig
 from rsjax.errors import first_line
 
-FORMATS = {4: torch.channels_last, 5: torch.channels_last_3d}  # by the kernels' number of axes
+FORMATS = {4: torch.channels_last, 5: torch.channels_last_3d}  # memory formats by the kernels' number of axes
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class TorchWork:
 
     Attributes:
         trained: networks that a training step changes.
-        frozen: the autoencoder's.
-        loss: the loss of a batch.
-        sample: generates ``sampled`` frames of each clip, the way the public code does.
-        encode, decode: to tokens or latents and back, ``frames`` frames in all.
+        frozen: the autoencoder's networks.
+        loss: returns the loss of a batch.
+        sample: generates ``sampled`` frames of each clip in the way of the public code.
+        encode, decode: map ``frames`` frames in all to tokens or latents, and back.
     """
 
     trained: tuple[nn.Module, ...]
@@ -49,15 +49,15 @@ def measure(
 ) -> dict[str, Any]:
     """Measures training step, sampling, encoding and decoding, in float32 and under bf16 autocast.
 
-    Under bf16 autocast also the training step by ``torch.compile``, and the autoencoder with its kernels in
-    channels-last format; both change the networks, so they come last.
+    Under bf16 autocast it also measures the training step with ``torch.compile``, and the autoencoder with its kernels
+    in channels-last format; both change the networks, so they come last.
 
     Args:
         timed: takes a call and returns its median seconds.
         compiler: backend of ``torch.compile``.
 
     Returns:
-        Numbers by name; ``torch_compile`` says why if the step cannot be compiled here.
+        Numbers by name; ``torch_compile`` gives the reason if the step cannot be compiled here.
     """
     networks = (*work.trained, *work.frozen)
     numbers: dict[str, Any] = {"torch_parameters": sum(x.numel() for x in parameters(networks))}
@@ -79,14 +79,14 @@ def measure(
 
 
 def to_channels_last(networks: Iterable[nn.Module]) -> None:
-    """Stores convolutions' kernels with the channels last, in which PyTorch then computes them."""
+    """Stores convolution kernels in the channels-last format, which PyTorch then also uses to compute."""
     for x in parameters(networks):
         if x.dim() in FORMATS:
             x.data = x.data.contiguous(memory_format=FORMATS[x.dim()])
 
 
 def training(work: TorchWork, loss: Callable[[], Tensor], optimizer: OptimizerConfig, cast: Any) -> Callable[[], Any]:
-    """Returns a training step with a fresh AdamW; ``cast`` makes the context of its forward pass."""
+    """Returns a training step with a fresh AdamW; ``cast`` returns the context manager of its forward pass."""
     for network in (*work.trained, *work.frozen):
         network.train()
     adamw = make_adamw(parameters(work.trained), optimizer)
@@ -114,7 +114,7 @@ def _codec_rates(work: TorchWork, seconds: Callable[[Callable[[], Any]], float],
 
 
 def _compiled(make: Callable[[], Callable[[], Any]], timed: Callable[[Callable[[], Any]], float]) -> dict[str, Any]:
-    """Measures a step that ``make`` makes: the first time, which compiles it, and the later ones."""
+    """Measures a step that ``make`` returns: its first call, which compiles it, and later calls."""
     began = time.perf_counter()
     try:
         step = make()
@@ -141,7 +141,7 @@ def make_adamw(params: Iterable[nn.Parameter], optimizer: OptimizerConfig) -> An
 
 
 def train_step(loss: Callable[[], Tensor], networks: Iterable[nn.Module], adamw: Any, grad_clip: float = 1.0) -> Tensor:
-    """Does one step and returns the loss before it. ``grad_clip`` 0 does not clip."""
+    """Makes one training step and returns the loss before it. ``grad_clip`` 0 does not clip."""
     value = loss()
     adamw.zero_grad()
     value.backward()
