@@ -59,10 +59,10 @@ class Architecture(TransformerConfig):
 
     @property
     def uncommitted(self) -> int:
-        """Frames at the end of those known that a temporal cache lacks.
+        """The number of newest frames that a temporal cache does not contain yet.
 
-        The pass that begins the next frame commits the last one, whose cells it sees decided. A pass over a whole
-        masked frame is final.
+        The pass that begins the next frame commits the last one, whose cells are all decided by then. With
+        ``whole_frames`` the pass over a frame's masked cells is final.
         """
         return 0 if self.whole_frames else 1
 

@@ -23,7 +23,8 @@ from rsjax.models.roboscape.frame_attention import attend_in_frames
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
 FEW = 2  # frames per pass of a rollout
-# Cells of a frame, or tokens of a sequence, from which bf16 products in attention save more than their transposes cost.
+# From this many cells of a frame, or tokens of a sequence, bf16 products in attention save more time than their
+# transposes cost.
 LARGE_FRAME = 128
 
 
@@ -41,7 +42,7 @@ class KeyValues:
 class Dense(nn.Module):
     """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32.
 
-    On a CPU without bf16 units it multiplies in float32 all the same.
+    On a CPU without bf16 units it multiplies in float32 even then.
     """
 
     features: int
@@ -102,11 +103,11 @@ def attend_cells(
     bf16: bool,
     causal: bool = False,
 ) -> Float[Array, "*N S h e"]:
-    """Returns :func:`attend` within each frame, or each sequence, by our fastest way on a CPU and jax's elsewhere.
+    """Returns :func:`attend` within each frame or sequence, by our fastest implementation on CPUs, jax's elsewhere.
 
     Args:
         bf16: whether products may round their operands to bf16.
-        causal: whether a query sees its own key and those before it alone.
+        causal: whether a query sees only its own key and those before it.
     """
     frames = [x.reshape(-1, *x.shape[-3:]) for x in (q, k, v)]
     if bf16 and jax.default_backend() != "cpu":
@@ -141,7 +142,7 @@ def put_frames(cache: Any, new: Any, start: Any, ring: bool) -> Any:
 
     Args:
         cache: a tree of :class:`KeyValues`, or :func:`rsjax.models.apart.apart` of it.
-        new: a tree alike.
+        new: a tree of the same structure with the new frames.
         ring: whether positions beyond the number of slots wrap around.
     """
 

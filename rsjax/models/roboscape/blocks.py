@@ -1,4 +1,4 @@
-"""Spatial-temporal blocks, and their pair with the depth → RGB projection (paper Eq. 3).
+"""Spatial-temporal blocks, and pairs of them with the depth → RGB projection (paper Eq. 3).
 
 Axes: B clips, T frames, S cells, C width.
 """

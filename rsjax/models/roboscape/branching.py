@@ -1,7 +1,7 @@
-"""Goes on from any frame of any clip: implements :class:`rsjax.models.moments.Branching` for models of tokens.
+"""Continues any clip from any of its frames: implements :class:`rsjax.models.moments.Branching` for token models.
 
-Every pass is of one number of clips, the lanes, filled up by repetition: floating-point sums of another number differ
-in their last bit, and here a frame has the same bits whoever shares its pass.
+Every pass is over the same number of clips, the lanes; repeated clips fill empty lanes. With another number of clips,
+floating-point sums would differ in their last bit. So a frame has the same bits whichever frames share its pass.
 
 Axes: N clips, S cells, A action dimensions.
 """
@@ -31,12 +31,12 @@ from rsjax.trainable import Params
 
 @dataclass(frozen=True)
 class _Memory:
-    """What a moment goes on from.
+    """The state from which a moment's clip continues.
 
     Attributes:
         state: of one clip, without its cache.
         cache: None stands for an empty one.
-        sums: of its scaled actions.
+        sums: of the clip's scaled actions.
     """
 
     state: State
@@ -48,8 +48,8 @@ class TokenBranching:
     """Implements :class:`rsjax.models.moments.Branching`.
 
     Args:
-        has_depth: whether its clips have depth; a depth branch sees it masked otherwise.
-        lanes: clips of a pass.
+        has_depth: whether the clips have depth; otherwise a depth branch sees it masked.
+        lanes: clips in a pass.
     """
 
     def __init__(
@@ -64,7 +64,8 @@ class TokenBranching:
         self.lanes = lanes
         self._config, self._arch, self._codec, self._params = config, arch, codec, params
         self._has_depth = arch.use_depth and has_depth and codec.normalization.depth_range is not None
-        # What a clip begins with. It is where the parameters are, as what passes return is: one program for both.
+        # The state that clips begin with. It is on the parameters' devices, as are the states that passes return, so
+        # that one program takes both.
         where = getattr(jax.tree.leaves(params)[0], "sharding", None) or jax.local_devices()[0]
         self._place = partial(jax.device_put, device=where)
         self._empty = self._place(begin(self._network(Decoding(steps=1)), 1))
@@ -104,7 +105,7 @@ class TokenBranching:
         return [self._moment(_Memory(made[i], caches[i], sums[i]), pictures[i]) for i in range(count)]
 
     def lightened(self, moment: Moment) -> Moment:
-        """A window that is full is encoded again before it is read, so its cache need not be kept."""
+        """Leaves out the cache if the window is full, as it is then encoded again; otherwise, the whole memory."""
         memory = moment.memory
         if memory is None or memory.cache is None:
             return moment
@@ -118,9 +119,9 @@ class TokenBranching:
         return self._codec.decode_depth(cells.reshape(1, self._arch.grid, self._arch.grid, *cells.shape[1:]))[0]
 
     def _network(self, decoding: Decoding) -> Network:
-        """Returns the settings of the program for a decoding, whose temperature and guidance are arguments of it.
+        """Returns the settings of a decoding's program, which takes temperature and guidance as arguments.
 
-        A model that can be guided always is, so that its cache is of one shape.
+        A model that can be guided always is, so that its cache always has the same shape.
         """
         drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.action_dropout else 1.0
         sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
@@ -128,7 +129,7 @@ class TokenBranching:
         return Network(self._arch, sample, self._has_depth, True)
 
     def _empty_cache(self) -> Cache:
-        return jax.tree.map(jnp.copy, self._empty.cache)  # a pass uses up what it gets
+        return jax.tree.map(jnp.copy, self._empty.cache)  # a pass uses up the cache that it gets
 
     def _moment(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> Moment:
         state = memory.state
@@ -141,7 +142,7 @@ class TokenBranching:
 
 
 def _fitted(net: Network, state: State) -> State:
-    """Returns a state with mean codes if these settings show them: for frames that have none, their tokens' codes."""
+    """Returns the state with mean codes if the settings show them; frames that have none get their tokens' codes."""
     if not net.sample.shows_means:
         return replace(state, means={})
     codes = {name: lfq.tokens_to_codes(cells, net.arch.code_bits) for name, cells in state.tokens.items()}

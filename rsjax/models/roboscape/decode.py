@@ -29,11 +29,11 @@ class Decoder:
     Attributes:
         apply: the network: :func:`rsjax.models.roboscape.guidance.apply_guided` with architecture, settings, parameters
             and ``no_depth`` bound.
-        actions: into all frames.
+        actions: those that lead into all frames.
         keys: one per clip.
         no_depth: True for clips without depth.
-        temperature: of each clip, above 0, in place of that of ``sample``.
-        entropy: whether :meth:`decode_pair` gives its frame's entropy.
+        temperature: one per clip, above 0, instead of that of ``sample``.
+        entropy: whether :meth:`decode_pair` returns its frame's entropy.
     """
 
     arch: Architecture
@@ -46,7 +46,7 @@ class Decoder:
     entropy: bool = False
 
     def cached(self, base: Array | int, t: Array, carry: tuple[Cells, Means, Cache]) -> tuple[Cells, Means, Cache]:
-        """Decodes frame t with the cache of the frames before, all but ``arch.uncommitted`` of them.
+        """Decodes frame t with the cache of the frames before it, except the last ``arch.uncommitted``.
 
         Args:
             base: the first frame of the window.
@@ -69,21 +69,21 @@ class Decoder:
         keys: Key[Array, "B steps"],
         cache: Cache,
     ) -> tuple[Frame, Cache]:
-        """Decodes the second of two frames: one pass over both, which commits the first one, then passes over it alone.
+        """Decodes the second of two frames: a pass over both commits the first, then passes cover the second alone.
 
-        What the first pass writes for the second frame is overwritten later. With ``arch.whole_frames`` it is final,
-        and the first frame, which is in the cache, is left out.
+        What the first pass writes into the cache for the second frame is overwritten later. With ``arch.whole_frames``
+        it is final, and the pass leaves out the first frame, which is in the cache already.
 
         Args:
-            pair: what is read of both: tokens, or mean codes if ``sample.reads_means``; the second's have no effect.
-            before: likewise of the frame before both, without T, for ``read_previous``; not read if the first is its
-                window's first.
-            actions: into both, as the window has them.
-            position: the second one's in the window.
-            cache: of the frames before the first one, or before the second.
+            pair: tokens of both frames, or mean codes if ``sample.reads_means``; the second's have no effect.
+            before: the same of the frame before both, without T, for ``read_previous``; not read if the first frame
+                begins its window.
+            actions: those that lead into both frames, as in the window.
+            position: that of the second frame in the window.
+            cache: of the frames before the first one; with ``arch.whole_frames``, of those before the second.
         """
         b, _, cells = pair["rgb"].shape[:3]
-        first = 1 - self.arch.uncommitted  # of the pass
+        first = 1 - self.arch.uncommitted  # frame of the pass
         mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (b, 2, cells))
         previous = {name: jnp.stack([before[name], grid[:, 0]], axis=1) for name, grid in pair.items()}
         seen, rows, known = jax.tree.map(lambda x: x[:, first:], (pair, actions, previous))
@@ -138,7 +138,7 @@ class Decoder:
         return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
 
     def _read(self, tokens: dict[str, Array], means: dict[str, Array]) -> dict[str, Array]:
-        """Returns what later passes read."""
+        """Returns the tokens or mean codes, whichever later passes read."""
         return means if self.sample.reads_means else tokens
 
     def _step_keys(self, t: Array) -> Key[Array, "B steps"]:

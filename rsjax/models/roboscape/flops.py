@@ -1,7 +1,7 @@
 """Floating-point operations of the transformer, counted from its shapes: matrix products only, 2·m·n·k each.
 
-Norms, softmaxes, GELUs and embeddings are left out as negligible. So is what rematerialisation repeats: these are the
-operations that the model needs, not those that a program executes.
+Norms, softmaxes, GELUs and embeddings are left out as negligible. Operations that rematerialisation repeats are left
+out too: these are the operations that the model needs, not those that a program executes.
 
 Axes: T frames, S cells of a frame, C width, n vocabularies of V codes.
 """

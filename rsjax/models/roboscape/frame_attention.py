@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from rsjax.matmul import bf16_pays, transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
-SCORES = 2**24  # of the frames that run at the same time: 64 MiB
+SCORES = 2**24  # at most so many in all frames that run at the same time: 64 MiB
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -31,7 +31,7 @@ def attend_in_frames(
     """Returns softmax(q·kᵀ/√e)·v; operands rounded to bf16 where that pays, all else float32; float32 in and out.
 
     Args:
-        causal: whether a query sees its own key and those before it alone.
+        causal: whether a query sees only its own key and those before it.
     """
     return _forward(q, k, v, causal)[0]
 
@@ -49,7 +49,7 @@ def _backward(causal: bool, saved: tuple[Array, ...], cotangent: Array) -> tuple
     gradient = partial(_frame_gradient, causal)
     dq, dk_t, dv_t = _each_frame(gradient, q, k, v, _rounded(g), along, log_total)
     return (
-        _head_major(dq) * q.shape[-1] ** -0.5,  # the saved queries hold this factor already
+        _head_major(dq) * q.shape[-1] ** -0.5,  # the saved queries contain this factor already
         dk_t.transpose(0, 3, 1, 2),
         dv_t.transpose(0, 3, 1, 2),
     )

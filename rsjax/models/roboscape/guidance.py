@@ -1,6 +1,6 @@
 """Applies the network in a rollout, with classifier-free guidance by actions if it is on.
 
-With guidance, every pass and the cache cover twice the clips: first with their actions, then without.
+With guidance, every pass and the cache cover all clips twice: first with their actions, then without.
 
 Axes: B clips, T frames, S cells, A action dimensions, n vocabularies of V codes.
 """
@@ -38,8 +38,8 @@ def apply_guided(
         start: position of the first of these frames (may be traced).
         cache: from :func:`guided_cache` or an earlier call.
         no_depth: True for clips whose depth is hidden, as in :class:`rsjax.models.roboscape.transformer.Transformer`.
-        previous: tokens of the frame before each of these, likewise.
-        strength: g of each clip in place of ``sample.guidance``, which still decides whether there is guidance.
+        previous: tokens of the frame before each of these, as in ``Transformer``.
+        strength: g of each clip instead of ``sample.guidance``, which still decides whether there is guidance.
     """
     b, drop = len(mask), None
     if sample.guidance != 1:

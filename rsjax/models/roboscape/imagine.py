@@ -1,4 +1,4 @@
-"""Generates frame by frame from pixels to pixels: one compiled program decodes tokens, and from them the pictures.
+"""Generates frame by frame from pixels to pixels: one compiled program decodes the tokens, and then their pictures.
 
 Axes: B clips, N of them, A action dimensions.
 """
@@ -23,10 +23,10 @@ from rsjax.trainable import Params
 
 
 class Imagined:
-    """Implements :class:`rsjax.models.base.Imagination`. It has depth if the model and its training clips have it.
+    """Implements :class:`rsjax.models.base.Imagination`. Frames have depth if the model and its training clips have it.
 
     Raises:
-        ConfigError: the model does not support these settings of sampling.
+        ConfigError: the model does not support these sampling settings.
     """
 
     def __init__(self, config: TokenModelConfig, arch: Architecture, codec: Codec, params: Params, clips: int) -> None:

@@ -24,8 +24,8 @@ class Frame:
     """A partly decoded frame: tokens by branch, and the cells that are still masked.
 
     Attributes:
-        entropy: of the RGB tokens in nats, in the step that decided each cell; None: not asked for.
-        means: likewise the mean codes by branch; empty: not asked for.
+        entropy: of the RGB tokens in nats, in the step that decided each cell; None: not requested.
+        means: the mean codes by branch, in the same step; empty: not requested.
     """
 
     tokens: dict[str, Int[Array, "*B S"]]
@@ -54,7 +54,7 @@ def sample_tokens(
     """Draws a token per cell.
 
     Args:
-        temperature: logits are divided by it; 0 takes each vocabulary's most probable code. An array is above 0.
+        temperature: logits are divided by it; 0 takes each vocabulary's most probable code. An array must be above 0.
         top_k: draw from the ``top_k`` most probable codes of each vocabulary (and ties with the last of them); 0: from
             all.
 
@@ -97,13 +97,13 @@ def unmask_step(
     """Does one decoding step: fills the masked cells, then masks some of them again as the schedule says.
 
     Both branches share their mask. The cells that are masked again are random or, for "greedy", those of lowest
-    confidence, the sum of both branches' log-probabilities; RGB's only for a clip without depth.
+    confidence, which is the sum of both branches' log-probabilities, or RGB's alone for a clip without depth.
 
     Args:
         keys: one per clip.
         logits: of this frame, by branch.
         no_depth: True for clips without depth, whose depth tokens are meaningless.
-        temperature: above 0, of each clip, in place of that of ``config``.
+        temperature: one per clip, above 0, instead of that of ``config``.
     """
     return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth, temperature)
 

@@ -1,14 +1,14 @@
 """Masks and corrupts training tokens (reference: the public Genie, 1xgpt).
 
-1. Every sub-token of every frame, the first too, becomes a random code with probability rate·u, u ~ U(0, 1).
+1. Every sub-token of every frame, including the first, becomes a random code with probability rate·u, u ~ U(0, 1).
 2. With ``corruption_probability``: f ~ U{P, …, T-1} and r ~ U(keep, 1); in each frame ≥ f, r shrinks by U(decay, 1) and
    sub-tokens become random with probability 1 - r. Otherwise f = 1. (P: prompt frames.)
 3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame. In a share
-   ``visible_prefix`` of the clips (not in the reference) this begins at a frame drawn per clip, {1, …, T-1}: before it
-   all is visible, as past frames are in sampling.
+   ``visible_prefix`` of the clips (not in the reference) masking begins at a frame drawn per clip, {1, …, T-1}: all
+   frames before it are visible, as past frames are in sampling.
 
-u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that it does
-not depend on the clip's device.
+u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that the draws
+do not depend on the clip's device.
 
 Axes: B clips, T frames, H×W cells, n vocabularies.
 """

@@ -93,7 +93,7 @@ def rgb_term(of: Predictions) -> Term:
 
 @loss_term("depth")
 def depth_term(of: Predictions) -> Term:
-    """Returns L_Depth of Eq. 4: likewise for the depth tokens of clips with depth; (0, 0) if none has depth."""
+    """Returns L_Depth of Eq. 4: the same for the depth tokens of clips with depth; (0, 0) if none has depth."""
     has_depth = of.batch.has_depth
     clips = of.batch.weight if has_depth is None else of.batch.weight * has_depth
     weight = of.mask * clips[:, None, None, None]
@@ -115,8 +115,8 @@ def attention_term(of: Predictions) -> Term:
 def keypoint_term(of: Predictions) -> Term:
     """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over frames t ≥ 2 in which keypoint i is visible.
 
-    ``keypoint_target`` "observed" puts the true code in the place of ŝ_1, ``keypoint_masked_only`` leaves out keypoints
-    on cells that are not masked.
+    ``keypoint_target`` "observed" uses the true code instead of ŝ_1; ``keypoint_masked_only`` leaves out keypoints on
+    cells that are not masked.
     """
     bits, loss = of.model.architecture.code_bits, of.model.loss
     cells = of.keypoints.cells.swapaxes(1, 2)  # B T K
@@ -201,7 +201,7 @@ class RoboScape(WorldModel[Batch]):
         return jax.tree.map(lambda x: x.astype("float32"), terms)
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
-        """Makes the tokens of every clip, stored beside the clips for all runs with this tokenizer and these shifts."""
+        """Makes every clip's tokens and stores them next to the clips, for all runs with this tokenizer and shifts."""
         codec, shifts = self._codec(assets), self.config.token_shifts
         return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 

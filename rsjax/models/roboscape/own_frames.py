@@ -1,8 +1,8 @@
-"""Lets the model train on frames of its own, as it reads them in a rollout (scheduled sampling in parallel).
+"""Lets the model train on its own predicted frames, as it reads them in a rollout (scheduled sampling in parallel).
 
-A rollout reads what the model made, not true frames. With whole masked frames a single pass predicts all frames of a
-clip, each from the true one before it, so the mean codes of that pass stand in for a rollout's
-(arXiv 1906.04331, "Parallel Scheduled Sampling", with mean codes in place of drawn tokens).
+A rollout reads frames that the model predicted, not true ones. If frames are masked as a whole, a single pass predicts
+all frames of a clip, each from the true frame before it, and the mean codes of that pass stand in for those of a
+rollout (arXiv 1906.04331, "Parallel Scheduled Sampling", with mean codes instead of drawn tokens).
 
 Axes: B clips, T frames, S cells, D code bits.
 """
@@ -35,7 +35,7 @@ def previous_frames(
     Args:
         predict: returns the logits of all frames, each from the true frames before it; not computed unless ``own``.
         tokens: of the true frames, by branch.
-        own: the same on all devices.
+        own: whether to return the model's codes; the same on all devices.
         prompt_frames: those that generation starts from.
     """
     true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}

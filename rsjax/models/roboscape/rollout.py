@@ -1,12 +1,12 @@
 """Rollouts: generate tokens frame by frame from prompt frames and actions (paper Eq. 1).
 
-With the temporal cache a frame costs ``steps`` frame passes, and one to commit it with its final tokens. The commit of
-frame t-1 is fused with the first step of frame t; the last commit is skipped. What a pass with masked cells writes into
-the cache is overwritten before it is read, so cached and uncached rollouts agree.
+With the temporal cache a frame takes ``steps`` passes over its cells, and one more to commit it with its final tokens.
+The commit of frame t-1 is fused with the first step of frame t; the last commit is skipped. What a pass with masked
+cells writes into the cache is overwritten before it is read, so cached and uncached rollouts agree.
 
-A rollout may be longer than ``arch.frames``; ``window.py`` describes the memory of its frames. There is one compilation
-for each number of clips and prompt frames and each multiple of ``arch.frames`` that the length is rounded up to. Arrays
-grow with that multiple, programs do not.
+A rollout may be longer than ``arch.frames``; ``window.py`` describes which frames it remembers. One program is compiled
+for each number of clips, each number of prompt frames and each length, rounded up to a multiple of ``arch.frames``.
+Arrays grow with that multiple, programs do not.
 
 Axes: B clips, T frames (the first P are the prompt), H×W = S cells, D code bits, A action dimensions.
 """
@@ -42,7 +42,7 @@ class Prompt:
 
     tokens: Tokens
     actions: Float[Array, "B P A"]
-    cache: StackedCache  # of all frames but ``Architecture.uncommitted``
+    cache: StackedCache  # of all frames but the last ``Architecture.uncommitted``
     no_depth: Bool[Array, " B"] | None  # as for :func:`rollout`
     # Settings that the cache depends on and a rollout must share; the stride is resolved.
     guided: bool = struct.field(pytree_node=False)
@@ -82,7 +82,7 @@ def rollout(
 
     Returns:
         Tokens of all T frames by branch; the first P are the prompt. If ``sample.shows_means``, the prompt's codes and
-        the others' mean codes instead, from which the tokenizer decodes pictures just as well.
+        the others' mean codes instead, from which the tokenizer can decode pictures too.
 
     Raises:
         ConfigError: the model does not support these settings.

@@ -1,8 +1,8 @@
 """Generates frame by frame while the actions come in, for many clips that began at different times.
 
-It gives the frames of :func:`rsjax.models.roboscape.rollout.rollout` with the same cache. A clip may have any length:
-what is kept of it is one window's tokens. As clips are at different positions, each one's window moves at its own time;
-a step in which none moves costs nothing for it.
+The frames are those of :func:`rsjax.models.roboscape.rollout.rollout` with its cache. A clip may have any length, as
+only one window of its tokens is kept. Clips are at different positions, so each clip's window moves at its own time; a
+step in which no window moves takes no extra time.
 
 Axes: B clips, K frames kept, S cells, D code bits, A numbers per frame that the action encoder reads.
 """
@@ -33,13 +33,14 @@ class Network(NamedTuple):
     arch: Architecture
     sample: SampleConfig
     has_depth: bool  # False: no clip has depth, and a depth branch sees it masked
-    entropy: bool = False  # whether a state has that of its last frame's tokens
+    entropy: bool = False  # whether a state has the entropy of its last frame's tokens
 
 
 class Dials(NamedTuple):
-    """Settings of each clip in place of those of ``Network.sample``, so that other values need no other program.
+    """Settings of each clip that replace those of ``Network.sample``, so that new values need no new program.
 
-    They cannot switch on what the program leaves out: drawing if the temperature is 0, guidance if it is 1.
+    They cannot switch on what the program leaves out: random draws if ``Network.sample`` has temperature 0, and
+    guidance if it has guidance 1.
     """
 
     temperature: Float[Array, " B"]
@@ -52,14 +53,14 @@ class State:
 
     Attributes:
         tokens: of the last K frames by branch.
-        actions: into these frames, as a whole clip's (sums since its first frame).
+        actions: those that lead into these frames, as in a whole clip's inputs (sums since its first frame).
         base: the row of ``actions`` of the window's first frame.
-        cache: of the window's frames but the last ``Architecture.uncommitted``, and but a clip's first until the next
-            step; clips are axis 1.
-        position: the next frame's in its window.
+        cache: of the window's frames except the last ``Architecture.uncommitted``. A clip's first frame is missing
+            until the next step. Clips are axis 1.
+        position: the next frame's position in its window.
         frame: the next frame's number in its clip.
         key: decides each clip's draws.
-        entropy: of the last frame's RGB tokens in nats; None unless the network says so.
+        entropy: of the last frame's RGB tokens in nats; None unless ``Network.entropy``.
         means: mean codes of the last K frames by branch; empty unless ``sample.shows_means``.
     """
 
@@ -78,17 +79,17 @@ AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, e
 
 
 def remembered_frames(net: Network) -> int:
-    """Returns K: the frames that stay in a window when it moves, and the one before the last if the model reads it."""
+    """Returns K: how many frames stay in a window when it moves, but at least 2 if the model reads previous frames."""
     return max(kept_frames(net), 2 if net.arch.read_previous else 1)
 
 
 def kept_frames(net: Network) -> int:
-    """Returns the frames that stay in a window when it moves, or the last one alone for a window that rolls."""
+    """Returns how many frames stay in a window when it moves: 1, the last frame, for a rolling window."""
     return 1 if net.arch.positions == "rotary" else net.arch.frames - stride(net.arch, net.sample)
 
 
 def begin(net: Network, clips: int) -> State:
-    """Returns the state of clips that have yet to be :func:`restart` ed."""
+    """Returns the state of clips before their first :func:`restart`."""
     arch, kept = net.arch, remembered_frames(net)
     cache = guided_cache(arch, net.sample, clips, cache_slots(arch, 1))
     copies = jax.tree.map(lambda x: x.reshape(len(x), clips, -1, *x.shape[2:]), cache)
@@ -109,12 +110,12 @@ def begin(net: Network, clips: int) -> State:
 def restart(
     state: State, which: Bool[Array, " B"], first: dict[str, Int[Array, "B S"]], key: Key[Array, " B"]
 ) -> State:
-    """Returns the state with some clips begun anew.
+    """Returns the state with some clips restarted.
 
     Args:
-        which: those clips.
+        which: True for the clips to restart.
         first: tokens of all clips' first frames; those of other clips have no effect.
-        key: likewise.
+        key: keys of all clips; those of other clips have no effect.
     """
 
     def pick(new: Any, old: Any) -> Any:
@@ -125,7 +126,7 @@ def restart(
         name: grid.at[:, -1].set(pick(lfq.tokens_to_codes(first[name], grid.shape[-1]), grid[:, -1]))
         for name, grid in state.means.items()
     }
-    # The cache stays: what is in it has positions that a clip has yet to reach, and is not read.
+    # The cache stays: its contents are at positions that the clip has not reached yet, so they are not read.
     return replace(
         state,
         tokens=tokens,
@@ -141,10 +142,10 @@ def restart(
 def advance(
     net: Network, params: Params, state: State, actions: Float[Array, "B A"], dials: Dials | None = None
 ) -> State:
-    """Decodes the next frame of every clip; its tokens are ``state.tokens[name][:, -1]`` then.
+    """Decodes the next frame of every clip; its tokens are ``state.tokens[name][:, -1]`` of the returned state.
 
     Args:
-        actions: the row into that frame, as in a whole clip's inputs.
+        actions: the row that leads into that frame, as in a whole clip's inputs.
         dials: each clip's settings; None: those of the network.
     """
     if net.arch.positions == "learned":
@@ -157,7 +158,7 @@ def advance(
 def _decoder(net: Network, params: Params, dials: Dials | None = None) -> Decoder:
     """Returns a decoder of one clip."""
     hidden = jnp.ones(1, bool) if net.arch.use_depth and not net.has_depth else None
-    unread: Any = None  # decode_pair takes one frame's actions and keys itself
+    unread: Any = None  # decode_pair takes one frame's actions and keys as arguments
     guided, drawn = net.sample.guidance != 1, net.sample.temperature != 0
     strength = dials.guidance[None] if dials is not None and guided else None
     temperature = dials.temperature[None] if dials is not None and drawn else None
@@ -186,24 +187,24 @@ def _decode(net: Network, params: Params, state: State, actions: Float[Array, " 
 
 
 def _read(net: Network, state: State) -> dict[str, Array]:
-    """Returns what later frames read of the last K: tokens, or mean codes."""
+    """Returns the tokens or mean codes of the last K frames, whichever later frames read."""
     return state.means if net.sample.reads_means else state.tokens
 
 
 def last_frame(net: Network, state: State, name: str) -> Int[Array, "B H W"] | Float[Array, "B H W D"]:
-    """Returns what a branch's last frame is decoded from: mean codes if there are any, or tokens."""
+    """Returns the mean codes that a branch's last frame is decoded from; its tokens if there are no mean codes."""
     made = (state.means or state.tokens)[name][:, -1]
     return made.reshape(-1, net.arch.grid, net.arch.grid, *made.shape[2:])
 
 
 def _begin_windows(net: Network, params: Params, kept: int, state: State, which: Bool[Array, " B"]) -> State:
-    """Begins the windows of the clips ``which`` with their last ``kept`` frames, and encodes these into the cache."""
+    """Begins new windows for the clips ``which``: encodes their last ``kept`` frames into the cache again."""
     begun = jax.vmap(partial(_begin_window, net, params, kept), in_axes=(AXES, 0), out_axes=AXES)
     return jax.lax.cond(which.any(), begun, lambda state, which: state, state, which)
 
 
 def _begin_window(net: Network, params: Params, kept: int, state: State, this: Bool[Array, ""]) -> State:
-    """Begins one clip's window so, if ``this`` is True."""
+    """Begins a new window for one clip, if ``this`` is True."""
     base, cache = state.actions[-kept], state.cache
     if encoded := kept - net.arch.uncommitted:
         frames = slice(-kept, encoded - kept or None)
@@ -223,7 +224,7 @@ def _begin_window(net: Network, params: Params, kept: int, state: State, this: B
 def _window_rows(
     arch: Architecture, rows: Float[Array, "T A"], base: Float[Array, " A"], start: Int[Array, ""] | int
 ) -> Float[Array, "T A"]:
-    """Returns actions as in a clip that begins with the window, of frames from position ``start`` on."""
+    """Returns the actions of frames from position ``start`` on, as in a clip that begins with the window."""
     if arch.integrate_actions:
         rows = rows - jnp.where(jnp.arange(rows.shape[-1]) >= rows.shape[-1] // 2, base, 0.0)
     first = (start + jnp.arange(len(rows)) == 0)[:, None]

@@ -1,7 +1,8 @@
 """Teacher forcing: predicts the tokens of each frame, all masked, from the true frames before it.
 
-The true frames are encoded into the temporal cache once; then each frame is one pass over its masked cells, which reads
-the slots before its own. Clips that are longer than the positions are scored window by window, as a rollout is.
+The true frames are encoded into the temporal cache once; then each frame takes one pass over its masked cells, which
+reads the cache slots before its own. Clips that are longer than the positions are scored window by window, as they are
+generated in a rollout.
 
 Axes: B clips, T frames, H×W = S cells, A action dimensions.
 """
@@ -40,7 +41,7 @@ def score_tokens(
     """Predicts each frame after the prompt from all true frames before it.
 
     Args:
-        sample: for the stride of the window.
+        sample: sets the stride of the window.
         tokens: of the true frames, by branch; "depth" is zeros for clips without.
         actions: normalised; row t led into frame t.
         no_depth: True for clips without depth.

@@ -22,10 +22,10 @@ from rsjax.models.roboscape.gelu import gelu
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
-# Of each cell its token, or its code: the mean of each bit in [-1, 1].
+# Each cell's token, or its code: the mean of each bit, in [-1, 1].
 Cells = Int[Array, "B T S"] | Float[Array, "B T S D"]
 StackedCache = dict[str, KeyValues]  # by branch
-Cache = StackedCache | list[StackedCache]  # of all blocks; of each, taken apart (rsjax.models.apart)
+Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by rsjax.models.apart
 
 MUP_WIDTH = 256  # the public code's base width
 
@@ -48,14 +48,14 @@ class TokenEmbed(nn.Module):
             embedded = sum(table(sub_tokens[..., k]) for k, table in enumerate(tables))
         else:
             shares, codes = lfq.code_shares(cells, cfg.vocabularies), jnp.arange(cfg.vocabulary_size)
-            mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # tokens' codes embed as tokens do
+            mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a token's code embeds as the token does
             embedded = sum(mean(shares[..., k, :], table(codes)) for k, table in enumerate(tables))
         mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.position_std), (cfg.width,))
         return jnp.where(mask[..., None], mask_embed, embedded)
 
 
 class Transformer(nn.Module):
-    """Two branches of spatial-temporal blocks, or RGB's alone if ``config.use_depth`` is False."""
+    """Two branches of spatial-temporal blocks, or the RGB branch alone if ``config.use_depth`` is False."""
 
     config: Architecture
 
@@ -75,16 +75,16 @@ class Transformer(nn.Module):
 
         Args:
             tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
-            mask: True for masked cells, in both branches; with ``config.whole_frames`` more are, see :func:`hidden`.
+            mask: True for masked cells, in both branches; ``config.whole_frames`` masks more, see :func:`hidden`.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
                 not exceed ``config.frames``, which is not checked.
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
-            drop_actions: True for clips that see the null action instead of theirs; needs ``config.action_dropout``.
+            drop_actions: True for clips that see the null action instead of their own; needs ``config.action_dropout``.
             no_depth: True for clips without depth: all their cells are masked in the depth branch. Ignored by a model
                 without that branch.
-            previous: for ``config.read_previous``, tokens of the frame before each of these by branch, of which frame
-                0's are not read; by default ``tokens`` moved by one frame, if ``start`` is 0.
+            previous: for ``config.read_previous``, tokens of the frame before each of these, by branch; those for frame
+                0 are not read. If ``start`` is 0, the default is ``tokens`` moved by one frame.
 
         Returns:
             float32 logits by branch, and the cache with these frames written in (None without a cache).
@@ -168,7 +168,7 @@ class Transformer(nn.Module):
 
 
 def hidden(config: Architecture, mask: Bool[Array, "B T H W"], start: Any = 0) -> Bool[Array, "B T H W"]:
-    """Returns the cells that the network does not see: the masked ones, or all after a clip's first frame.
+    """Returns the cells hidden from the network: the masked ones, or with ``whole_frames`` all after a clip's first.
 
     Args:
         start: position of the first of these frames.
@@ -179,7 +179,7 @@ def hidden(config: Architecture, mask: Bool[Array, "B T H W"], start: Any = 0) -
 
 
 def shifted(frames: Cells) -> Cells:
-    """Returns the frame before each frame; for the first, itself."""
+    """Returns the frame before each frame; for the first frame, the frame itself."""
     return jnp.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
 
 
@@ -187,7 +187,8 @@ def _rematerialised(config: Architecture) -> Any:
     if config.remat == "none":
         return DualBlock
     keep = None if config.remat == "blocks" else jax.checkpoint_policies.save_only_these_names(PRODUCT)
-    # Eliminating common subexpressions could undo the recomputation within an iteration of the scan, not across them.
+    # Common-subexpression elimination could undo the recomputation within an iteration of the scan, not across
+    # iterations.
     return nn.remat(DualBlock, prevent_cse=config.unroll > 1, policy=keep)
 
 

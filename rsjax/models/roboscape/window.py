@@ -1,8 +1,8 @@
 """The window of frames that a frame is decoded from.
 
-With rotary positions it contains the ``arch.frames - 1`` frames before, and moves with every frame. Learned positions
-count from the window's first frame, so the cache is valid only while the window stays. The window therefore moves by a
-stride, and the frames that stay in it are encoded again.
+With rotary positions the window contains the ``arch.frames - 1`` frames before that frame, and moves with every frame.
+Learned positions count from the window's first frame, so the cache is valid only while the window stays in place. The
+window therefore moves by a stride, and the frames that stay in it are encoded again.
 
 Axes: B clips, T frames, A action dimensions.
 """
@@ -30,9 +30,9 @@ def window_start(arch: Architecture, sample: SampleConfig, frame: Int[Array, ""]
 
 
 def room(arch: Architecture, sample: SampleConfig, frames: int) -> int:
-    """Returns the length of the arrays of a rollout of ``frames`` frames, which every window fits into.
+    """Returns the length of the arrays of a rollout of ``frames`` frames, so that every window fits into them.
 
-    It is rounded up to a multiple of ``arch.frames`` (plus a stride), so that few programs are compiled.
+    The length is rounded up to a multiple of ``arch.frames`` (plus a stride), so that few programs are compiled.
     """
     whole = -(-frames // arch.frames) * arch.frames
     return whole + stride(arch, sample) if arch.positions == "learned" and whole > arch.frames else whole
