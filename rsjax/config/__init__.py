@@ -1,4 +1,4 @@
-"""Every setting of the project: frozen, hashable, serialisable dataclasses that check themselves when made.
+"""Every setting of the project: frozen, hashable, serialisable dataclasses that check themselves when created.
 
 A :class:`Config` contains everything that one run depends on. Presets are in :mod:`rsjax.config.presets`.
 The paper's λ₁, λ₂, λ₃ and γ are in :class:`LossConfig` and nowhere else.

@@ -10,7 +10,7 @@ from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 ENCODED, DECODED = 8, 2  # frames that the autoencoder encodes and latent frames that it decodes in one piece
-COMPRESSION = 4  # frames of a latent frame, after the first
+COMPRESSION = 4  # frames per latent frame, after the first
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class CausalVAEConfig:
     norm_groups: int = 32
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
     # The image that the model continues is a clip's first frame with noise of a deviation of exp(N(mean, deviation²)),
-    # pixels being in ±1. So many noisy ones are encoded of each clip; 0: the frame as it is.
+    # pixels being in ±1. This many noisy images are encoded for each clip; 0: the frame as it is.
     image_draws: int = 4
     image_noise: tuple[float, float] = (-3.0, 0.5)  # mean, deviation
 
@@ -55,12 +55,12 @@ class CausalVAEConfig:
 
 
 def padded_frames(frames: int) -> int:
-    """Returns the least 8k + 1 that is not below ``frames``: what the autoencoder takes without losing a frame."""
+    """Returns the smallest 8k + 1 that is at least ``frames``: a length of which the autoencoder loses no frame."""
     return 1 - (1 - frames) // ENCODED * ENCODED
 
 
 def latent_frames(frames: int) -> int:
-    """Returns the latent frames of a video."""
+    """Returns the number of latent frames of a video."""
     return (padded_frames(frames) - 1) // COMPRESSION + 1
 
 
@@ -71,7 +71,7 @@ class TextConfig:
     file: str = ""  # embeddings of the tasks, made by python -m rsjax.convert text; empty: learned tokens
     tokens: int = 226
     width: int = 4096
-    tasks: tuple[str, ...] = ()  # tasks with learned tokens of their own; empty: all clips have the same
+    tasks: tuple[str, ...] = ()  # tasks with learned tokens of their own; empty: all clips share the same tokens
     dropout: float = 0.1  # share of the training clips that see the empty text
 
     def __post_init__(self) -> None:
@@ -108,9 +108,9 @@ class CogVideoXConfig(ModelConfig):
     mlp_ratio: int = 4
     patch_size: int = 2  # cells of latents that one token covers, along each side
     time_width: int = 512
-    # What the model sees of the image. channels: its latents join those of the first frame as further channels, zeros
-    # those of later frames. first_latent: it is the first latent frame, without noise and out of the loss. The public
-    # 2B sees no image and has no such channels.
+    # How the model sees the image. channels: the image's latents are further channels of the first frame; those of
+    # later frames are zeros. first_latent: the image is the first latent frame, without noise and not in the loss. The
+    # public 2B sees no image and has no such channels.
     image: Literal["channels", "first_latent"] = "channels"
     image_dropout: float = 0.0  # share of the training clips without an image in its channels
     positions: Literal["rotary", "sincos"] = "rotary"
@@ -121,7 +121,7 @@ class CogVideoXConfig(ModelConfig):
     # Frames, rows and columns of learned positions, (13, 30, 45) in the public 5B-I2V, where they are near zero.
     learned_positions: tuple[int, ...] = ()
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
-    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps the blocks' inputs alone
+    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
     error_weight: float = 1.0
     noise: NoiseConfig = NoiseConfig(
         beta_start=0.00085, beta_end=0.012, betas="scaled_linear", prediction="velocity", zero_terminal=True

@@ -47,7 +47,7 @@ def _cogvideox(name: str, model: CogVideoXConfig) -> Config:
 
 
 def cogvideox_tiny(base: Config) -> Config:
-    """Returns CogVideoX and its own autoencoder on the clips and in about the time of the preset ``tiny``."""
+    """Returns CogVideoX and its own autoencoder on the clips of the preset ``tiny``, trained for about as long."""
     return replace(
         base,
         name="cogvideox_tiny",
@@ -63,7 +63,7 @@ def cogvideox_tiny(base: Config) -> Config:
         ),
         model=CogVideoXConfig(
             autoencoder=CausalVAEConfig(patch_size=2, widths=(32, 64, 64), res_blocks=1, norm_groups=8),
-            # One task has one text: guidance by it leads nowhere.
+            # There is one task, so one text: guidance by the text has no effect.
             text=TextConfig(tokens=8, width=64, dropout=0.0),
             width=192,
             blocks=8,

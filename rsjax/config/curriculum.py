@@ -2,7 +2,7 @@
 
 A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; ``+`` joins its parts. A part is
 ``DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][#CLIPS][@STORE]``: shell patterns joined by commas (``all`` matches
-everything), a weight, how many of the clips count (the first), and the directory of another store. So
+everything), a weight, how many of the clips to use (the first ones), and the directory of another store. So
 ``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two picking or placing clips of the run's own for each
 difficult clip of run b, and ``all/all/kitchen*:1`` the clips in kitchens. Names that contain one of ``: + @ = / , #``
 cannot be written this way; in Python, :class:`CurriculumStageConfig` takes them.

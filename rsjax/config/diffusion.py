@@ -10,7 +10,7 @@ from rsjax.config.fields import added, fitting_sizes, require, require_range
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """The forward process: how latents turn into noise, and what of it the network predicts."""
+    """The forward process: how latents turn into noise, and which quantity the network predicts."""
 
     steps: int = 1000
     beta_start: float = 1e-4
@@ -18,7 +18,7 @@ class NoiseConfig:
     betas: Literal["linear", "scaled_linear"] = "linear"  # scaled_linear: their roots grow linearly
     prediction: Literal["noise", "velocity"] = "noise"
     snr_shift: float = added(1.0)  # s in ᾱ ← ᾱ / (s + (1 - s)·ᾱ): the ratio of signal to noise is divided by it
-    zero_terminal: bool = added(False)  # √ᾱ is stretched to 0 after the last step, from where sampling then begins
+    zero_terminal: bool = added(False)  # √ᾱ is rescaled to be 0 after the last step, where sampling then begins
 
     def __post_init__(self) -> None:
         require_range(self, "model.noise", 2, math.inf, "steps")
@@ -38,11 +38,11 @@ class NoiseConfig:
 class DenoiseConfig:
     """Settings of the sampler. Names and definitions are those of the package ``diffusers``."""
 
-    # ddim: one network call a step. pndm: Runge-Kutta at first, which makes it steps + 9 calls.
+    # ddim: one network call a step. pndm: begins with Runge-Kutta steps, so it takes steps + 9 calls.
     sampler: Literal["pndm", "ddim"] = "pndm"
     steps: int = 50
     # Which steps of the forward process are visited: from 0 to the last (linspace), multiples of one number from 0 on
-    # (leading), or such a series that ends with the last one (trailing).
+    # (leading), or an evenly spaced series that ends with the last one (trailing).
     spacing: Literal["linspace", "leading", "trailing"] = "linspace"
     # ᾱ after the last step is 1; False: that of the first step of the forward process. The public IRASim has False.
     end_clean: bool = False
@@ -70,7 +70,7 @@ def check_grid(clips: ClipShape, downsampling: int, patch_size: int) -> int:
         downsampling: the autoencoder's.
 
     Raises:
-        ConfigError: they do not divide the clips' images.
+        ConfigError: these tokens do not divide the clips' images.
     """
     token = downsampling * patch_size
     require(

@@ -14,7 +14,7 @@ from rsjax.errors import UserError
 
 T = TypeVar("T")
 
-MOST_SEED = 2**32 - 1  # jax.random.key drops higher bits, so that two seeds would be one
+MOST_SEED = 2**32 - 1  # jax.random.key drops higher bits, so two seeds would give the same draws
 
 
 class ConfigError(UserError):
@@ -29,7 +29,7 @@ def runtime(default: Any) -> Any:
 def added(default: Any) -> Any:
     """Returns a dataclass field that content keys leave out at its default.
 
-    For a field that came later: what was made before it existed keeps its key.
+    For a field that was added later: results from before it existed keep their key.
     """
     return field(default=default, metadata={"added": True})
 
@@ -68,21 +68,21 @@ def fitting_sizes(size: int, unit: int, least: int = 1, most: int | None = None)
     """Returns the multiples of ``unit`` next to ``size``, such as "240 or 256", for errors.
 
     Args:
-        least, most: units that there may be.
+        least, most: the least and the most units allowed.
     """
     near = {max(least, n if most is None else min(n, most)) for n in (size // unit, size // unit + 1)}
     return " or ".join(str(unit * n) for n in sorted(near))
 
 
 def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
-    """Checks that every number of a dataclass is finite and every seed one of 32 bits, also in nested dataclasses.
+    """Checks that every number of a dataclass is finite and every seed has 32 bits, also in nested dataclasses.
 
     Args:
         prefix: precedes the fields' names in the error.
         dash: whether to write the names as flags of a command line.
 
     Raises:
-        ConfigError: a number is not.
+        ConfigError: a number is not finite, or a seed does not have 32 bits.
     """
     for f in dataclasses.fields(settings):
         name = prefix + (f.name.replace("_", "-") if dash else f.name)

@@ -13,7 +13,7 @@ from rsjax.config.tokenizer import TokenizerConfig
 
 @dataclass(frozen=True)
 class DiTConfig:
-    """A diffusion transformer on frames: blocks within frames and blocks over time take turns."""
+    """A diffusion transformer on frames: blocks within frames alternate with blocks over time."""
 
     # frame: each action modulates the blocks within its frame (the paper's Frame-Ada). video: all actions together
     # modulate every block (Video-Ada).
@@ -27,7 +27,7 @@ class DiTConfig:
     mlp_ratio: int = 4
     patch_size: int = 2  # cells of latents that one token covers, along each side
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
-    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps the blocks' inputs alone
+    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
 
     def __post_init__(self) -> None:
         for name in ("width", "blocks", "heads", "mlp_ratio", "patch_size"):
@@ -97,7 +97,7 @@ class KLConfig:
 @register_family("irasim")
 @dataclass(frozen=True)
 class IRASimConfig(DiTConfig, ModelConfig):
-    """IRASim (reference: its authors' public code): predicts the noise in a clip's latents, its first frames clean."""
+    """IRASim (reference: its authors' public code): predicts the noise in a clip's latents; first frames are clean."""
 
     uses_tokenizer: ClassVar[bool] = True
     autoencoder: KLConfig = KLConfig()

@@ -33,7 +33,7 @@ def irasim_xl() -> Config:
 def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
     """Returns a preset with the public code's settings on the latents of SDXL's autoencoder, which stays frozen.
 
-    The public batch is 1 clip a GPU, accumulated twice, on GPUs of unknown number; 16 is our choice.
+    The public batch is 1 clip a GPU, accumulated twice, on an unknown number of GPUs; 16 is our choice.
     """
     public = OptimizerConfig(warmup_steps=0, schedule="steps", beta2=0.999, grad_clip=0.1)
     return Config(
@@ -55,7 +55,7 @@ def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
 
 
 def irasim_tiny(base: Config) -> Config:
-    """Returns IRASim and its own autoencoder on the clips and in about the time of the preset ``tiny``."""
+    """Returns IRASim and its own autoencoder on the clips of the preset ``tiny``, trained for about as long."""
     return replace(
         base,
         name="irasim_tiny",

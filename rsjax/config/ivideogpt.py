@@ -19,11 +19,11 @@ class ConditionalVQConfig:
     norm_groups: int = 32
     latent: int = 64
     codes: int = 8192  # in each of the two codebooks
-    future_patch: int = 4  # a later frame's token covers so many cells along each side
-    attention_size: int = 16  # levels of at most so many cells a side attend to the context
+    future_patch: int = 4  # a later frame's token covers this many cells along each side
+    attention_size: int = 16  # levels of at most this many cells a side attend to the context
     heads: int = 4
     dropout: float = 0.1  # of weights and output of the attention to the context
-    # Codes begin between ± this; 0: ± 1/codes, as in the public code, from where a short training moves few of them.
+    # Codes are initialised between ± this; 0: ± 1/codes, as in the public code, but a short training moves few of them.
     codebook_scale: float = 0.0
     codebook_weight: float = 1.0
 
@@ -46,7 +46,7 @@ class ConditionalVQConfig:
         """Returns the cells along each side of an image, which are the tokens of a context frame.
 
         Raises:
-            ConfigError: the image does not divide into cells, or its cells not into the tokens of a later frame.
+            ConfigError: the image does not divide into cells, or its cells do not divide into a later frame's tokens.
         """
         pixels, most = self.downsampling * self.future_patch, self.attention_size // self.future_patch
         require(
@@ -98,7 +98,7 @@ class IVideoGPTConfig(ModelConfig):
     dropout: float = 0.1  # of attention weights
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
     unroll: int = runtime(1)  # blocks per iteration of the scan
-    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps the blocks' inputs alone
+    remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
     sample: TopKConfig = sampling(TopKConfig())
 
     def __post_init__(self) -> None:

@@ -31,7 +31,7 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
         prompt_frames=model.autoencoder.context_frames,
         sim=SimConfig(image_size=size),
         tokenizer_train=TokenizerTrainConfig(
-            steps=100_000,  # the public 200,000 count the discriminator's turns too
+            steps=100_000,  # the public 200,000 include the discriminator's steps
             batch_size=64,
             frames_per_clip=8,
             depth_share=0.0,
@@ -47,7 +47,7 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
 
 
 def ivideogpt_tiny(tiny: Config) -> Config:
-    """Returns iVideoGPT on the clips and in about the time of the preset ``tiny``."""
+    """Returns iVideoGPT on the clips of the preset ``tiny``, trained for about as long."""
     return replace(
         tiny,
         name="ivideogpt_tiny",
@@ -78,7 +78,7 @@ def ivideogpt_tiny(tiny: Config) -> Config:
             blocks=6,
             heads=6,
             mlp_width=768,
-            positions=511,  # a clip of 16 frames: no position is sampled that was not trained
+            positions=511,  # a clip of 16 frames: sampling uses only positions that were trained
             integrate_actions=True,
             dropout=0.0,
             compute_dtype="bfloat16",

@@ -39,7 +39,7 @@ class ModelConfig:
     def own_autoencoder(self) -> Any:
         """Settings of the family's own autoencoder, a frozen dataclass, in place of ``Config.tokenizer``; None: none.
 
-        :mod:`rsjax.tokenizers.autoencoder` says how a family comes to have one.
+        :mod:`rsjax.tokenizers.autoencoder` says how a family defines one.
         """
         return None
 
@@ -55,7 +55,7 @@ class ModelConfig:
 
     @property
     def takes_actions(self) -> bool:
-        """Whether what the model generates depends on actions; without, ΔPSNR has no meaning."""
+        """Whether generated videos depend on actions; if they do not, ΔPSNR has no meaning."""
         return True
 
     @property

@@ -25,16 +25,16 @@ PUBLIC_OPTIMIZER = OptimizerConfig(
 class PolicyConfig:
     """A Diffusion Policy with a 1-D U-Net; the defaults are the public hyper-parameters for Lift from images.
 
-    An action of a clip leads from one frame to the next and may hold several controls, such as four of 50 ms; the
+    An action of a clip leads from one frame to the next and may consist of several controls, such as four of 50 ms; the
     policy plans in controls.
     """
 
-    observations: int = 2  # frames that it sees, the newest last
-    horizon: int = 16  # controls that it plans
+    observations: int = 2  # frames that the policy sees, the newest last
+    horizon: int = 16  # controls that the policy plans
     execute: int = 8  # controls of a plan that are executed before the next one
     crop: float = 76 / 84  # side of the crop, as a share of the picture's: random in training, the middle otherwise
     noise_steps: int = 100  # of the diffusion
-    sample_steps: int = runtime(100)  # that sampling takes, a divisor of noise_steps
+    sample_steps: int = runtime(100)  # of sampling, a divisor of noise_steps
     channels: tuple[int, ...] = (256, 512, 1024)  # of the U-Net's levels
     kernel: int = 5
     groups: int = 8  # of the U-Net's group normalisation
@@ -99,7 +99,7 @@ def tiny() -> PolicyConfig:
 
 
 def toy() -> PolicyConfig:
-    """Returns a size for tests: seconds."""
+    """Returns a size for tests, which trains in seconds."""
     return PolicyConfig(
         horizon=8,
         execute=4,
@@ -124,7 +124,7 @@ def policy_preset(name: str) -> PolicyConfig:
     """Returns a named size.
 
     Raises:
-        ConfigError: there is none of this name.
+        ConfigError: no size has this name.
     """
     if name not in POLICIES:
         raise ConfigError(f"no policy size {name!r}{did_you_mean(name, POLICIES)}; there are {', '.join(POLICIES)}")

@@ -59,7 +59,7 @@ def tiny() -> Config:
         # sub-tokens do (20.4 dB on validation clips after 600 steps, against 20.0 with two vocabularies of 512).
         tokenizer=TokenizerConfig(
             # Patches of 4 pixels: a step takes two thirds of the time that it takes with patches of 2, half of the
-            # channels and a third level (docs/results/miniature.md). The model, which is the limit, gets that time.
+            # channels and a third level (docs/results/miniature.md). The model, which limits quality, gets that time.
             patch_size=4,
             channels=64,
             channel_multipliers=(1, 2),
@@ -80,7 +80,7 @@ def tiny() -> Config:
             l1_weight=0.2,
             l2_weight=4.0,
             entropy_weight=0.01,
-            entropy_offset=0.0,  # the true entropy, as these weights were chosen with
+            entropy_offset=0.0,  # the true entropy, with which these weights were chosen
             commitment_weight=0.1,
             sharding="jit",
             checkpoint_every=500,
@@ -171,17 +171,17 @@ def genie_35m_actions() -> Config:
 
 
 def ivideogpt_tiny() -> Config:
-    """Returns iVideoGPT on the clips of :func:`tiny`, in about its time."""
+    """Returns iVideoGPT on the clips of :func:`tiny`, trained for about as long."""
     return ivideogpt_presets.ivideogpt_tiny(tiny())
 
 
 def irasim_tiny() -> Config:
-    """Returns IRASim on the clips of :func:`tiny`, in about its time."""
+    """Returns IRASim on the clips of :func:`tiny`, trained for about as long."""
     return irasim_presets.irasim_tiny(tiny())
 
 
 def cogvideox_tiny() -> Config:
-    """Returns CogVideoX on the clips of :func:`tiny`, in about its time."""
+    """Returns CogVideoX on the clips of :func:`tiny`, trained for about as long."""
     return cogvideox_presets.cogvideox_tiny(tiny())
 
 

@@ -18,12 +18,12 @@ class EvalConfig:
     """Settings of the evaluation on the test split."""
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
-    repetitions: int = added(1)  # with other random draws
-    loss_clips: int = 1000  # clips of the validation loss during training, likewise
+    repetitions: int = added(1)  # how often each clip is generated, with different random draws
+    loss_clips: int = 1000  # clips of the validation loss during training, spread alike
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
-    localiser_steps: int = 500  # of the network that reads from frames where cube and gripper are
+    localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # Without these files, which are not part of this project, the metrics are null.
     lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips
     lpips_vgg_weights: str = ""
@@ -104,7 +104,7 @@ class Config:
 
     @property
     def autoencoder(self) -> Any:
-        """Settings of what maps frames to tokens or latents: the model's own autoencoder, or ``tokenizer``."""
+        """Settings of the network that maps frames to tokens or latents: the model's own, or ``tokenizer``."""
         own = self.model.own_autoencoder
         return self.tokenizer if own is None else own
 

@@ -64,7 +64,7 @@ class SimConfig:
 
     @property
     def train_tasks(self) -> tuple[str, ...]:
-        """The tasks of the train and test splits; none in lift, which has one."""
+        """The tasks of the train and test splits; empty in lift, which has only one task."""
         return (self.tasks or ML45) if self.env == "metaworld" else ()
 
     @property

@@ -21,9 +21,9 @@ class MaskConfig:
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
     corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
     visible_prefix: float = 0.0  # step 3: share of the clips in which all frames before a random one stay visible
-    # With model.whole_frames: in this share of the steps after so many, every frame is predicted from the model's own
-    # prediction of the frame before (its mean codes), as in a rollout. Such a step is a third more work. Not in the
-    # reference.
+    # With model.whole_frames: after own_frames_after steps, in this share of the steps, every frame is predicted from
+    # the model's own prediction of the frame before (its mean codes), as in a rollout. Such a step takes a third more
+    # work. Not in the reference.
     own_frames: float = added(0.0)
     own_frames_after: int = added(0)
 
@@ -39,11 +39,11 @@ class SampleConfig:
     top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
     unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
     # Frames are decoded from each cell's mean code under the model's probabilities, not from its most probable one:
-    # 0.45 dB closer to the truth, and blurred where the model is unsure (docs/results/miniature.md). Without effect at
-    # other temperatures than 0.
+    # 0.45 dB closer to the truth, and blurred where the model is unsure (docs/results/miniature.md). No effect at
+    # temperatures other than 0.
     mean_codes: bool = False
     # With mean_codes: later frames read the mean codes too, not the most probable ones, so that they know where the
-    # model was unsure: another 0.2 dB, and cube and gripper nearer to their places (docs/results/miniature.md).
+    # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (docs/results/miniature.md).
     read_means: bool = added(False)
     # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
     # double the work.
@@ -72,7 +72,7 @@ class SampleConfig:
 
 
 def check_sampling(sample: SampleConfig, positions: int, action_dropout: float) -> None:
-    """Raises :class:`rsjax.config.ConfigError` if a model with so many positions does not support these settings."""
+    """Raises :class:`rsjax.config.ConfigError` if a model with this many positions does not support these settings."""
     require(
         sample.guidance == 1 or action_dropout > 0,
         f"model.sample.guidance is {sample.guidance} but the model never saw clips without actions; "
@@ -100,11 +100,11 @@ class LossConfig:
     use_keypoints: bool = True  # False: without the keypoint and attention terms
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
     # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
-    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which has
+    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which gives
     # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (docs/results/keypoints.md).
     keypoint_target: Literal["observed", "predicted"] = "observed"
-    # Whether Eq. 5 compares masked cells only: from a third to half of ŝ_t lie on visible cells, where nobody samples.
-    # Measured there without effect.
+    # Whether Eq. 5 compares masked cells only: a third to half of ŝ_t lie on visible cells, which are never sampled.
+    # It had no effect in the measurements of docs/results/keypoints.md.
     keypoint_masked_only: bool = True
 
     def __post_init__(self) -> None:
@@ -119,16 +119,16 @@ class TransformerConfig:
     # zero, so that public weights keep their logits. none: no actions (the public Genie).
     action_encoder: Literal["linear", "mlp", "none"] = "linear"
     # The encoder also reads the sum of all actions so far, which doubles its input. If actions are pose deltas, the sum
-    # is the pose: a large model finds it by temporal attention, a small one in few steps may not. Not in the paper.
+    # is the pose: a large model finds it by temporal attention, a small one may not in few steps. Not in the paper.
     integrate_actions: bool = False
-    # Every frame's input also has the embedded tokens of the frame before it, cell by cell, through a table of its own.
-    # In training these are visible where the frame before is masked, as past frames are in sampling, and the first
-    # spatial attention finds more than masks in the frame to predict. No output sees its own frame by it. Not in the
+    # Every frame's input also contains the tokens of the frame before it, cell by cell, embedded by a separate table.
+    # In training these are visible even where that frame is masked, as past frames are in sampling, and the first
+    # spatial attention finds more than masks in the frame to predict. No output sees its own frame this way. Not in the
     # paper.
     read_previous: bool = False
     # All cells of every frame but a clip's first stay masked, so each frame is predicted as a whole, from the actions
-    # and the frames before, which the network sees by read_previous alone. Training then asks of every cell what
-    # decoding in one step asks, and decoding makes one pass over a frame instead of two; further decoding steps gain
+    # and the frames before, which the network sees only through read_previous. Training then sets every cell the same
+    # task as decoding in one step, and decoding makes one pass over a frame instead of two; further decoding steps gain
     # nothing. The paper and the public code mask a share of the cells.
     whole_frames: bool = added(False)
     width: int = 256
@@ -152,8 +152,8 @@ class TransformerConfig:
     embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 as in the public code (torch's default)
     position_std: float = 0.0  # position and mask embeddings ~ N(0, std²); 0 as in the public code
     # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
-    # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units multiply
-    # linear layers in float32 all the same, which is faster there.
+    # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units still
+    # multiply linear layers in float32, which is faster there.
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
@@ -199,8 +199,8 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     Attributes:
         max_frames: positions in time, and how many frames temporal attention covers; 0: the clips' frames.
-        shifts: copies of each training clip, moved by up to ``shift_pixels``, of which a step draws one or the clip.
-            Few clips last longer with them: a scene that is moved by less than a token has other tokens everywhere.
+        shifts: copies of each training clip, moved by up to ``shift_pixels``. A step draws one of them or the clip.
+            Few clips last longer with copies: a scene that is moved by less than a token has new tokens everywhere.
     """
 
     uses_tokenizer: ClassVar[bool] = True

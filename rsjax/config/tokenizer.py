@@ -29,8 +29,8 @@ class TokenizerConfig:
     # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
     depth_scale: Literal["linear", "inverse"] = "inverse"
 
-    # bfloat16: operands of convolutions, and on an accelerator their results; CPUs without bf16 units convolve in
-    # float32 all the same, which is faster there. The public code trains in mixed half precision and is used in
+    # bfloat16: operands of convolutions, and on an accelerator their results; CPUs without bf16 units still convolve in
+    # float32, which is faster there. The public code trains in mixed half precision and is used in
     # float32.
     compute_dtype: Literal["float32", "bfloat16"] = added("float32")
 
@@ -88,7 +88,7 @@ class TokenizerConfig:
 class TokenizerTrainConfig(LoopConfig):
     """Settings of the tokenizer's training. The defaults are the reference's, without LPIPS and discriminator.
 
-    ``batch_size`` counts clips, of which ``frames_per_clip`` frames each are drawn. A field ``NAME_weight`` weighs the
+    ``batch_size`` counts clips; ``frames_per_clip`` frames are drawn from each. A field ``NAME_weight`` weighs the
     loss term NAME.
     """
 

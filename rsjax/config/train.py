@@ -56,7 +56,7 @@ class ComponentConfig:
     scenes: tuple[str, ...] = ("*",)  # likewise, such as kitchen
     store: str = ""  # a token store of the same tokenizer; empty: this run's own
     weight: float = 1.0  # share of the clips drawn, relative to the other components
-    clips: int = added(0)  # use only so many of these clips, the first; 0: all
+    clips: int = added(0)  # use only this many of these clips, the first ones; 0: all
 
     def __post_init__(self) -> None:
         require(self.weight > 0, f"a component of a data mixture has weight {self.weight}; it must be above 0")
@@ -67,11 +67,12 @@ class ComponentConfig:
 class CurriculumStageConfig:
     """One stage of a curriculum.
 
-    The paper's authors: 2 epochs of simple tasks, then 3 of difficult ones. They state no restart of the learning rate.
+    The paper's authors train 2 epochs on simple tasks, then 3 on difficult ones. They mention no restart of the
+    learning rate.
     """
 
     components: tuple[ComponentConfig, ...] = (ComponentConfig(),)
-    epochs: float = 1.0  # the stage draws as many clips as its components have, times this
+    epochs: float = 1.0  # the stage draws this many times the number of its components' clips
     # The learning rate schedule starts again with this stage; it ends at the next restart or the end of the run.
     restart: bool = False
 
