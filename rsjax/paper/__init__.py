@@ -1,1 +1,1 @@
-"""The paper's claims, each trained for, measured and judged in small by ``python -m experiments.paper``."""
+"""Tests the paper's claims at small scale: ``python -m experiments.paper`` trains, measures and judges each."""

@@ -1,8 +1,8 @@
-"""How large the cells of a budget are, and how long they take.
+"""Determines how large the cells of a budget are, and estimates how long they take.
 
-The constants are of ``tiny`` on 2 cores of an AMD EPYC, measured 2026-11-22. A budget determines the sizes through them
-alone, not through the machine at hand: so the same budget always means the same cells, and a command that is started
-again finds them.
+The constants were measured with ``tiny`` on 2 cores of an AMD EPYC on 2026-11-22. The sizes depend only on the budget
+and these constants, not on the machine at hand. So the same budget always means the same cells, and a command that is
+started again finds them.
 """
 
 import re
@@ -19,18 +19,19 @@ from rsjax.tokenizers.flops import tokenizer_flops
 
 EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
-STEP, RATE = 0.06, 1.4e11  # a step of a world model: seconds, and operations a second on top
-TOKENIZER_RATE = 4.1e10  # operations a second of the tokenizer's training, with Muon
-# Seconds of a step of autoencoder and model in each family's small preset, on the same quiet machine; 1.02 and 0.74 are
-# 1.33 and 0.87, of slower attention, by the ratios that a busy one gave (docs/performance.md).
+STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations per second for the rest
+TOKENIZER_RATE = 4.1e10  # operations per second of the tokenizer's training, with Muon
+# Seconds per step of autoencoder and of model in each family's small preset, on the same machine while it was idle.
+# 1.02 and 0.74 are estimates: 1.33 and 0.87 were measured with a slower attention, and are scaled by the speed-ups
+# that a busy machine measured (docs/performance.md).
 FAMILY_STEPS = {"ivideogpt": (0.88, 1.02), "irasim": (0.13, 0.55), "cogvideox": (0.85, 0.74)}
-START = 15.0  # seconds of a training to its first step: 27 for the first of its shapes, 9 for the next
-EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds: of each evaluation, a localiser's step, a rollout
+START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
+EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds per evaluation, step of the localiser, and rollout
 
-COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # of a budget
-ROLLOUTS_SHARE, LOCALISER_SHARE = 0.12, 0.04  # of a cell
-# Trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with three seeds,
-# of which six are cheaper, as they are without depth), and how their number grows with the budget.
+COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # shares of a budget
+ROLLOUTS_SHARE, LOCALISER_SHARE = 0.12, 0.04  # shares of a cell
+# The number of trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with
+# three seeds, six of which are cheaper because they are without depth), and how it grows with the budget.
 CELLS, GROWTH = 13.7, 0.4
 LEAST_STEPS, LEAST_TOKENIZER_STEPS, LEAST_EPISODES, LEAST_CLIPS = 40, 100, 60, 2
 SEEDS = 3
@@ -67,7 +68,7 @@ class Scale:
 
 
 def scale(preset: Config, seconds: float) -> Scale:
-    """Returns the preset with as many episodes, steps and scored clips as suit a budget, at most its own."""
+    """Returns the preset with as many episodes, steps and scored clips as the budget allows, at most its own."""
     sim, tokenizer, evaluation = preset.sim, preset.tokenizer_train, preset.eval
     each = SPENT_IN_CELLS * seconds / (CELLS * (seconds / (HOUR / 2)) ** GROWTH)
     episodes = min(sim.episodes, max(LEAST_EPISODES, _round(COLLECT_SHARE * seconds / EPISODE)))
@@ -85,7 +86,7 @@ def scale(preset: Config, seconds: float) -> Scale:
         "eval.batch_size": min(evaluation.batch_size, clips),
         "eval.action_draws": draws,
         "eval.localiser_steps": min(evaluation.localiser_steps, max(1, _round(LOCALISER_SHARE * each / LOCALISER))),
-        "train.curriculum": (),  # whose epochs would set the steps; a claim's arms bring theirs
+        "train.curriculum": (),  # its epochs would determine the steps; a claim's arms have their own
         "train.eval_every": 0,
         "tokenizer_train.eval_every": 0,
     }
@@ -96,7 +97,7 @@ def scale(preset: Config, seconds: float) -> Scale:
 
 
 def with_steps(config: Config, steps: int) -> Config:
-    """Returns the configuration with so many steps of the world model; own frames begin at the same share of them."""
+    """Returns the configuration with a number of world-model steps; own frames begin at the same share of the steps."""
     values = {"train.steps": steps}
     if isinstance(config.model, TokenModelConfig):
         values["model.mask.own_frames_after"] = config.model.mask.own_frames_after * steps // config.train.steps
@@ -109,7 +110,7 @@ def _round(number: float) -> int:
 
 
 def cut(config: Config, share: float) -> Config:
-    """Returns the configuration with each of its training loops at a share of its steps, at least one."""
+    """Returns the configuration with each training loop cut to a share of its steps, at least one step."""
     loops = {
         field.name: replace(loop, steps=max(1, round(share * loop.steps)), eval_every=0)
         for field in fields(config)
@@ -119,11 +120,11 @@ def cut(config: Config, share: float) -> Config:
 
 
 def train_flops(config: Config) -> int | None:
-    """Returns the operations of the world model's whole training; None for a family without counts."""
+    """Returns the operations of the world model's whole training; None for a family that does not count them."""
     per_clip = create_model(config).flops(config.clips.frames).get("train")
     if per_clip is None:
         return None
-    # A step on own frames has another forward pass, a third of a step. Counted as if they began with the first step.
+    # A step on own frames needs one more forward pass, a third of a step. It is counted from the first step on.
     own = config.model.mask.own_frames / 3 if isinstance(config.model, TokenModelConfig) else 0.0
     return round(config.train.steps * config.train.batch_size * per_clip * (1 + own))
 
@@ -137,7 +138,7 @@ def parameters(config: Config) -> tuple[int, int]:
 
 
 def step_seconds(config: Config) -> float:
-    """Returns the seconds of a step of the world model; of a family without counts, 0."""
+    """Returns the seconds of a step of the world model; 0 for a family that does not count its operations."""
     if config.model.family in FAMILY_STEPS:
         return FAMILY_STEPS[config.model.family][1]
     flops = train_flops(config)
@@ -163,7 +164,7 @@ def collect_seconds(config: Config) -> float:
 
 
 def tokenizer_seconds(config: Config) -> float:
-    """Returns the seconds of the training of tokenizer or autoencoder, and of making tokens."""
+    """Returns the seconds of training the tokenizer or autoencoder and of making tokens."""
     if not config.model.uses_tokenizer:
         return 0.0
     clips = config.sim.episodes * (1 + sum(config.model.token_shifts[:1]))
@@ -171,12 +172,12 @@ def tokenizer_seconds(config: Config) -> float:
 
 
 def training_cost(config: Config, unit: Literal["seconds", "flops"]) -> tuple[float, float]:
-    """Returns what the trainings of autoencoder and world model take: estimated seconds, or operations."""
+    """Returns the cost of training the autoencoder and the world model, in estimated seconds or in operations."""
     loop = config.tokenizer_train
     if unit == "seconds":
         return loop.steps * tokenizer_step_seconds(config), config.train.steps * step_seconds(config)
     images = loop.steps * loop.batch_size * loop.frames_per_clip
-    # Without what differs between arms and seeds, since some families count by tracing their programs.
+    # Leave out what differs between arms and seeds: some families count by tracing their programs, and this is cached.
     bare = replace(config, train=LoopConfig(), tokenizer_train=replace(loop, steps=1))
     return 3.0 * images * _frame_flops(bare), float(train_flops(config) or 0)
 
@@ -191,8 +192,8 @@ def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0
     """Returns the seconds of an evaluation and a report.
 
     Args:
-        draws: of random actions; None: those of the configuration.
-        frames: of a rollout; 0: the clips'.
+        draws: draws of random actions; None: the configuration's number.
+        frames: frames per rollout; 0: the clips' number.
     """
     draws = config.eval.action_draws if draws is None else draws
     draws = draws if config.model.takes_actions else 0

@@ -13,21 +13,21 @@ from rsjax.errors import did_you_mean
 class Arm:
     """One of the trainings that a claim compares; it runs with several seeds.
 
-    Without any setting it is the base preset itself.
+    An arm without settings is the base preset itself.
 
     Attributes:
-        name: in tables.
+        name: its name in tables.
         values: fields that differ from the base preset, by dotted name.
-        model: the family of the model, with the base preset's size; empty: the base preset's.
-        preset: instead, the small preset of this family (``irasim``: ``irasim_tiny``), with the base preset's clips and
-            evaluation. An arm without such a preset is left out.
+        model: the family of the model, at the base preset's size; empty: the base preset's family.
+        preset: a family whose small preset is used instead (``irasim``: ``irasim_tiny``), with the base preset's clips
+            and evaluation. An arm whose preset does not exist is left out.
         equal: whether it trains for as many steps as the base preset, for as many estimated seconds, or for as many
-            operations. A family's small preset trains autoencoder and model; both are cut or prolonged alike.
+            operations. A family's small preset trains autoencoder and model; both are scaled by the same factor.
         curriculum: the stages of its training, whose epochs are scaled to the cell's steps.
-        mixed: the clips of these stages are mixed instead, each as often as in the curriculum.
+        mixed: mix the clips of these stages instead, each clip as often as in the curriculum.
         data: the share of the training clips that the world model learns from.
         rate: a factor on the learning rate of the world model.
-        published: the paper's numbers for it, by metric.
+        published: the paper's numbers for this arm, by metric.
     """
 
     name: str
@@ -47,12 +47,12 @@ class Comparison:
     """A part of a claim: one arm scores better than another.
 
     Attributes:
-        metric: a registered metric, which says whether higher or lower is better.
-        better, than: names of the arms; the same arm twice compares two scores of it.
-        score, than_score: the scores per clip of each arm, such as "psnr_repeat_first"; empty: the metric itself.
-        measurement: where they are from: the run's evaluation if empty, otherwise a
-            :func:`rsjax.paper.measurements.measurement` of this name.
-        margin: by how much it is better, in the metric's unit; negative: it is worse by at most that.
+        metric: a registered metric, which determines whether higher or lower is better.
+        better, than: names of the arms; if both are the same arm, two of its scores are compared.
+        score, than_score: the per-clip score of each arm, such as "psnr_repeat_first"; empty: the metric itself.
+        measurement: the source of the scores: empty for the run's evaluation, otherwise the name of a
+            :func:`rsjax.paper.measurements.measurement`.
+        margin: by how much the first arm is better, in the metric's unit; negative: it is worse by at most ``-margin``.
     """
 
     metric: str
@@ -69,16 +69,16 @@ class Claim:
     """A statement of the paper, or about a choice of ours, that can be put to the test.
 
     Attributes:
-        name: for ``--only``.
+        name: the name for ``--only``.
         title: a heading.
         statement: what is claimed, in the words of the source.
-        place: where: "Table 2".
-        arms: what is trained. Arms of the same configuration are trained once for all claims.
-        comparisons: its parts.
-        beside: scores that stand beside each arm's in the report, by the measurement that they are from.
-        rank: claims of rank 0 come first, with all their seeds; then the others by rank, each with two seeds; then
+        place: the place in the paper, such as "Table 2".
+        arms: what is trained. Arms with the same configuration are trained once for all claims.
+        comparisons: the parts of the claim.
+        beside: further scores that the report shows for each arm: score → the measurement that it is from.
+        rank: claims of rank 0 run first, with all their seeds; then the others by rank, each with two seeds; then
             their further seeds.
-        notes: what differs from the paper, one line each.
+        notes: differences from the paper, one line each.
     """
 
     name: str
@@ -103,13 +103,13 @@ class Claim:
         return next(arm for arm in self.arms if arm.name == name)
 
     def measurements(self, arm: str) -> tuple[str, ...]:
-        """Returns the names of the measurements that its comparisons need of an arm."""
+        """Returns the names of the measurements of an arm that the claim's comparisons and report need."""
         used = (each.measurement for each in self.comparisons if arm in (each.better, each.than))
         return tuple(dict.fromkeys([*filter(None, used), *self.beside.values()]))
 
 
 def pairs(better: str, than: str, *metrics: str) -> tuple[Comparison, ...]:
-    """Returns the comparison of two arms by each of these metrics."""
+    """Returns comparisons of two arms, one for each of these metrics."""
     return tuple(Comparison(metric, better, than) for metric in metrics)
 
 
@@ -117,10 +117,10 @@ _CLAIMS: dict[str, Claim] = {}
 
 
 def register(claim: Claim) -> Claim:
-    """Adds a claim to those of ``experiments.paper``.
+    """Adds a claim to those of ``experiments.paper``, and returns it.
 
     Raises:
-        ConfigError: another claim has its name.
+        ConfigError: another claim has the same name.
     """
     require(claim.name not in _CLAIMS, f"two claims are named {claim.name!r}; rename one of them")
     _CLAIMS[claim.name] = claim
@@ -138,7 +138,7 @@ def chosen(patterns: Sequence[str], known: Mapping[str, Claim]) -> tuple[Claim, 
     """Returns the claims whose names match a shell pattern, or all of them if there is no pattern.
 
     Raises:
-        ConfigError: a pattern matches none; the message lists all.
+        ConfigError: a pattern matches no claim; the message lists all claims.
     """
     for pattern in patterns:
         problem = f"--only {pattern}: no such claim{did_you_mean(pattern, known)} (claims: {', '.join(known)})"

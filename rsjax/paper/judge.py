@@ -1,4 +1,4 @@
-"""Judges claims by the scores per clip of their cells."""
+"""Judges claims by the per-clip scores of their cells."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,25 +24,25 @@ from rsjax.paper.measurements import read_scores
 from rsjax.paper.plan import Cell, Plan
 from rsjax.pipeline.run import Run
 
-CEILING = "psnr_tokenizer"  # of the reconstruction, which each family's own autoencoder limits
-SUCCESS = "success"  # the name of scores that are 1 or 0, of trials that may all end alike
+CEILING = "psnr_tokenizer"  # PSNR of the reconstruction by each family's own autoencoder, a limit on the prediction's
+SUCCESS = "success"  # the name of scores that are 1 or 0 for each trial; all trials may end alike
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A comparison and what was measured.
+    """A comparison with its measurements and verdict.
 
     Attributes:
         comparison: what was claimed.
-        metric: by which.
-        seeds: finished seeds of both arms.
+        metric: the metric of the comparison.
+        seeds: the numbers of finished seeds of both arms.
         published: the paper's difference, if it has one.
         sides: both scores, means over seeds.
-        difference: of the arm claimed to be better minus the other, with an interval over seeds and clips.
+        difference: the arm claimed to be better minus the other, with an interval over seeds and clips.
         test: Welch's t-test over the seeds; None with fewer than two seeds.
-        clips: that have a score in all of them.
-        verdict: of the wider one of both intervals.
-        reason: why there is no difference, or why its interval tells nothing.
+        clips: the number of clips that have a score in all seeds of both arms.
+        verdict: by the interval that contains both the difference's and the test's.
+        reason: why there is no difference, or why its interval gives no verdict.
     """
 
     comparison: Comparison
@@ -62,10 +62,10 @@ class Trained:
     """An arm's cells and their results.
 
     Attributes:
-        name: the arm's.
-        cells: one for each seed, those left out too.
-        results: of the same cells.
-        absent: why it cannot be trained; empty if it can.
+        name: the arm's name.
+        cells: one for each seed, including those that the budget leaves out.
+        results: the results of the same cells.
+        absent: why the arm cannot be trained; empty if it can.
         spreads: mean and deviation over finished seeds of the claim's scores, by metric or name in ``Claim.beside``.
     """
 
@@ -91,7 +91,7 @@ class Outcome:
 
     @property
     def counts(self) -> dict[Verdict, int]:
-        """How many of the comparisons that could be made have each verdict."""
+        """The number of comparisons with each verdict, among those that could be made."""
         counts: dict[Verdict, int] = {"holds": 0, "does not hold": 0, "cannot tell": 0}
         for each in self.judged:
             if each.difference is not None:
@@ -100,7 +100,10 @@ class Outcome:
 
     @property
     def verdict(self) -> Verdict:
-        """Holds if all comparisons that could be made do, does not if any does not; otherwise cannot tell."""
+        """The verdict on the whole claim, from the comparisons that could be made.
+
+        "holds" if all of them hold, "does not hold" if any does not hold; otherwise "cannot tell".
+        """
         counts = self.counts
         if counts["does not hold"]:
             return "does not hold"
@@ -108,10 +111,10 @@ class Outcome:
 
 
 def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
-    """Judges all claims of a plan by what has finished so far.
+    """Judges all claims of a plan by the cells that have finished so far.
 
     Args:
-        runs: the run of each of the plan's cells by name.
+        runs: the run of each cell of the plan, by name.
     """
     results = {name: read_result(runs[name]) for name in plan.cells}
     read: dict[tuple[str, str], tuple[Mapping[str, Sequence[float]], str]] = {}
@@ -165,7 +168,7 @@ def _judge(claim: Claim, comparison: Comparison, arms: Mapping[str, Trained], re
 def _paired(
     better: Trained, than: Trained, comparison: Comparison, read: Mapping[Any, Any]
 ) -> tuple[Float[np.ndarray, "S B"], Float[np.ndarray, "Z B"]]:
-    """Returns both arms' scores by seed, of the clips that have a finite one in all.
+    """Returns both arms' scores by seed, for the clips that have a finite score in all seeds of both.
 
     Raises:
         Unavailable: there is nothing to compare.
@@ -186,7 +189,7 @@ def _scores(arm: Trained, score: str, comparison: Comparison, read: Mapping[Any,
     """Returns an arm's scores by seed.
 
     Raises:
-        Unavailable: no seed has finished, or has this score.
+        Unavailable: no seed has finished, a finished seed lacks this score, or seeds have different numbers of clips.
     """
     if arm.absent or not arm.finished:
         raise Unavailable(f"{arm.name}: {arm.absent or 'no seed has finished'}")
@@ -210,9 +213,9 @@ def _published(claim: Claim, comparison: Comparison) -> float | None:
 
 
 def _wider(interval: Estimate, test: Welch) -> Estimate:
-    """Returns the interval that contains both, as few seeds make the bootstrap's too narrow.
+    """Returns the smallest interval that contains both, because few seeds make the bootstrap's too narrow.
 
-    Of a single score per seed, such as a correlation, there is no bootstrap, and Welch's is returned.
+    For a single score per seed, such as a correlation, there is no bootstrap interval, and Welch's is returned.
     """
     low, high = test.difference.low, test.difference.high
     if interval.low is None or interval.high is None or low is None or high is None:

@@ -1,7 +1,7 @@
-"""Scores of a trained run beyond its own evaluation, which claims name: other clips, longer rollouts, other judges.
+"""Measures scores of a trained run that its own evaluation lacks: on other clips, longer rollouts, with policies.
 
-A measurement is a function of a run that returns a score per clip by name. It runs once per run; the result lies in the
-run's directory.
+A measurement is a function that takes a run and returns a score per clip by name; claims refer to it by its name. It
+runs once per run, and the result is kept in the run's directory.
 """
 
 import math
@@ -30,10 +30,10 @@ def measurement(name: str, seconds: Seconds) -> Callable[[Measurement], Measurem
     """Registers a measurement under a name for :attr:`rsjax.paper.claim.Comparison.measurement`.
 
     Args:
-        seconds: estimates its time for a run of a configuration.
+        seconds: a function that estimates its time for a run with a configuration.
 
     Raises:
-        ConfigError: another one has that name.
+        ConfigError: another measurement has that name.
     """
 
     def register(function: Measurement) -> Measurement:
@@ -57,7 +57,7 @@ def measured(run: Run, name: str) -> bool:
 
 
 def measure(run: Run, name: str) -> None:
-    """Measures a finished run unless that was done; a failure is recorded and tried again by the next command.
+    """Measures a finished run unless this was done before; a failure is recorded, and the next command tries again.
 
     A measurement that does not exist for this run (:class:`rsjax.evaluation.registry.Unavailable`) is not tried again.
     """
@@ -79,10 +79,10 @@ def measure(run: Run, name: str) -> None:
 
 
 def read_scores(run: Run, name: str) -> tuple[Scores, str]:
-    """Returns the scores per clip of a finished run, and why there are none.
+    """Returns the per-clip scores of a finished run, and the reason if there are none.
 
     Args:
-        name: of a measurement; empty: the run's own evaluation.
+        name: the name of a measurement; empty: the run's own evaluation.
     """
     try:
         if not name:

@@ -1,4 +1,4 @@
-"""The cells that the claims need, in the order in which they run, as far as a budget goes."""
+"""Plans the cells that the claims need, in the order in which they run, as far as a budget allows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from rsjax.paper.measurements import seconds_of
 from rsjax.pipeline.run import Run
 from rsjax.sim import expert
 
-SLACK = 1.05  # of the budget that the estimates may take
-TOLD = 2  # seeds of each arm without which nothing is told
+SLACK = 1.05  # share of the budget that the estimates may take
+TOLD = 2  # seeds of each arm that a verdict needs
 KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
 
 
@@ -26,9 +26,9 @@ class Cell:
     """A training and its evaluation.
 
     Attributes:
-        name: its directory; it ends with a content key, so that a directory keeps the cells of several budgets apart.
+        name: the name of its directory; it ends with a content key, which keeps the cells of several budgets apart.
         config: what is trained.
-        uses: (claim, arm) for which it runs.
+        uses: each (claim, arm) for which it runs.
     """
 
     name: str
@@ -41,10 +41,10 @@ class Task:
     """A step of a plan: a cell's training with its evaluation, or a measurement of a trained cell.
 
     Attributes:
-        cell: its name.
-        measurement: its name; empty: the training.
-        claim: the first one that needs it.
-        seconds: the estimate; the first task that needs a shared stage has its seconds too.
+        cell: the cell's name.
+        measurement: the measurement's name; empty: the training.
+        claim: the first claim that needs the task.
+        seconds: the estimate; it includes a shared stage's seconds if the task is the first that needs this stage.
     """
 
     cell: str
@@ -55,12 +55,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Plan:
-    """What some claims need at a scale.
+    """The cells and tasks that some claims need at a scale.
 
     Attributes:
-        cells: by name, those that the budget leaves out too.
+        cells: by name, including those that the budget leaves out.
         tasks: in the order in which they run.
-        left_out: those that the budget has no time for, known before anything runs.
+        left_out: tasks that the budget has no time for; they are known before anything runs.
         absent: (claim, arm) → why the arm cannot be trained.
     """
 
@@ -77,13 +77,13 @@ class Plan:
 
 
 def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS) -> Plan:
-    """Returns the cells of claims, which share the budget, and what is to be done in which order.
+    """Returns the cells of claims, which share the budget, and the tasks in their order.
 
     The sizes of the cells depend on the budget alone, not on the claims.
 
     Args:
         data: the directory of simulated data sets.
-        seeds: trainings of each arm.
+        seeds: the number of trainings of each arm.
     """
     absent: dict[tuple[str, str], str] = {}
     cells: dict[str, Cell] = {}  # by content key
@@ -114,7 +114,7 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
 
 
 def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
-    """Returns the seconds of the stages that no cell before has made, and adds their keys to ``made``."""
+    """Returns the seconds of the stages that no earlier cell makes, and adds their keys to ``made``."""
     parts = {
         "collect": budget.collect_seconds,
         "tokenizer": budget.tokenizer_seconds,
@@ -126,7 +126,7 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
 
 
 def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
-    """Claims of rank 0 with all seeds; then each other one with the seeds that a verdict takes; then further seeds."""
+    """Returns (claim, arm, seed) in order: rank 0 with all seeds; other claims with ``TOLD`` seeds; further seeds."""
     first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
     few, more = seeds[:TOLD], seeds[TOLD:]
@@ -138,7 +138,7 @@ def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, in
 
 
 def _label(arm: Arm) -> dict[str, Value]:
-    """Returns what an arm varies, for the name of its directory."""
+    """Returns the values that an arm varies, for the name of its directory."""
     family = {"model": arm.model or arm.preset} if arm.model or arm.preset else {}
     stages = {"curriculum": "+".join(arm.curriculum) + " mixed" * arm.mixed} if arm.curriculum else {}
     shares = {name: f"{share:.2g}" for name, share in (("data", arm.data), ("rate", arm.rate)) if share != 1}
@@ -170,7 +170,8 @@ def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alon
     """Returns a configuration whose trainings take as much as the base preset's.
 
     Args:
-        alone: whether its autoencoder is its own, to be cut or prolonged too; otherwise it is the base preset's.
+        alone: whether the autoencoder is its own, so that its training is scaled too; otherwise it is the base
+            preset's.
     """
     (tokenizer, model), whole = budget.training_cost(config, unit), sum(budget.training_cost(base, unit))
     if alone:
@@ -209,7 +210,7 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
 
 
 def _simple_share(sim: SimConfig) -> float:
-    """Returns the expected share of simple clips: of the tasks, which take turns, or of the modes of Lift's expert."""
+    """Returns the expected share of simple clips, from the tasks, which take turns, or the modes of Lift's expert."""
     tasks = sim.train_tasks
     if tasks:
         return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)

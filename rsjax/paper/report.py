@@ -1,4 +1,4 @@
-"""The report on all claims: ``report.md``, ``report.html``, ``report.json`` and a figure for each claim."""
+"""Writes the report on all claims: ``report.md``, ``report.html``, ``report.json`` and a figure for each claim."""
 
 import base64
 import math
@@ -41,7 +41,7 @@ LEGEND = (
 
 
 def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: str) -> Path:
-    """Writes the files into a directory and returns the path of the page.
+    """Writes the report's files into a directory, and returns the path of the HTML page.
 
     Raises:
         FileError: the disk is full.
@@ -79,7 +79,7 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
 def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     base = plan.scale.base
     results = {result.name: result for outcome in outcomes for arm in outcome.arms for result in arm.results}
-    runs = [result.run for result in results.values()]  # cells that share a stage have the mark of one
+    runs = [result.run for result in results.values()]  # cells that share a stage have the same mark for it
     spent = {key: run.mark(stage).get("seconds", 0.0) for run in runs for stage, key in run.keys().items()}
     states = Counter(result.state for result in results.values())
     return {
@@ -100,7 +100,7 @@ def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def _claim(outcome: Outcome) -> dict[str, Any]:
-    """Returns a claim's part of the report, JSON-ready; texts are as they are shown."""
+    """Returns a claim's part of the report, JSON-ready, with texts as the pages show them."""
     claim, columns = outcome.claim, _columns(outcome)
     return {
         "name": claim.name,
@@ -165,7 +165,7 @@ def _beside(arm: Trained, name: str) -> str:
 
 
 def _parameters(config: Config) -> str:
-    """Returns the trained parameters of model and autoencoder in millions, and how many more are frozen."""
+    """Returns the numbers of trained and, if any, of frozen parameters of model and autoencoder, in millions."""
     model, autoencoder = budget.parameters(config)
     trained = model + autoencoder * (config.tokenizer_train.steps > 0)
     frozen = model + autoencoder - trained
@@ -173,7 +173,7 @@ def _parameters(config: Config) -> str:
 
 
 def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, Any]]:
-    """Returns the scores of repeating the first frame and of the reconstruction, of the first arm that has any."""
+    """Returns the scores of both baselines (first frame repeated, reconstruction) from the first arm that has any."""
     finished = [result for arm in outcome.arms for result in arm.finished][:1]
     of = next((f" of {arm.name}" for arm in outcome.arms if arm.finished), "")
     rows = []
@@ -219,7 +219,7 @@ def _comparison(judged: Judged) -> dict[str, Any]:
 
 
 def _numbers(judged: Judged) -> dict[str, Any]:
-    """Returns the numbers of a comparison, as the texts beside them are rounded."""
+    """Returns the unrounded numbers of a comparison; the texts of the report are rounded."""
     interval, test = judged.difference or Estimate(math.nan, None, None), judged.test
     welch = test.difference if test else Estimate(math.nan, None, None)
     return {
@@ -245,7 +245,7 @@ def _missing(result: Result) -> str:
 
 
 def _figure(outcome: Outcome) -> bytes | None:
-    """Draws the arms' scores with every seed; None before any arm has one."""
+    """Draws the arms' scores with every seed; returns None before any arm has a score."""
     columns = _columns(outcome)
     names = {column.name for column in columns}
     shown = [(arm, {name: value for name, value in arm.spreads.items() if name in names}) for arm in outcome.arms]
@@ -254,10 +254,10 @@ def _figure(outcome: Outcome) -> bytes | None:
 
 
 def _strip(outcome: Outcome) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Draws a clip as the first seed of every arm predicts it: of those that all arms kept, the first arm's middle one.
+    """Draws one clip as the first seed of every arm predicts it: the clip that is the median by the first arm's error.
 
-    None with fewer than two arms, where no frames of the same clip were kept, or for a claim about other clips or
-    frames than those of the runs' evaluations.
+    It is chosen among the clips whose frames all arms kept. Returns None with fewer than two arms, if no frames of the
+    same clip were kept, or for a claim about other clips or frames than those of the runs' evaluations.
     """
     if all(each.measurement for each in outcome.claim.comparisons):
         return None

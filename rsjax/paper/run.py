@@ -1,4 +1,4 @@
-"""Carries out the tasks of a plan one after another, and writes the report after each."""
+"""Carries out the tasks of a plan one after another, and writes the report after each task."""
 
 from collections import Counter
 from pathlib import Path
@@ -20,15 +20,15 @@ def runs_of(plan: Plan, out: Path, data: Path) -> dict[str, Run]:
 
 
 def run_plan(plan: Plan, out: Path, data: Path, command: str) -> dict[str, State]:
-    """Carries out the tasks that are not done, and writes the report after each.
+    """Carries out the tasks that are not done, and writes the report after each task.
 
-    A cell that fails is recorded and the next task begins. An interrupt or SIGTERM ends the command; the next one goes
-    on where this one stopped.
+    A cell that fails is recorded, and the next task begins. An interrupt or SIGTERM ends the command; the next command
+    continues where this one stopped.
 
     Args:
         out: the directory of cells and report.
         data: the directory of simulated data sets.
-        command: how to repeat it, for the reports.
+        command: the command that repeats this, for the reports.
 
     Returns:
         The state of each cell by name.
@@ -60,7 +60,7 @@ def _measure(task: Task, run: Run, place: tuple[int, int]) -> None:
 
 
 def write(plan: Plan, out: Path, data: Path, command: str) -> Path:
-    """Writes the report of what is there so far, and returns the path of its page."""
+    """Writes the report on the results so far, and returns the path of its page."""
     with lock(out / ".locks" / "report", wait="waiting for another process that writes the report"):
         return write_report(out, plan, judge_all(plan, runs_of(plan, out, data)), command)
 

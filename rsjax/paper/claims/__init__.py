@@ -1,4 +1,4 @@
-"""The claims, a few to a file. Importing this package imports, and so registers, all of them."""
+"""The claims, a few per file. Importing this package imports, and so registers, all of them."""
 
 import importlib
 import pkgutil

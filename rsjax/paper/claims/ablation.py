@@ -2,7 +2,8 @@
 
 from rsjax.paper.claim import Arm, Claim, pairs, register
 
-# The paper does not say which LPIPS; its depth errors are of an estimator, as the model without depth has them too.
+# The paper does not say which LPIPS it uses. Its depth errors must be an estimator's, since the model without depth has
+# them too.
 _DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
 _COLUMNS = ("lpips_alex", "psnr", *_DEPTH, "delta_psnr")
 

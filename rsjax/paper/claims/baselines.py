@@ -12,7 +12,7 @@ from rsjax.paper.measurements import Scores, measurement
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load
 
-# Of Table 1; its depth errors are an estimator's, as models without depth have them too.
+# The columns of Table 1. Its depth errors must be an estimator's, since models without depth have them too.
 _DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
 _COLUMNS = ("lpips_alex", "psnr", *_DEPTH, "delta_psnr")
 _TABLE_1 = {
@@ -36,7 +36,7 @@ FRAME = "seconds a frame"
 
 @measurement(FRAME, lambda config: 20.0)
 def speed(run: Run) -> Scores:
-    """Times the generation of a frame of a clip alone, from pixels to pixels."""
+    """Measures the time per generated frame of a single clip, from pixels to pixels."""
     trained, clip = load(run.directory), run.open_clips().source("test")[0]
     first = run.config.prompt_frames
     prompt = Video(clip["rgb"][None, :first], None if clip["depth"] is None else clip["depth"][None, :first])
@@ -48,7 +48,7 @@ def speed(run: Run) -> Scores:
 def _arms(
     columns: tuple[str, ...], table: Mapping[str, tuple[float, ...]], equal: Literal["seconds", "flops"] = "seconds"
 ) -> tuple[Arm, ...]:
-    """Returns the arms of all families, for equal time or operations, with the numbers of a table of the paper."""
+    """Returns the arms of all families, for equal time or operations, with the numbers of one of the paper's tables."""
     published = {name: dict(zip(columns, numbers, strict=False)) for name, numbers in table.items()}
     return (
         Arm("RoboScape", published=published["RoboScape"]),
@@ -66,7 +66,7 @@ def _against_all(*metrics: str) -> tuple[Comparison, ...]:
         comparison
         for name in ("Genie", "iVideoGPT", "IRASim", "CogVideoX")
         for comparison in pairs("RoboScape", name, *metrics)
-        if (name, comparison.metric) != ("CogVideoX", "delta_psnr")  # it has no actions
+        if (name, comparison.metric) != ("CogVideoX", "delta_psnr")  # CogVideoX has no actions
     )
 
 

@@ -1,4 +1,4 @@
-"""Choices of ours that depart from the paper or the public code, each against the letter."""
+"""Our choices that depart from the paper or the public code, each compared with what these say."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ _METRICS = ("psnr", "delta_psnr")
 
 
 def _departure(name: str, title: str, statement: str, letter: dict[str, Any], metrics: tuple[str, ...]) -> None:
-    """Registers the claim that our choice is better than the fields of ``letter``."""
+    """Registers the claim that our choice is better than ``letter``, the fields that follow the paper or its code."""
     register(
         Claim(
             name=f"departure-{name}",

@@ -1,4 +1,4 @@
-"""The authors' answers on scenes never seen and on long rollouts."""
+"""The authors' answers on unseen scenes and on long rollouts."""
 
 import shutil
 from dataclasses import replace
@@ -51,7 +51,7 @@ def _register_unseen(split: str, name: str) -> None:
 
     @measurement(name, seconds)
     def unseen(run: Run) -> Scores:
-        """Scores clips of the simulator that differ from all of training."""
+        """Scores simulated clips whose task, camera or colours do not occur in training."""
         config = run.config
         if split not in unseen_splits(config.sim):
             raise Unavailable(f"{config.sim.env} has one task; the preset multitask holds tasks out")

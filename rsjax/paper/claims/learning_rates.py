@@ -1,4 +1,4 @@
-"""Equally many trials of the learning rate for every family of Table 1."""
+"""The same number of learning rates tried for every family of Table 1."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ _FACTORS = {"0.3 × the rate": 0.3, "3 × the rate": 3.0}
 
 
 def _trials(arm: Arm) -> tuple[Arm, ...]:
-    """Returns an arm of Table 1, and the same with other learning rates of the world model."""
+    """Returns an arm of Table 1, and copies of it with other learning rates of the world model."""
     arm = replace(arm, published={})
     return (arm, *(replace(arm, name=f"{arm.name}, {what}", rate=factor) for what, factor in _FACTORS.items()))
 

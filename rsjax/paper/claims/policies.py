@@ -1,4 +1,4 @@
-"""What the world model is for: learning from its videos, judging policies in it, improving them, and planning."""
+"""The uses of the world model: policies learn from its videos, are judged and improved in it, and plan with it."""
 
 import math
 from collections.abc import Callable
@@ -27,20 +27,21 @@ from rsjax.policies.training import train_policy
 from rsjax.policies.trials import Trials, lift_simulators
 from rsjax.progress import Progress
 
-STRONG = 0.9  # correlation with success in the simulator that is asked for
-# Seconds on 2 cores; a decision is one of 96 sequences.
+STRONG = 0.9  # correlation with success in the simulator that counts as strong
+# Seconds on 2 cores; a decision considers 96 sequences.
 POLICY_STEP, JUDGE_STEP, EPISODE, DECISION = 0.31, 0.12, 1.7, 6.5
-CONTINUED = {"ivideogpt": 2.3, "irasim": 24.0}  # of an imagined episode, where each frame is one of a video of its own
+# Seconds per imagined episode in addition to EPISODE, for families that generate a whole video for each frame.
+CONTINUED = {"ivideogpt": 2.3, "irasim": 24.0}
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large the experiments are for a cell: for all cells of a budget the same share of the whole.
+    """The sizes of a cell's experiments: the same share of the full sizes for all cells of a budget.
 
     Attributes:
         policy: settings of every policy.
-        trials: episodes of every policy.
-        demos: demonstrations that are many; a quarter of them are few.
+        trials: trial episodes of every policy.
+        demos: the number of demonstrations that counts as many; a quarter of it counts as few.
         judge: training steps of the judge.
     """
 
@@ -51,7 +52,7 @@ class Size:
 
     @classmethod
     def of(cls, config: Config) -> "Size":
-        """Returns the sizes for a cell, by the share of the preset's clips that it is evaluated on."""
+        """Returns the sizes for a cell, in proportion to the share of the preset's clips that it is evaluated on."""
         share = config.eval.clips / presets.get(config.name).eval.clips
         steps, episodes, demos, judge = (max(4, round(share * whole)) for whole in (2000, 50, 200, 1000))
         policy = sized_policy("tiny" if config.clips.image_size >= 64 else "toy", steps)
@@ -59,17 +60,20 @@ class Size:
 
     @property
     def few(self) -> int:
-        """Demonstrations that are few."""
+        """The number of demonstrations that counts as few."""
         return self.demos // 4
 
 
 def _seconds(
     policies: float = 0, trials: float = 0, imagined: float = 0, decisions: float = 0
 ) -> Callable[[Config], float]:
-    """Returns an estimate of the seconds of so many trainings, tries of a policy and planned episodes' decisions.
+    """Returns a function that estimates the seconds of training the judge and of the given numbers of further work.
 
     Args:
-        imagined: tries in the world model, for what they take beyond the others.
+        policies: trainings of a policy.
+        trials: trials of a policy, each of ``Size.trials`` episodes.
+        imagined: trials in the world model, for their extra time over other trials.
+        decisions: planned decisions per trial episode.
     """
 
     def seconds(config: Config) -> float:
@@ -101,13 +105,13 @@ def _judged(run: Run, size: Size) -> RunData:
 
 
 def _place(run: Run, size: Size) -> Path:
-    """Returns the folder of what all cells on the same clips share: policies from real clips, and their trials."""
+    """Returns the folder that all cells on the same clips share: policies from real clips, and their trials."""
     return run.data_directory / f"policies-{content_key(run.keys()['collect'], size)}"
 
 
 @measurement("policies judged", _seconds(policies=1 / 6, trials=8 * 1.5, imagined=8))
 def judged(run: Run) -> Scores:
-    """Rolls eight stages of a policy's training out in the simulator and in the run's world model."""
+    """Rolls out eight checkpoints of a policy in the simulator and in the run's world model."""
     size = Size.of(run.config)
     data, place = _judged(run, size), _place(run, size)
     with making(place, wait=True), lift_simulators(data.simulator, size.trials) as simulator:
@@ -124,9 +128,9 @@ def judged(run: Run) -> Scores:
     }
 
 
-@measurement("policies learned", _seconds(policies=8, trials=6))  # two of the six train for twice the steps
+@measurement("policies learned", _seconds(policies=8, trials=6))  # two of the six policies train for twice the steps
 def learned(run: Run) -> Scores:
-    """Trains policies on few and many demonstrations, synthetic, real and both together, and tries them."""
+    """Trains policies on few and on many demonstrations, synthetic, real and both together, and runs their trials."""
     size = Size.of(run.config)
     data, place, own = _judged(run, size), _place(run, size), run.directory / FOLDER / "policies"
     real = data.demos()
