@@ -1,1 +1,1 @@
-"""Clips on disk and on their way into training: the ArrayRecord store and the Grain loader."""
+"""Stores clips on disk and loads them for training: the ArrayRecord store and the Grain loader."""

@@ -1,4 +1,4 @@
-"""Makes a store out of clips in memory: for data that no reader of :mod:`rsjax.ingest` knows.
+"""Makes a store from clips in memory, for data that no reader of :mod:`rsjax.ingest` knows.
 
 Axes: T frames, S×S pixels, A action dimensions, N₀ tracks.
 """
@@ -23,14 +23,14 @@ from rsjax.data.store import MANIFEST, WRITER_OPTIONS, Source, Store, StoreError
 from rsjax.errors import did_you_mean
 from rsjax.files import disk_guard, making
 
-TRACKS = 256  # of clips without tracks
+TRACKS = 256  # number of empty tracks of a clip without tracks
 _LABELS = ("difficulty", "scene", "segment", "skill")
 _FIELDS = (*(field.name for field in dataclasses.fields(Clip)), "episode", "fps", *_LABELS)
 
 
 @dataclasses.dataclass
 class _Episode:
-    """What the manifest says of the clips of one episode."""
+    """What the manifest records about the clips of one episode."""
 
     numbers: list[int] = dataclasses.field(default_factory=list)
     statistics: Statistics | None = None
@@ -64,7 +64,7 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
             scored |= "success" in given
             payload = encode(record)
             digest.update(payload)
-            with disk_guard(path):  # what reading the clips raises is the caller's
+            with disk_guard(path):  # errors from reading the clips stay the caller's
                 writer.write(payload)
             count += 1
         with disk_guard(path):
@@ -78,7 +78,7 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
 
 
 def choose_test(names: Collection[str], share: float) -> set[str]:
-    """Returns which of the names are test, by a hash of them; each split gets one at least of two or more."""
+    """Chooses the names of the test split by a hash of each; of two or more names, each split gets at least one."""
     ranked = sorted(names, key=lambda name: hashlib.sha256(name.encode("utf-8", "surrogatepass")).digest())
     return set(ranked[: min(len(ranked) - 1, max(1, round(share * len(ranked)))) if share > 0 else 0])
 
@@ -118,7 +118,7 @@ def _labels(record: Record) -> dict[str, str]:
 
 
 def _note(episode: _Episode, record: Record, number: int) -> None:
-    """Adds a clip to what is known of its episode."""
+    """Adds a clip to the record of its episode."""
     rows = Statistics.of(record["actions"][1:])
     episode.statistics = episode.statistics.merged(rows) if episode.statistics else rows
     episode.numbers.append(number)
@@ -129,7 +129,7 @@ def _note(episode: _Episode, record: Record, number: int) -> None:
 
 
 def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
-    """Returns a clip as the store has it; :class:`StoreError` names a field that is missing or wrong."""
+    """Returns a clip as a record of the store; :class:`StoreError` names a field that is missing or wrong."""
     for name in clip:
         if name not in _FIELDS:
             raise StoreError(f"{where}: no field {name!r}{did_you_mean(name, _FIELDS)}; it has {', '.join(_FIELDS)}")
@@ -221,7 +221,7 @@ def _array(
 
 
 def _check_alike(shapes: dict[str, tuple[int, ...]], first: dict[str, tuple[int, ...]], where: str) -> None:
-    """Checks that a clip's arrays have the shapes of the first clip's, which are noted."""
+    """Checks that a clip's arrays have the first clip's shapes, which ``first`` collects."""
     for name, shape in shapes.items():
         if first.setdefault(name, shape) != shape:
             hint = f"; without tracks a clip gets {TRACKS} that are never visible" if name == "tracks" else ""

@@ -1,4 +1,4 @@
-"""Clips of a split, stacked, for what looks at whole clips: evaluation, pictures, videos.
+"""Stacks whole clips of a split, for evaluation, figures and videos.
 
 Axes: B clips, T frames, H×W pixels, A action dimensions, N₀ tracks.
 """
@@ -18,13 +18,13 @@ from rsjax.progress import note
 
 @dataclass(frozen=True)
 class Clips:
-    """Fields of :class:`rsjax.clip.Clip` with a leading axis.
+    """The fields of :class:`rsjax.clip.Clip` for several clips, along a leading axis.
 
     Attributes:
-        index: each one's number in the split.
-        depth: zeros for clips that have none.
-        has_depth: which have depth.
-        metric: which have depth in metres, and not relative (see :mod:`rsjax.ingest.annotators.depth`).
+        index: each clip's number in the split.
+        depth: zeros for clips without depth.
+        has_depth: whether a clip has depth.
+        metric: whether a clip's depth is in metres rather than relative (see :mod:`rsjax.ingest.annotators.depth`).
     """
 
     index: Int[np.ndarray, " B"]
@@ -40,7 +40,7 @@ class Clips:
 
     @classmethod
     def stacked(cls, records: Sequence[Record], index: Sequence[int]) -> "Clips":
-        """Records of clips, all of one shape, with their numbers."""
+        """Stacks records of clips, all of one shape; ``index`` has their numbers."""
         fields = {
             name: np.stack([record[name] for record in records])
             for name in ("rgb", "actions", "tracks", "visible", "success")
@@ -71,7 +71,7 @@ class Clips:
 
     @property
     def metric_video(self) -> Video:
-        """Frames and depth in metres; NaN in clips without."""
+        """Frames and depth in metres; NaN in clips without metric depth."""
         return self._video(self.metric)
 
     def _video(self, has_depth: Bool[np.ndarray, " B"]) -> Video:
@@ -80,7 +80,7 @@ class Clips:
 
 
 def spread(source: Sized, count: int) -> list[int]:
-    """The numbers of ``count`` records spread evenly over a split: neighbours may be windows of one episode."""
+    """Returns the numbers of ``count`` records spread evenly over a split, since neighbours may be of one episode."""
     return np.unique(np.linspace(0, len(source) - 1, min(count, len(source))).round().astype(int)).tolist()
 
 
@@ -88,7 +88,7 @@ def first_clip(store: Store) -> Record:
     """Returns the first readable record of a store's train split.
 
     Raises:
-        StoreError: none can be read.
+        StoreError: no record can be read.
     """
     for _, record in readable(store.source("train"), tell=lambda _: None):
         return record
@@ -98,10 +98,11 @@ def first_clip(store: Store) -> Record:
 def readable(
     source: RecordSource, numbers: Iterable[int] | None = None, tell: Callable[[str], None] = note
 ) -> Iterator[tuple[int, Record]]:
-    """The records of a split that can be read, with their numbers; the others are told. Training need not end here.
+    """Yields the readable records of a split with their numbers, and reports the others, so that work continues.
 
     Args:
-        numbers: those that are wanted; all if None.
+        numbers: numbers of the records to read; all if None.
+        tell: called with a message about each record that cannot be read.
     """
     for number in range(len(source)) if numbers is None else numbers:
         try:
@@ -113,10 +114,10 @@ def readable(
 
 
 def load_clips(store: Store, count: int) -> Clips:
-    """``count`` clips spread over the test split, without those of them that cannot be read.
+    """Loads ``count`` clips spread over the test split, except those that cannot be read.
 
     Raises:
-        StoreError: none can be read.
+        StoreError: no clip can be read.
     """
     source = store.source("test")
     found = list(readable(source, spread(source, count)))
@@ -126,10 +127,10 @@ def load_clips(store: Store, count: int) -> Clips:
 
 
 def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
-    """Returns the frames per second of a store's clips, by one of them; None where nothing says it.
+    """Returns the frames per second of a store's clips, from one of them; None if it is unknown.
 
     Args:
-        manifest: the store's; of simulated clips it has the control steps between two frames.
+        manifest: the store's manifest; for simulated clips it has the control steps between two frames.
     """
     origin = clip["provenance"]
     frames, fps, control = origin.get("frames", ()), origin.get("fps"), origin.get("control_hz")
@@ -140,5 +141,5 @@ def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
 
 
 def keeps_rate(clip: Record, manifest: Mapping[str, Any], fps: float) -> bool:
-    """Returns whether a clip has so many frames per second, give or take two frames: windows round to recorded ones."""
+    """Returns whether a clip has ``fps``, up to two frames in its length: windows round to recorded frames."""
     return abs((frame_rate(clip, manifest) or 0.0) - fps) * (len(clip["rgb"]) - 1) <= 2 * fps

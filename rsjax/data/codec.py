@@ -1,4 +1,4 @@
-"""Records (dicts of arrays and JSON-ready values) as bytes: a checksum, then msgpack. Never pickle."""
+"""Encodes records (dicts of arrays and JSON-ready values) as bytes: a checksum, then msgpack, never pickle."""
 
 import zlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""Curricula: which records a training loop reads, in which stages, resolved from the config against stores."""
+"""Resolves curricula: which records of which stores a training loop reads, in which stages."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ EVERYTHING = CurriculumStageConfig()
 
 @dataclass(frozen=True)
 class LoaderFactory:
-    """Makes the loaders of a training loop: ``factory(state)`` resumes from a loader's state, None begins.
+    """Makes the loaders of a training loop: ``factory(state)`` resumes from a loader's state, or begins if it is None.
 
     Attributes:
         loop: the loop, with ``steps`` and ``restarts`` of its stages.
@@ -39,12 +39,12 @@ class LoaderFactory:
         return Loader(self.stages, loop.batch_size, loop.seed, listed, workers=loop.workers, state=state)
 
     def replay(self, state: dict[str, Any]) -> Arrays:
-        """Returns the whole batch, over all processes, that a loader in this state gives next."""
+        """Returns the next batch of a loader in this state, with the rows of all processes."""
         with self(None).whole(state) as loader:
             return next(loader)
 
     def summary(self) -> list[str]:
-        """Returns a line for each stage of the config: how many clips it reads, in which steps."""
+        """Returns a line for each stage of the config, with its number of clips and its steps."""
         lines, first = [], 0
         for config, stage in zip(self.loop.curriculum, self.stages, strict=False):
             last = first + stage.records // self.loop.batch_size
@@ -62,15 +62,15 @@ def plan(
     Args:
         loop: the loop; without ``stages`` it reads all of ``own`` for ``loop.steps`` steps.
         own: the store that components read unless they name another.
-        transform: returns the transform of a store's records; all have to give arrays of the same shapes.
-        directory: for the list of damaged records.
+        transform: returns the transform of a store's records; all must give arrays of the same shapes.
+        directory: where the list of damaged records is.
 
     Returns:
         The loop with ``steps`` (of each stage, rounded up to whole batches) and ``restarts`` set, and the factory of
         its loaders.
 
     Raises:
-        StoreError: a component's store cannot be read or does not go with ``own``, or nothing passes its patterns.
+        StoreError: a component's store cannot be read or mixed with ``own``, or no record passes its patterns.
     """
     resolved = [_resolve(stage, loop.batch_size, own, transform) for stage in loop.curriculum or (EVERYTHING,)]
     if loop.curriculum:
@@ -84,13 +84,13 @@ def plan(
 
 
 def check_stages(loop: LoopConfig, own: Store) -> list[Store]:
-    """Checks early that the stages' stores exist and, where they are labelled, that some record passes the patterns.
+    """Checks early that the stages' stores exist and, if they are labelled, that some record passes the patterns.
 
     Returns:
-        These stores, the first of which is ``own``.
+        These stores, ``own`` first.
 
     Raises:
-        StoreError: as :func:`plan`.
+        StoreError: as from :func:`plan`.
     """
     others = []
     for part in (part for stage in loop.curriculum for part in stage.components):
@@ -102,10 +102,10 @@ def check_stages(loop: LoopConfig, own: Store) -> list[Store]:
 
 
 def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
-    """Returns the numbers of the records that pass a component's patterns, the first ``part.clips``; None if all do.
+    """Returns the numbers of the first ``part.clips`` records that pass a component's patterns; None for all records.
 
     Raises:
-        StoreError: none passes; the message lists the store's tasks and difficulties.
+        StoreError: no record passes; the message lists the store's words in the columns of the patterns.
     """
     patterns = {"difficulty": part.difficulties, "task": part.tasks, "scene": part.scenes}
     patterns = {name: allowed for name, allowed in patterns.items() if "*" not in allowed}
@@ -144,13 +144,13 @@ def _resolve(
             _check_mixable(store, component, own, MixtureComponent(own.source(SPLIT), transform(own)))
         components.append(component)
     drawn = stage.epochs * sum(map(len, components))
-    # Epochs such as 0.1 are not exact in binary: a hair above a whole number of batches is that number.
+    # Epochs such as 0.1 are not exact in binary, so a value just above a whole number of batches counts as that number.
     batches = max(1, math.ceil(drawn / batch_size - 1e-6))
     return CurriculumStage(tuple(components), batches * batch_size)
 
 
 def _check_mixable(store: Store, component: MixtureComponent, own: Store, own_component: MixtureComponent) -> None:
-    """Raises :class:`StoreError` where batches cannot hold records of both stores."""
+    """Raises :class:`StoreError` if batches cannot contain records of both stores."""
     theirs, ours = ({name: one.manifest.get(name) for name in ("kind", "tokenizer")} for one in (store, own))
     _require_alike(store, own, theirs, ours, needs="records of one kind, made with the same tokenizer")
     _require_alike(store, own, _shapes(component), _shapes(own_component), needs="clips of one length and size")

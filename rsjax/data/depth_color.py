@@ -1,9 +1,9 @@
 """A reversible colour map for depth, so that the RGB tokenizer can read it.
 
-The paper tokenizes depth maps with MAGVIT-2 but does not publish its colour map. Ours walks
-black → red → yellow → white: each third of the range raises one channel, so the position along the walk *is* the mean
-of the three channels. Inverting is linear, a blurred edge decodes to a depth between its two sides (a rainbow map
-would give one from elsewhere), and 8-bit colours keep 766 levels.
+The paper tokenizes depth maps with MAGVIT-2 but does not publish its colour map. Ours goes black → red → yellow →
+white: each third of the range raises one channel, so the position along this path is the mean of the three channels.
+The inverse is linear, a blurred edge decodes to a depth between its two sides (with a rainbow map it could be any
+depth), and 8-bit colours keep 766 levels.
 """
 
 from typing import Any, Literal
@@ -20,7 +20,7 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
     """Returns depth as colours 0–255 (float32, whole numbers); depth outside [near, far] is clipped to it.
 
     Args:
-        depth: depth in metres; 0, where there is none, becomes black; numpy or JAX, and the colours likewise.
+        depth: depth in metres, numpy or JAX (so are the colours); 0, which means no depth, becomes black.
         near: depth that becomes white.
         far: depth that becomes black.
         scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.

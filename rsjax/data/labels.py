@@ -1,4 +1,4 @@
-"""Labels of the records of a split, kept beside them, so that records are chosen by label without being read.
+"""Labels of the records of a split, in a file of their own, so that records can be chosen by label without being read.
 
 A label is a word in a column, such as ``simple`` in ``difficulty``. Columns are stored as int32 codes of their words.
 """
@@ -23,14 +23,14 @@ Label = Callable[[Record], Words]  # the columns are always the same
 
 
 class LabelWriter:
-    """Collects the labels of records that pass by, in order, and writes them to one file."""
+    """Collects the labels of records as they are written, in order, and writes them to one file."""
 
     def __init__(self) -> None:
         self._words: dict[str, dict[str, int]] = {}
         self._codes: dict[str, array[int]] = {}
 
     def noting(self, records: Iterable[Record], label: Label) -> Iterator[Record]:
-        """Yields the same records and notes the labels of each."""
+        """Yields the same records and collects the labels of each."""
         for record in records:
             for name, word in label(record).items():
                 words = self._words.setdefault(name, {})
@@ -53,7 +53,7 @@ class Labels:
 
     Attributes:
         words: the words of each column, in the order of their first use.
-        codes: the place of each record's word among its column's words, (N,).
+        codes: the index of each record's word among its column's words, (N,).
     """
 
     words: dict[str, list[str]]
@@ -65,7 +65,7 @@ class Labels:
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is damaged.
+            ValueError: the file is damaged.
         """
         payload = regular(path).read_bytes()
         if zlib.crc32(payload) != entry["crc32"]:
@@ -80,7 +80,7 @@ class Labels:
         return {name: words[self.codes[name][number]] for name, words in self.words.items()}
 
     def matching(self, patterns: Mapping[str, tuple[str, ...]]) -> Bool[np.ndarray, " N"]:
-        """Returns which records match: in each column named, one of its shell patterns matches the record's word."""
+        """Returns which records match: in each named column, one of the shell patterns matches the record's word."""
         passes = np.ones(len(next(iter(self.codes.values()))), bool)
         for name, allowed in patterns.items():
             chosen = [any(fnmatch.fnmatchcase(word, pattern) for pattern in allowed) for word in self.words[name]]
@@ -88,7 +88,7 @@ class Labels:
         return passes
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Returns the number of records of each word of each column."""
+        """Returns the number of records with each word of each column."""
         return {
             name: dict(zip(words, np.bincount(self.codes[name], minlength=len(words)).tolist(), strict=True))
             for name, words in self.words.items()

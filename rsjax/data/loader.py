@@ -1,7 +1,7 @@
-"""Batches of records, read with Grain in an endless seeded order that resumes exactly.
+"""Reads batches of records with Grain, in an endless seeded order that resumes exactly.
 
 A batch has the transform's arrays, stacked, and three more of shape (batch,): ``part`` int32 and ``record`` int64, by
-which :meth:`Loader.identify` names its clips, and ``index`` int32, the place in the batch over all processes of a
+which :meth:`Loader.identify` finds its clips, and ``index`` int32, the place in the batch over all processes of a
 multi-host run.
 """
 
@@ -24,7 +24,7 @@ from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Transfor
 from rsjax.data.quarantine import MAX_DAMAGED, Quarantine
 from rsjax.data.store import RecordSource, StoreError
 
-MAX_RESTARTS = 3  # in a row, of worker processes that die before they give a batch
+MAX_RESTARTS = 3  # in a row, after worker processes that die before they give a batch
 PLACE = "global_next_index"  # the key in the state of Grain's ElasticIterator
 
 _log = logging.getLogger(__name__)
@@ -33,21 +33,21 @@ _log = logging.getLogger(__name__)
 class Loader:
     """An endless iterator over the batches of a curriculum. Close it, or use it as a context manager.
 
-    The order of the batches is the same for any number of processes and workers; batches cross the borders of epochs.
-    Grain's ``ElasticIterator`` cuts and batches alike, but takes no function that its workers run at their start.
+    The order of the batches is the same for any number of processes and workers; a batch may span two epochs.
+    Grain's ``ElasticIterator`` shards and batches in the same way, but it cannot run a function in starting workers.
 
     Args:
-        stages: stages of the curriculum, one after another; the last one goes on for ever.
+        stages: stages of the curriculum, one after another; the last stage is endless.
         batch_size: records per batch, over all processes of a multi-host run.
         seed: seed of the order and of the transforms' generators.
         quarantine: the list of damaged records, which are replaced as in :class:`rsjax.data.order.Readable`.
-        workers: processes that read and transform; 0: threads of this one.
+        workers: processes that read and transform; 0: threads of this process.
         state: :meth:`state` of an earlier loader.
-        shard: the share of each batch that this process gets; None: by its place among jax's processes.
+        shard: the share of each batch that this process gets; None: by its index among jax's processes.
 
     Raises:
         StoreError: a component has no records.
-        ConfigError: the batch does not divide over the processes.
+        ConfigError: the batch size is not a multiple of the number of processes.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Loader:
                 arrays = next(self._iterator)
                 self._restarts = 0
                 return arrays
-            except RuntimeError as error:  # of Grain: a worker was killed, mostly for lack of memory
+            except RuntimeError as error:  # from Grain: a worker was killed, usually for lack of memory
                 if not self._workers or "terminated unexpectedly" not in str(error):
                     raise
                 self.close()
@@ -108,7 +108,7 @@ class Loader:
         shard = self._shard
         cut = self._dataset[self._place + shard.shard_index :: shard.shard_count]
         cut = cut.batch(self._batch_size // shard.shard_count, drop_remainder=True)
-        cut = cut.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))  # in batches
+        cut = cut.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=4))  # the buffer counts batches
         if not self._workers:
             return cut
         absl.flags.FLAGS.mark_as_parsed()  # Grain's workers refuse to start otherwise
@@ -125,10 +125,10 @@ class Loader:
         return {PLACE: self._place}
 
     def identify(self, arrays: Arrays) -> list[dict[str, Any]]:
-        """Returns where the records of a batch lie and come from, JSON-ready, one object a row.
+        """Returns where the records of a batch are and where they come from, one JSON-ready object per row.
 
-        ``store``, ``split``, ``record`` and ``file`` say where it lies (``record`` alone if the source is no store's);
-        ``task`` and ``provenance`` are the record's own, where it has them and can still be read.
+        ``store``, ``split``, ``record`` and ``file`` say where a record is (only ``record`` if its source is no
+        store's); ``task`` and ``provenance`` are the record's own, if it has them and can still be read.
         """
         rows = []
         for part, number in zip(arrays["part"], arrays["record"], strict=True):
@@ -140,7 +140,7 @@ class Loader:
         return rows
 
     def whole(self, state: dict[str, Any]) -> "Loader":
-        """Returns a loader from this state on that reads the rows of all processes alone, to look at a batch again."""
+        """Returns a loader that starts at this state and reads the rows of all processes, to look at a batch again."""
         shard = grain.sharding.NoSharding()
         return Loader(self._stages, self._batch_size, self._seed, self._quarantine, state=state, shard=shard)
 
@@ -150,11 +150,11 @@ class Loader:
         return self._shard.shard_count > 1
 
     def quarantined(self) -> int:
-        """Returns how many records are known to be damaged, to all processes and in earlier runs of this stage."""
+        """Returns how many damaged records all processes have found, also in earlier runs of this stage."""
         return self._quarantine.count()
 
     def close(self) -> None:
-        """Stops the worker processes; the next batch starts others."""
+        """Stops the worker processes; the next batch starts new ones."""
         if self._iterator is not None:
             self._iterator.close()
             self._iterator = None
@@ -170,11 +170,11 @@ def batches(
     max_damaged: float = MAX_DAMAGED,
     **options: Any,
 ) -> Loader:
-    """Returns a loader of one source without stages, which shuffles every epoch anew.
+    """Returns a loader of one source, without stages, which shuffles anew in every epoch.
 
     Args:
         transform: record → arrays, see :mod:`rsjax.data.order`.
-        quarantine: the file that lists damaged records; None: none is written.
+        quarantine: the file that lists damaged records; None: no file is written.
         max_damaged: share of the records that may be damaged.
         options: ``workers``, ``state`` and ``shard`` of :class:`Loader`.
     """
@@ -183,7 +183,7 @@ def batches(
 
 
 def _start_worker(index: int, count: int) -> None:
-    """Prepares a worker process: it leaves signals to its parent and does not outlive it."""
+    """Prepares a worker process, which leaves signals to its parent and does not outlive the parent."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()

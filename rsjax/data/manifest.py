@@ -1,4 +1,4 @@
-"""Checks of a store's manifest, which may come from elsewhere, before any file that it names is touched."""
+"""Checks a store's manifest, which may come from elsewhere, before any file that it names is opened."""
 
 from pathlib import PurePosixPath
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 FORMAT = 1
 MOST = 2**50  # bytes or records
 NUMBER = (int, float)
-# Fields that may be missing or null, and of lists and objects the types of the values in them.
+# The types of fields that may be missing or null, and, for lists and objects, the types of their values.
 OPTIONAL: dict[str, tuple[tuple[type, ...], tuple[type, ...]]] = {
     "kind": ((str,), ()),
     "key": ((str,), ()),
@@ -27,14 +27,14 @@ OPTIONAL: dict[str, tuple[tuple[type, ...], tuple[type, ...]]] = {
 
 
 class ManifestError(Exception):
-    """A manifest is wrong. The message names the field, without the file and the cure."""
+    """Says what is wrong with a manifest. The message names the field, but neither the file nor the cure."""
 
 
 def check_manifest(manifest: dict[str, Any]) -> None:
     """Checks that a manifest has the fields that a store needs and names nothing outside its directory.
 
     Raises:
-        ManifestError: it lacks a field, has one of another type, or names something elsewhere.
+        ManifestError: a field is missing, has the wrong type, or names something outside the directory.
     """
     _require("format", "format" in manifest)
     if manifest["format"] != FORMAT:
@@ -76,7 +76,7 @@ def _check_file(field: str, file: Any, numbers: tuple[str, ...]) -> None:
 
 
 def _is_plain(name: Any) -> bool:
-    """Returns whether this is the name of a file, without a folder."""
+    """Returns whether this is a file name without a folder."""
     named = isinstance(name, str) and name not in ("", ".", "..") and PurePosixPath(name).name == name
     return named and not {"\\", "\0"} & set(name)
 

@@ -1,8 +1,8 @@
-"""Merging stores into one and splitting one into several. Records are copied one at a time.
+"""Merges stores into one, and splits a store into several. Records are copied one at a time.
 
 Training can mix stores as it reads (:mod:`rsjax.data.curriculum`). A merged store is for everything else: one set of
-statistics, one validation split, one place to inspect, evaluate and send elsewhere. Its directory can be moved, as its
-manifest names its files without their place.
+statistics, one validation split, one directory to inspect, evaluate or send elsewhere. The directory can be moved,
+because its manifest names files by relative paths.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,21 +20,21 @@ from rsjax.files import making, safe_id
 
 UNITS = ("action_mean", "action_std", "depth_range")  # fields of a manifest that normalization reads
 LEFT_OUT = ("filtered", "quarantine")  # fields with a reason for each episode that was left out
-OF_WHOLE = ("format", "splits", "key", "counts", "episodes", "success_share")  # fields that are not true of a part
+OF_WHOLE = ("format", "splits", "key", "counts", "episodes", "success_share")  # fields that do not hold for a part
 
-Numbers = dict[str, list[int]]  # of chosen records, by split
+Numbers = dict[str, list[int]]  # numbers of the chosen records, by split
 
 
 def merge(paths: Sequence[Path], out: Path) -> Store:
     """Writes all records of several stores into one, split by split, in the order of the stores.
 
-    Statistics of actions and depth ranges that differ become those of all train records together; depth ranges in the
-    records' provenance change with them. Token sets that all the stores have are merged too, unless depth ranges
-    differ, on which depth tokens depend.
+    If the stores differ in action statistics or depth ranges, the new store has those of all train records together,
+    also in the provenance of its records. Token sets that all stores have are merged too, unless depth ranges differ,
+    because depth tokens depend on them.
 
     Raises:
-        StoreError: fewer than two stores, one of them twice, stores of other kinds or shapes, tokens of another
-            tokenizer or depth range, or ``out`` exists or lies in one of them.
+        StoreError: there are fewer than two stores, a store is named twice, the stores differ in kind, shapes, or (for
+            tokens) tokenizer or depth range, or ``out`` exists or is inside one of them.
         FileError: ``out`` cannot be written, or another process is making it.
     """
     if len(paths) < 2:
@@ -54,13 +54,14 @@ def merge(paths: Sequence[Path], out: Path) -> Store:
 def split(path: Path, parts: Mapping[Path, Numbers]) -> dict[Path, Store]:
     """Writes chosen records of a store into new stores.
 
-    They keep its statistics, so models trained on the whole can read the parts. Its token sets are split with it.
+    The new stores keep its statistics, so that models trained on the whole can read the parts. Its token sets are
+    split too.
 
     Args:
         parts: the records of each new store, from :func:`by_label` or :func:`into_parts`.
 
     Raises:
-        StoreError: no record is chosen for a new store, or its place is taken or lies in the old one.
+        StoreError: no record is chosen for a new store, or the new store's path exists or is inside the old store.
         FileError: a new store cannot be written, or another process is making it.
     """
     store = open_store(path)
@@ -79,7 +80,7 @@ def split(path: Path, parts: Mapping[Path, Numbers]) -> dict[Path, Store]:
 
 
 def by_label(path: Path, column: str, folder: Path) -> dict[Path, Numbers]:
-    """Returns, for :func:`split`, a store in ``folder`` for each word of a column, such as ``difficulty``.
+    """Returns parts for :func:`split`: a store in ``folder`` for each word of a column, such as ``difficulty``.
 
     Raises:
         StoreError: the store has no such labels.
@@ -99,7 +100,7 @@ def by_label(path: Path, column: str, folder: Path) -> dict[Path, Numbers]:
 
 
 def into_parts(path: Path, count: int, folder: Path) -> dict[Path, Numbers]:
-    """Returns, for :func:`split`, ``count`` stores in ``folder`` whose numbers of records differ by one at most."""
+    """Returns parts for :func:`split`: ``count`` stores in ``folder``, whose sizes differ by at most one record."""
     sizes = open_store(path).counts()
     return {
         folder / f"part-{part:03d}": {name: list(range(part, size, count)) for name, size in sizes.items()}
@@ -108,7 +109,7 @@ def into_parts(path: Path, count: int, folder: Path) -> dict[Path, Numbers]:
 
 
 class _Copy(dict[str, Any]):
-    """A record with the labels that it has in the store from which it is copied."""
+    """A record with its labels in the store that it is copied from."""
 
     words: Words
 
@@ -119,7 +120,7 @@ _words = attrgetter("words")  # the label of a copy
 def _copies(
     parts: Iterable[tuple[Store, str, Iterable[int]]], labelled: bool, changes: dict[str, Any]
 ) -> Iterator[_Copy]:
-    """Yields the records of (store, split, numbers), with changes of their provenance."""
+    """Yields the records of (store, split, numbers), with changes to their provenance."""
     for store, name, numbers in parts:
         source = store.source(name)
         labels = store.labels(name) if labelled and len(source) else None
@@ -175,7 +176,7 @@ def _labelled(stores: Sequence[Store]) -> bool:
 
 
 def _left_out(stores: Sequence[Store], name: str) -> dict[str, str]:
-    """Returns the reasons of all stores by episode; an episode that two stores have is named with the later store."""
+    """Returns the reasons in all stores, by episode; an episode that was named before also gets the store's path."""
     reasons: dict[str, str] = {}
     for store in stores:
         for episode, why in (store.manifest.get(name) or {}).items():
@@ -238,7 +239,7 @@ def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
 
 
 def _check_free(out: Path, stores: Sequence[Store]) -> None:
-    """Raises :class:`StoreError` if something is at ``out``, or ``out`` lies in a store that is read."""
+    """Raises :class:`StoreError` if ``out`` exists or is inside a store that is read."""
     if out.exists():
         raise StoreError(f"{out}: is there already; choose another place, or delete it")
     for store in stores:

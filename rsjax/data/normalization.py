@@ -1,4 +1,4 @@
-"""Normalization of actions and depth, and the statistics that it comes from.
+"""Normalizes actions and depth, and computes the statistics for it.
 
 Axes: B clips, T frames, A action dimensions, N rows.
 """
@@ -26,7 +26,7 @@ class Normalization:
 
     Attributes:
         action_mean: mean of each action dimension over the training split, (A,).
-        action_std: standard deviation, likewise.
+        action_std: standard deviation of each action dimension over the training split, (A,).
         depth_range: near and far end of the depth colour map, metres; None if no clip has depth.
     """
 
@@ -39,7 +39,7 @@ class Normalization:
         """Reads the normalization of a store's manifest.
 
         Raises:
-            StoreError: the manifest has no statistics, or depth is the same everywhere, which no colour map shows.
+            StoreError: the manifest has no statistics, or depth is constant, so that no colour map can show it.
         """
         near_far = store.manifest.get("depth_range")
         if isinstance(near_far, list) and len(near_far) == 2 and near_far[0] == near_far[1]:
@@ -56,7 +56,7 @@ class Normalization:
         """Reads the normalization that a run was trained with.
 
         Raises:
-            UserError: the file is missing, because the run has not come so far, or damaged.
+            UserError: the file is damaged, or missing because the run has not reached this point.
         """
         path = run / FILE
         try:
@@ -82,17 +82,17 @@ class Normalization:
         """Returns the inputs of the action encoder: actions as :meth:`scaled`; row 0 is zero.
 
         Args:
-            actions: actions in the data's units; row t leads into frame t.
-            integrate: append a quarter of their sum over the frames so far; A2 is then 2 A, otherwise A.
+            actions: actions in the data's units; row t leads to frame t.
+            integrate: whether to append a quarter of the sum of actions so far; A2 is then 2 A, otherwise A.
         """
         scaled = self.scaled(actions)
         scaled[..., 0, :] = 0.0
         return with_sums(scaled, np.cumsum(scaled, axis=-2) if integrate else None)
 
     def scaled(self, actions: Float[np.ndarray, "*B A"]) -> Float64[np.ndarray, "*B A"]:
-        """Returns actions at zero mean and unit variance.
+        """Returns actions scaled to zero mean and unit variance.
 
-        So that a dimension that hardly varies is not blown up, its deviation counts as at least 0.001.
+        A standard deviation below 0.001 counts as 0.001, so that a dimension that hardly varies is not amplified.
         """
         return (actions - np.asarray(self.action_mean)) / np.maximum(self.action_std, 1e-3)
 
@@ -100,14 +100,14 @@ class Normalization:
 def with_sums(
     scaled: Float[np.ndarray, "*B A"], sums: Float[np.ndarray, "*B A"] | None
 ) -> Float32[np.ndarray, "*B A2"]:
-    """Returns the action encoder's inputs: scaled actions and, if given, a quarter of their sums over the frames."""
+    """Returns the action encoder's inputs: scaled actions and, if given, a quarter of their sums."""
     rows = scaled if sums is None else np.concatenate([scaled, sums / 4.0], axis=-1)
     return rows.astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of action rows, each (A,), that add up over parts of a data set without keeping the rows."""
+    """Statistics of action rows, each (A,), which can be merged over parts of a data set without keeping the rows."""
 
     count: int
     mean: Float64[np.ndarray, " A"]
@@ -117,7 +117,7 @@ class Statistics:
 
     @classmethod
     def of(cls, rows: Float[np.ndarray, "N A"]) -> "Statistics":
-        """Returns the statistics of at least one row. Leave out row 0 of a clip, into which nothing led."""
+        """Returns the statistics of at least one row. Leave out row 0 of a clip, which is not an action."""
         wide = rows.astype(np.float64)
         mean = wide.mean(0)
         return cls(len(wide), mean, ((wide - mean) ** 2).sum(0), wide.min(0), wide.max(0))

@@ -1,4 +1,4 @@
-"""Batches read and put onto the device by a thread, while the training step computes."""
+"""Reads batches and puts them onto the device in a thread, while the training step computes."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ class DeviceBatch(NamedTuple):
         batch: the input of the training step.
         clips: ``part`` and ``record`` of this process's rows, which :meth:`Prefetch.identify` reads.
         before: state of a loader whose next batch is this one.
-        after: state of a loader whose next batch is the one after this.
+        after: state of a loader whose next batch is the following one.
     """
 
     batch: Any
@@ -27,15 +27,15 @@ class DeviceBatch(NamedTuple):
 
 
 class Prefetch:
-    """An iterator over a loader's batches, which a thread of Grain's makes ahead and puts onto the device.
+    """An iterator over a loader's batches, which a thread of Grain makes in advance and puts onto the device.
 
-    An error of the loader or of ``put`` is raised by the call for the batch, and again by each later call. Close the
-    iterator, or use it as a context manager: that closes the loader too.
+    If the loader or ``put`` fails, the call for that batch raises the error, and so does each later call. Close the
+    iterator, or use it as a context manager; this closes the loader too.
 
     Args:
         loader: source of the batches; nothing else may read it from now on.
         put: turns a loader's arrays into the input of the training step, on the device.
-        ahead: most batches that wait on the device, beside the one that is being made.
+        ahead: how many finished batches wait on the device, at most.
 
     Attributes:
         waited: total seconds that calls for the next batch have taken.
@@ -60,13 +60,13 @@ class Prefetch:
         return item
 
     def state(self) -> dict[str, Any]:
-        """Returns the loader's state after the last batch that was handed out, however many were made ahead."""
+        """Returns the loader's state after the last batch that was handed out, however many were made in advance."""
         return self._state
 
     def identify(self, batch: DeviceBatch) -> list[dict[str, Any]]:
-        """Returns where the clips of a batch lie and come from, as :meth:`rsjax.data.loader.Loader.identify` does.
+        """Returns where the clips of a batch are and come from, as :meth:`rsjax.data.loader.Loader.identify` does.
 
-        If several processes share the batch, all its rows are named; for that, the batch is read once more.
+        If several processes share the batch, it is read once more to identify the rows of all processes.
         """
         if not self._loader.shared:
             return self._loader.identify(batch.clips)
@@ -87,15 +87,15 @@ class Prefetch:
         """Stops the thread and closes the loader."""
         if self._batches is not None:
             self._batches.close()
-            self._batches = None  # Grain's iterator prints an error where it lives until the interpreter exits
+            self._batches = None  # Grain's iterator prints an error if it still exists at the interpreter's exit
         self._loader.close()
 
 
 class _Batches:
     """A loader's batches on the device, in the form that Grain prefetches from.
 
-    After an error, each further item is that error. Grain's thread forwards an :class:`Exception` alone; of any other,
-    such as :class:`rsjax.errors.Preempted`, it dies silently, and the training loop would wait for ever.
+    After an error, each further item is that error. Grain's thread forwards only an :class:`Exception`; any other
+    error, such as :class:`rsjax.errors.Preempted`, ends it silently, and the training loop would wait for ever.
     """
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any]) -> None:

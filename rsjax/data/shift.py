@@ -1,7 +1,7 @@
-"""Moved copies of a clip: the same scene through a camera that points a few pixels elsewhere.
+"""Makes shifted copies of a clip: the same scene through a camera that points a few pixels elsewhere.
 
-The tokens of a picture that is moved by less than a token differ in every cell, so a model that sees such copies learns
-how things move and not which tokens the training clips have.
+If a frame is shifted by less than a token's width, the tokens of all its cells change. A model that sees such copies
+therefore learns how things move rather than which tokens the training clips have.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from rsjax.data.codec import Record
 
 
 def moved(images: Array, right: int, down: int) -> Array:
-    """Returns images (T, H, W, …) whose content is moved; what comes into view repeats the border."""
+    """Returns images (T, H, W, …) whose content is shifted; pixels that come into view repeat the border."""
     height, width = images.shape[1:3]
     rows = np.clip(np.arange(height) - down, 0, height - 1)
     columns = np.clip(np.arange(width) - right, 0, width - 1)
@@ -20,10 +20,10 @@ def moved(images: Array, right: int, down: int) -> Array:
 
 
 def moved_tracks(record: Record, move: Float[np.ndarray, " 2"]) -> Record:
-    """Returns the tracks and the visibility of a record whose pictures were moved; points that leave are not visible.
+    """Returns a record's tracks and their visibility after its frames are shifted; points that leave are not visible.
 
     Args:
-        move: to the right and down, in widths of the image.
+        move: the shift to the right and down, in widths of the image.
     """
     tracks = record["tracks"] + move
     inside = ((tracks >= 0) & (tracks <= 1)).all(axis=-1)

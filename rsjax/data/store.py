@@ -1,4 +1,4 @@
-"""A store: ArrayRecord shards of each split and a ``manifest.json``, in one directory that is written atomically.
+"""Reads and writes stores: a directory, written atomically, of ArrayRecord shards per split and a ``manifest.json``.
 
 Records are dicts that :mod:`rsjax.data.codec` encodes; a :class:`rsjax.clip.Clip` is one kind of record.
 """
@@ -22,9 +22,9 @@ from rsjax.data.manifest import FORMAT, ManifestError, check_manifest
 from rsjax.files import FileError, disk_guard, placeholder, read_json, replace_directory
 
 MANIFEST = "manifest.json"
-WRITER_OPTIONS = "group_size:1,zstd:1"  # one record a group: random access reads no more than it returns
+WRITER_OPTIONS = "group_size:1,zstd:1"  # one record per group: random access reads no more than it returns
 SHARD_BYTES = 256 * 2**20
-NO_ARRAY = "none"  # the shape of an array that a record does without
+NO_ARRAY = "none"  # in place of a shape, for an array that a record does not have
 
 
 class StoreError(FileError):
@@ -45,7 +45,7 @@ def encode_clip(clip: Clip) -> Record:
 
 
 class Source:
-    """Random access to the records of one split: ``len(source)``, ``source[i]``. Can be sent to other processes.
+    """Random access to the records of one split: ``len(source)``, ``source[i]``. It can be sent to other processes.
 
     Args:
         store: the store's directory.
@@ -53,7 +53,7 @@ class Source:
         files: name and number of records of each shard, in order.
 
     Raises:
-        StoreError: on reading a damaged record; it names the file and the record.
+        StoreError: on reading a damaged record; the message names the file and the record.
     """
 
     def __init__(self, store: Path, split: str, files: list[tuple[str, int]]) -> None:
@@ -70,13 +70,13 @@ class Source:
     def __getitem__(self, index: int) -> Record:
         if not 0 <= index < len(self):
             raise IndexError(f"record {index} of a split with {len(self)} records")
-        for _ in range(2):  # a file handle that went stale is not damage, so the shards are opened once more
+        for _ in range(2):  # a stale file handle is not damage, so the shards are opened once more
             try:
                 reader = self._reader  # another thread may reset the attribute
                 if reader is None:
                     reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
                 return decode(reader[index])
-            except Exception as error:  # array_record reports damage by several types
+            except Exception as error:  # array_record reports damage with several exception types
                 self._reader, damage = None, error
         shard = self._shard(index)
         raise StoreError(
@@ -88,7 +88,7 @@ class Source:
         return int(np.searchsorted(self._starts, index, side="right")) - 1
 
     def locate(self, index: int) -> dict[str, Any]:
-        """Returns where a record lies, JSON-ready: ``store``, ``split``, ``record`` (its number there) and ``file``."""
+        """Returns where a record is, JSON-ready: ``store``, ``split``, ``record`` (its number there) and ``file``."""
         return {
             "store": str(self._store.absolute()),
             "split": self._split,
@@ -120,11 +120,11 @@ class Store:
         return Source(self.path, split, [(file["name"], file["count"]) for file in entry["files"]])
 
     def counts(self) -> dict[str, int]:
-        """Returns the number of records by split."""
+        """Returns the number of records of each split."""
         return {split: len(self.source(split)) for split in self.splits}
 
     def shapes(self) -> dict[str, str]:
-        """Returns type and shape of each array of the first record, ``NO_ARRAY`` where it has none."""
+        """Returns type and shape of each array of the first record; ``NO_ARRAY`` for an array that is missing."""
         source = next((source for source in map(self.source, self.splits) if len(source)), None)
         return {
             name: NO_ARRAY if value is None else f"{value.dtype} {value.shape}"
@@ -158,12 +158,12 @@ class Store:
 
 
 def open_store(path: Path | str) -> Store:
-    """Opens a store, which may come from elsewhere, and checks that all its files are there and whole.
+    """Opens a store, which may come from elsewhere, and checks that all its files are there and complete.
 
     Raises:
         StoreError: there is no store; its manifest or a shard is missing, truncated, of another format or out of reach
             (permissions, a loop of links); or its manifest names a file outside the store or an impossible size. The
-            cure says to delete the directory only where it holds shards, so that nobody deletes their recordings.
+            message says to delete the directory only if it contains shards, so that nobody deletes their recordings.
     """
     path = Path(path)
     place = path / MANIFEST
@@ -195,7 +195,7 @@ def open_store(path: Path | str) -> Store:
 
 
 def complete_key(path: Path | str) -> str | None:
-    """Returns the content key of a whole store, or None where there is none."""
+    """Returns the content key of a complete store, or None if there is none."""
     try:
         return open_store(path).manifest.get("key")
     except StoreError:
@@ -209,7 +209,7 @@ def write_store(
     meta: dict[str, Any],
     label: Label | None = None,
 ) -> None:
-    """Writes a store; an older one at the same place is replaced only when the new one is complete.
+    """Writes a store; replaces an older one at the same path only when the new one is complete.
 
     Args:
         path: the store's directory.
@@ -219,7 +219,7 @@ def write_store(
         label: returns a record's labels by column, kept for :meth:`Store.labels`.
 
     Raises:
-        FileError: the disk is full or refuses.
+        FileError: the disk is full or cannot be written to.
         StoreError: ``path`` holds something that is not a store.
     """
     path = Path(path)

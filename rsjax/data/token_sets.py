@@ -6,16 +6,16 @@ from rsjax.config import TokenizerConfig, content_key
 from rsjax.data.store import Store, StoreError, open_store
 
 FOLDER = "tokens"  # in the store of clips
-OWN = "own"  # likewise in the directory of a run's stage, where the store of clips is write-protected
+OWN = "own"  # in the directory of a run's stage, if the store of clips is write-protected
 
 
 def tokenizer_key(config: Any, weights: str, *shifts: int) -> str:
-    """Returns the key of everything that decides an image's tokens: the tokenizer and how depth becomes an image.
+    """Returns the key of everything that determines an image's tokens: the tokenizer and how depth becomes an image.
 
     Args:
         config: settings of the tokenizer or of a family's own autoencoder (``Config.autoencoder``).
         weights: fingerprint of the tokenizer's weights.
-        shifts: how many moved copies of a clip there are and how far they are moved, if there are any.
+        shifts: how many shifted copies of a clip there are and how far they are shifted, if there are any.
     """
     settings = config.depth_scale if isinstance(config, TokenizerConfig) else config
     return content_key("tokenizer", weights, settings, *shifts)
@@ -32,13 +32,13 @@ def tokens_key(clips: str, tokenizer: str) -> str:
 
 
 def token_sets(clips: Store) -> dict[str, Store]:
-    """Returns the token sets of a store of clips by tokenizer; only whole ones, with a record for every clip."""
+    """Returns the token sets of a store of clips by tokenizer; only complete sets, with a record for every clip."""
     sets = {}
     for place in sorted((clips.path / FOLDER).glob("*")):
         try:
             tokens = open_store(place)
         except StoreError:
-            continue  # half made, or damaged; it is made again when it is needed
+            continue  # incomplete or damaged; it is made again when it is needed
         key = tokens_key(str(clips.manifest.get("key")), place.name)
         if tokens.manifest.get("key") == key and tokens.counts() == clips.counts():
             sets[place.name] = tokens
