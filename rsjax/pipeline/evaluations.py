@@ -1,4 +1,4 @@
-"""Evaluates run directories by protocols. Each result is a folder, ``RUN/evaluations/LABEL``, with ``result.json``."""
+"""Evaluates runs by protocols. Each result is a folder, ``RUN/evaluations/LABEL``, with ``result.json``."""
 
 import json
 import shutil
@@ -41,14 +41,14 @@ class Request:
     """How to evaluate.
 
     Attributes:
-        protocol: its name.
+        protocol: the protocol's name.
         changes: fields of the protocol to change.
         settings: fields of :class:`rsjax.config.EvalConfig` to change, such as paths of weights.
         data: a store with the clips to score; None: the run's own.
-        splits: of that store; empty: the protocol's.
+        splits: splits of that store; empty: the protocol's.
         store: the new path of the run's store of ingested clips, if it was moved.
-        overwrite: evaluate again what is up to date.
-        second_takes: simulate the scored clips once more, for Physics-IQ's score.
+        overwrite: whether to replace results that are up to date.
+        second_takes: whether to simulate the scored clips once more, for Physics-IQ's score.
     """
 
     protocol: str
@@ -62,7 +62,7 @@ class Request:
 
 
 def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
-    """Evaluates one run, each split by itself; what is up to date is skipped. All processes call it together.
+    """Evaluates one run, each split by itself; skips results that are up to date. All processes call it together.
 
     Args:
         data: the directory of simulated data sets.
@@ -72,7 +72,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
 
     Raises:
         UserError: the run, its data, a split or a file of weights is missing; the clips do not fit the protocol, or
-            cannot be simulated once more.
+            second takes of them cannot be simulated.
     """
     config = load_config(directory)
     config = relocated(config, request.store) if request.store else config
@@ -86,7 +86,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     held_out = open_store(request.data) if request.data else held_out_store(run, store, protocol)
     for split in chosen_splits(held_out, protocol.splits):
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
-        key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # the store may be a stranger's
+        key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # a key may be unsafe as a path
         name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
         if request.second_takes:
@@ -97,7 +97,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
 
 
 def evaluate_own(run: Run) -> Evaluation:
-    """Evaluates a run by its own configuration, as its evaluation stage does; the lead process calls it alone."""
+    """Evaluates a run by its own configuration, in its evaluation stage; only the lead process calls it."""
     trained, store = load(run.directory), run.open_clips()
     held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
     folder = run.directory / "evaluation"
@@ -121,7 +121,7 @@ def evaluate_into(
         with alone():
             shutil.rmtree(parts, ignore_errors=True)
 
-    if overwrite:  # batches of an interrupted evaluation may be another version's
+    if overwrite:  # an interrupted evaluation's batches may be from another version
         on_lead("old batches", clear)
     if jax.process_count() > 1:
         with disk_guard(parts):
@@ -133,7 +133,7 @@ def evaluate_into(
         with alone():
             if overwrite or _key_of(folder) != key:
                 _evaluate(folder, name, key, trained, run, store, held_out)
-            else:  # the process that was waited for made it
+            else:  # another process made it while this one waited
                 note(skipped)
                 shutil.rmtree(parts, ignore_errors=True)
 
@@ -146,7 +146,7 @@ def _evaluate(
     parts = _parts(folder, key)
     with disk_guard(folder):
         for old in folder.glob("parts-*"):
-            if old != parts:  # of a configuration that was never finished
+            if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
         found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
@@ -157,7 +157,7 @@ def _evaluate(
 
 
 def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
-    """Returns protocol, sampling, data, model and machine for the file."""
+    """Returns the entries of ``result.json`` on protocol, sampling, data, model and machine."""
     config, (frames, size) = trained.config, held_out.clips.rgb.shape[1:3]
     rate = frame_rate(held_out.records[0], held_out.store.manifest)
     data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
@@ -182,7 +182,7 @@ def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut)
 
 
 def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
-    """Returns a hash of all that decides the scores, except the code."""
+    """Returns a hash of everything that determines the scores, except the code."""
     data = [
         (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, held_out.store)
     ]
@@ -207,7 +207,7 @@ def _parts(folder: Path, key: str) -> Path:
 
 
 def _settings(settings: EvalConfig) -> dict[str, Any]:
-    """Returns what the metrics depend on: files by their content, and the constant of the masks of what moves."""
+    """Returns what the metrics depend on: the settings, with files by content, and the threshold of motion masks."""
     values = {name: value for name, value in to_dict(by_content(settings)).items() if name not in NOT_OF_METRICS}
     return values | {"physics_iq_threshold": THRESHOLD}
 
@@ -222,7 +222,7 @@ def _sample_settings(config: Config) -> dict[str, Any]:
 
 
 def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
-    """Returns the model with the protocol's settings of sampling, as far as its family has them."""
+    """Returns the model with the protocol's sampling settings; a note names those that its family does not have."""
     settings = getattr(trained.config.model, "sample", None)
     known = {each.name for each in fields(settings)} if is_dataclass(settings) else set()
     if missing := ", ".join(sorted(protocol.sampling.keys() - known)):

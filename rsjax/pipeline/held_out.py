@@ -1,4 +1,4 @@
-"""The clips that an evaluation scores: a run's own, or longer episodes, scenes never seen and second takes."""
+"""Finds the clips that an evaluation scores: a run's own, longer episodes, unseen scenes, and second takes."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -21,13 +21,13 @@ from rsjax.sim.collect import Report, collect, collection_key
 from rsjax.sim.unseen import collect_unseen, unseen_splits
 from rsjax.training.distributed import on_lead
 
-LONGER_SEED = 1_000_000  # added to a run's seed, for longer episodes that are none of its own
-LONGER_TRAIN = 2  # episodes of their train split, which nothing uses
+LONGER_SEED = 1_000_000  # added to a run's seed, so that longer episodes differ from the run's own
+LONGER_TRAIN = 2  # episodes in the train split of longer episodes, which nothing uses
 T = TypeVar("T")
 
 
 def chosen_splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
-    """Returns the store's splits of these names; those that end in ``*`` stand for all that begin so."""
+    """Returns the store's splits with these names; a name that ends in ``*`` stands for all with that beginning."""
     if lacking := _lacking(store.splits, wanted):
         raise StoreError(
             f"{store.path}: no split {lacking[0]!r}; it has {', '.join(store.splits)}: choose with --split, or name "
@@ -37,12 +37,12 @@ def chosen_splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
 
 
 def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
-    """Returns the wanted names or patterns that fit none of the splits."""
+    """Returns the wanted names or patterns that match no split."""
     return [pattern for pattern in wanted if not any(fnmatchcase(split, pattern) for split in splits)]
 
 
 def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
-    """Returns the run's store, or one of longer episodes or unseen scenes, which are simulated if need be."""
+    """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
     sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
     if run.config.data.key:
         return store
@@ -66,7 +66,7 @@ def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
 
 
 def with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
-    """Returns the clips with second takes of all of them, which are simulated if need be."""
+    """Adds second takes of all clips, which are simulated if necessary."""
     protocol, clips = held_out.protocol, held_out.clips
     if protocol.reference != "recorded":
         raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
@@ -79,7 +79,7 @@ def with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
 
 
 def _simulated(what: str, make: Callable[[Report], T]) -> T:
-    """Returns clips that the lead process makes, unless they exist, and the others then find."""
+    """Returns clips that the lead process makes unless they exist; the other processes then find them."""
     with Progress(f"simulating {what}", 0, "episodes") as progress:
 
         def report(done: int, total: int) -> None:
@@ -94,6 +94,6 @@ def _simulated(what: str, make: Callable[[Report], T]) -> T:
 
 
 def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:
-    """Returns the configuration of held-out episodes that are longer than a run's: of another seed, all for testing."""
+    """Returns the configuration of held-out episodes that are longer than a run's, with a seed other than the run's."""
     seed = (sim.seed + LONGER_SEED) % 2**32
     return replace(sim, frames=frames, seed=seed, episodes=clips + LONGER_TRAIN, test_episodes=clips)

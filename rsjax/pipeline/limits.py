@@ -1,4 +1,4 @@
-"""Refuses what cannot fit into memory or onto the disk, before it begins: each figure is less than what is needed."""
+"""Refuses, before it begins, work that cannot fit into memory or onto the disk; all estimates are lower bounds."""
 
 import os
 import shutil
@@ -16,16 +16,16 @@ _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_
 
 
 def host_memory() -> int:
-    """Returns the bytes of memory that this process may use at most."""
+    """Returns the bytes of memory that this process may use."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for path in map(Path, _CGROUPS):
-        with suppress(OSError, ValueError):  # "max" is no limit
+        with suppress(OSError, ValueError):  # "max" means no limit
             limits.append(int(path.read_text()))
     return min(limits)
 
 
 def device_memory() -> int:
-    """Returns the bytes of memory of each of this process's devices; on a CPU, its share of the host's."""
+    """Returns the bytes of memory of each of this process's devices; on a CPU, the device's share of host memory."""
     devices = jax.local_devices()
     limits = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in devices]
     return min(limits) or host_memory() // len(devices)
@@ -45,7 +45,7 @@ def check_batch(config: Config, loop: LoopConfig, stage: Literal["tokenizer", "w
 
 
 def _clip_bytes(config: Config, stage: str) -> int:
-    """Returns bytes of a clip that the backward pass reads at least: features of one layer, or the input of a block."""
+    """Returns a lower bound on the bytes per clip for the backward pass: features of one layer, or inputs of blocks."""
     if stage == "tokenizer" and config.autoencoder is not config.tokenizer:
         return config.tokenizer_train.frames_per_clip * config.clips.image_size**2
     if stage == "tokenizer":
@@ -68,7 +68,7 @@ def check_rollout(config: Config, frames: int) -> None:
 
 
 def check_episodes(config: SimConfig, out: Path) -> None:
-    """Raises :class:`UserError` if simulated episodes cannot fit onto the disk: a byte a pixel is the least."""
+    """Raises :class:`UserError` if simulated episodes cannot fit onto the disk, at one byte per pixel or more."""
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     needed, free = config.episodes * config.frames * config.image_size**2, shutil.disk_usage(place).free
     if needed > free:

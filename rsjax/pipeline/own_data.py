@@ -11,11 +11,11 @@ from rsjax.data.store import MANIFEST, StoreError, open_store
 def on_store(config: Config, path: Path) -> Config:
     """Returns the configuration with its training data replaced by a store made by ``experiments.ingest``.
 
-    Image size, token grid and action width follow from its clips.
+    Image size, token grid and action width follow from the store's clips.
 
     Raises:
         StoreError: the store is missing, is not of clips, or has no content key.
-        ConfigError: the model or the tokenizer does not fit its clips; the message names the fields.
+        ConfigError: the model or the tokenizer does not fit the clips; the message names the fields.
     """
     store = open_store(path)
     manifest, where = store.manifest, store.path / MANIFEST
@@ -44,7 +44,7 @@ def on_store(config: Config, path: Path) -> Config:
 
 
 def relocated(config: Config, path: Path) -> Config:
-    """Returns the configuration of a run with the new path of its store, which was moved.
+    """Returns the configuration of a run with the new path of its store that was moved.
 
     Raises:
         StoreError: the store is missing, or the run's clips were simulated.

@@ -1,4 +1,4 @@
-"""Records configuration, code, packages, machine and data of every start of a run in ``run.json``."""
+"""Records the configuration, code, packages, machine and data of every start of a run in ``run.json``."""
 
 import hashlib
 import importlib.metadata
@@ -45,13 +45,13 @@ def read_starts(directory: Path) -> list[dict[str, Any]]:
 
 
 def record_start(run: Run, command: str) -> list[str]:
-    """Appends this start. The lead process calls it once, after the devices are set up and the directory is made.
+    """Appends this start to ``run.json``. The lead process calls it once, after device setup, in an existing directory.
 
     Args:
         command: the command that started the run.
 
     Returns:
-        The entries of ``DECIDE`` that changed since the last start; additional data and packages are not changes.
+        The entries of ``DECIDE`` that changed since the last start; added data and packages do not count.
 
     Raises:
         FileError: the file is damaged, or the disk is full.
@@ -80,7 +80,7 @@ def _differ(before: Any, now: Any) -> bool:
 
 
 def record_data(run: Run) -> None:
-    """Updates the last start's entry with the data that it has made since."""
+    """Adds the data that the run has made since its last start to that start's entry."""
     starts = read_starts(run.directory)
     if starts:
         write_json(run.directory / NAME, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
@@ -89,7 +89,7 @@ def record_data(run: Run) -> None:
 def data_fingerprints(run: Run) -> dict[str, Any]:
     """Returns path, content key, manifest hash and split sizes of every existing data set.
 
-    The manifest names all files with their sizes and numbers of records, so its hash changes with them.
+    The manifest lists all files with their sizes and numbers of records, so its hash changes when these do.
     """
     stores = {"clips": run.clips, "tokens": run.output("tokens")}
     loops = (run.config.tokenizer_train, run.config.train)
@@ -100,9 +100,9 @@ def data_fingerprints(run: Run) -> dict[str, Any]:
 
 
 def data_fingerprint(path: Path) -> dict[str, Any]:
-    """Returns path, content key, manifest hash and split sizes of a store; less of a damaged one."""
+    """Returns path, content key, manifest hash and split sizes of a store; fewer entries if it is damaged."""
     known: dict[str, Any] = {"path": str(path.absolute())}
-    # Damage is reported by the stage that reads it.
+    # The stage that reads the store reports the damage.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         raw = (path / MANIFEST).read_bytes()
         known["manifest_sha256"] = hashlib.sha256(raw).hexdigest()
@@ -116,7 +116,7 @@ def data_fingerprint(path: Path) -> dict[str, Any]:
 def code_version(root: Path) -> dict[str, Any]:
     """Returns version, git revision, whether the checkout at ``root`` has changes, and the hash of ``git diff HEAD``.
 
-    All but the version are null without a checkout. The diff does not include new files.
+    Without a checkout, everything but the version is null. The diff does not include new files.
     """
     code: dict[str, Any] = {"version": rsjax.__version__, "revision": None, "dirty": None, "diff_sha256": None}
     # rsjax may be installed inside another project's checkout.
@@ -139,7 +139,7 @@ def _git(root: Path, *arguments: str) -> str | None:
 
 
 def training_settings(config: Config) -> dict[str, Any]:
-    """Returns the settings of each training loop and of the tokenizer that decide the weights of any one seed."""
+    """Returns the settings, other than seeds, that determine the weights: of the training loops and the tokenizer."""
     parts = {each.name: getattr(config, each.name) for each in fields(config)}
     trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
     if config.model.uses_tokenizer:

@@ -29,8 +29,8 @@ class Clip:
     """One clip of a replayed batch.
 
     Attributes:
-        source: its file, record and origin, from :meth:`rsjax.data.loader.Loader.identify`.
-        scalars: its loss, the terms of the loss, and the norm of its gradient.
+        source: the clip's file, record and origin, from :meth:`rsjax.data.loader.Loader.identify`.
+        scalars: the clip's loss, the terms of the loss, and the norm of its gradient.
     """
 
     source: dict[str, Any]
@@ -44,7 +44,7 @@ class Clip:
 def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> Iterator[Clip]:
     """Yields the clips of a skipped step's batch, scored one by one with the random draws of that step.
 
-    The parameters are those of the newest checkpoint, at that step or near it; before the first, the initial ones.
+    The parameters are those of the newest checkpoint, at that step or near it; without one, the initial parameters.
 
     Raises:
         UserError: the step was not skipped, or its data or the checkpoints are missing.

@@ -65,7 +65,7 @@ class Run:
         """Opens the store of clips.
 
         Raises:
-            StoreError: it is missing or damaged, or another store was put in its place.
+            StoreError: the store is missing or damaged, or another store is in its place.
         """
         key = self.config.data.key
         if key and not (self.clips / MANIFEST).exists():
@@ -82,7 +82,7 @@ class Run:
         """Opens the store that the world model trains on: tokens, or the clips themselves.
 
         Raises:
-            StoreError: it is missing or damaged, or was made from other clips.
+            StoreError: the store is missing or damaged, or was made from other clips.
         """
         store = open_store(self.output("tokens").resolve())
         if not self._made_of_these_clips(store.manifest):
@@ -122,15 +122,15 @@ class Run:
 
     @property
     def lock_file(self) -> Path:
-        """The lock that a process keeps while it makes stages here."""
+        """The lock that a process holds while it makes stages here."""
         return self.directory / ".lock"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keeps other processes from making stages here; whoever only reads is not locked out.
+        """Keeps other processes from making stages here; processes that only read are not locked out.
 
         Raises:
-            RunError: another process does so; the message names it.
+            RunError: another process is making stages here; the message names it.
         """
         with lock(self.lock_file, required=False) as free:
             if not free:
@@ -144,26 +144,26 @@ class Run:
         """Makes the directory, or checks that it fits this configuration, and writes ``config.json``.
 
         Args:
-            overwrite: delete trained stages of another configuration instead of refusing.
+            overwrite: whether to delete trained stages of another configuration instead of refusing.
 
         Raises:
-            RunError: it contains a trained stage of another configuration; the message names the differing fields.
+            RunError: the directory contains a trained stage of another configuration; the message names the fields.
         """
         for stage in (stage for stage in TRAINED if stage in self.stages):
             aside = self.directory / f"{stage}.old"
-            shutil.rmtree(aside, ignore_errors=True)  # of a command that was killed here
+            shutil.rmtree(aside, ignore_errors=True)  # left by a command that was killed here
             if self._key_of_content(stage) not in (None, self.keys()[stage]):
                 if not overwrite:
                     raise RunError(
                         f"{self.directory} holds a {stage.replace('_', ' ')} of another configuration "
                         f"({self._differences(stage)}); choose another --run-dir, or train it again with --overwrite"
                     )
-                os.replace(self.directory / stage, aside)  # at once: half a stage might be resumed
+                os.replace(self.directory / stage, aside)  # atomic, because half a stage might be resumed
                 shutil.rmtree(aside)
         write_json(self.directory / "config.json", to_dict(self.config))
 
     def _key_of_content(self, stage: str) -> str | None:
-        """Returns the key of the trained stage in the directory: of its mark, or where that is lost of config.json."""
+        """Returns the key of the trained stage in the directory, from its mark, or from config.json without a mark."""
         if key := self.mark(stage).get("key"):
             return str(key)
         if not (self.directory / stage / "checkpoints").exists():
@@ -177,7 +177,7 @@ class Run:
         return from_dict(Config, read_json(self.directory / "config.json"))
 
     def _differences(self, stage: str) -> str:
-        """Describes the fields that differ from the saved stage's, except those without effect on results."""
+        """Describes the fields that differ from the saved stage's, except fields without effect on results."""
         try:
             saved = self._saved_config()
         except ConfigError as error:
@@ -205,7 +205,7 @@ class Run:
         try:
             manifest = read_json(self.output("tokens") / MANIFEST)
         except FileError:
-            return True  # the stage that reads them reports the damage
+            return True  # the stage that reads the clips reports the damage
         return self._made_of_these_clips(manifest)
 
     def mark(self, stage: str) -> dict[str, Any]:
@@ -220,7 +220,7 @@ class Run:
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Path]:
-        """Marks a stage as begun, and after its work as finished, with its duration; yields its directory.
+        """Marks a stage as begun and, after its work, as finished, with its duration; yields its directory.
 
         Durations add up over interruptions, except those of killed processes.
         """
@@ -241,16 +241,16 @@ class Run:
 
 
 def _by_content(settings: EvalConfig) -> EvalConfig:
-    """Returns the settings with files of weights by their content; those that cannot be read stay paths."""
+    """Returns the settings with paths of weights replaced by content hashes; unchanged if a file cannot be read."""
     try:
         return _hashed(settings)
     except UserError:
-        return settings  # whoever evaluates says what is wrong
+        return settings  # the evaluation reports what is wrong
 
 
 @cache  # hashing large files takes seconds
 def _hashed(settings: EvalConfig) -> EvalConfig:
-    from rsjax.evaluation.results import by_content  # here, since it loads jax
+    from rsjax.evaluation.results import by_content  # here, because it loads jax
 
     return by_content(settings)
 
@@ -275,7 +275,7 @@ def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def link(target: Path, at: Path) -> None:
-    """Makes ``at`` a link to ``target``, atomically, and replaces what was at that path."""
+    """Makes ``at`` a link to ``target``, atomically; replaces what was at that path."""
     temporary = at.with_name(f"{at.name}.{os.getpid()}.tmp")
     temporary.unlink(missing_ok=True)
     if at.is_dir() and not at.is_symlink():  # a copied run contains the tokens themselves

@@ -24,11 +24,11 @@ class Setup:
     """The arguments of :func:`rsjax.training.loop.fit` for a stage.
 
     Attributes:
-        model: what is trained.
+        model: the model to train.
         loop: the stage's loop, with the ``steps`` and ``restarts`` of its curriculum.
-        loader: makes its loaders.
+        loader: makes the stage's loaders.
         to_batch: converts a loader's arrays to the model's batch.
-        start: makes the initial parameters from fresh ones; None: fresh ones are used.
+        start: makes the initial parameters from fresh ones; None: training starts from fresh parameters.
     """
 
     model: Trainable[Any]
@@ -65,13 +65,13 @@ def world_model_setup(run: Run) -> Setup:
 
 
 def note_curriculum(loader: LoaderFactory) -> None:
-    """Prints a line for each stage of the curriculum, on the lead."""
+    """Prints a line for each stage of the curriculum, in the lead process."""
     for line in loader.summary() if is_lead() else ():
         note(line)
 
 
 def starting(model: Any, start_from: str, part: str) -> Callable[[Params], Params] | None:
-    """Returns the function that makes the initial parameters from a directory's; None if ``start_from`` is empty.
+    """Returns a function that makes initial parameters from a directory's weights; None if ``start_from`` is empty.
 
     Args:
         part: "tokenizer" or "world_model".

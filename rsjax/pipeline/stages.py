@@ -28,13 +28,13 @@ from rsjax.training.wandb_run import find_wandb
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
-    """Runs every unfinished stage in order, and prints which are skipped.
+    """Runs every unfinished stage in order, and prints which stages are skipped.
 
     Several processes with a common run directory train together; the lead process runs the other stages.
 
     Args:
         resume: False restarts an unfinished training stage instead of resuming from its checkpoint.
-        command: the command that repeats the run, for the report.
+        command: the command that repeats the run, for ``run.json`` and the report.
     """
     _check_starts(run)
     on_lead("run.json", lambda: _record_start(run, command))
@@ -109,7 +109,7 @@ def _record_start(run: Run, command: str) -> None:
 
 
 def collect_clips(run: Run) -> None:
-    """Stage 1: collects episodes in the simulator, unless another run has; or checks an existing store."""
+    """Stage 1: collects episodes in the simulator, unless another run has done so; or checks an existing store."""
     cfg = run.config
     if cfg.data.key:
         if cfg.model.uses_depth and not run.open_clips().manifest.get("depth_range"):
@@ -150,7 +150,7 @@ def train_tokenizer(run: Run, resume: bool) -> None:
 
 
 def prepare(run: Run) -> None:
-    """Stage 3: makes what the model trains on instead of clips, such as tokens, and links to it."""
+    """Stage 3: makes the store that the model trains on instead of clips, such as tokens, and links to it."""
     clips, folder, cfg = run.open_clips(), run.directory / "tokens", run.config
     (folder / QUARANTINE).unlink(missing_ok=True)
     assets = Assets(Normalization.create(clips), load_tokenizer(cfg, run.directory))

@@ -39,7 +39,7 @@ def write_summary(run: Run, command: str) -> None:
         versions=_versions(run),
         seconds=seconds,
         command=command,
-        show_targets=cfg.name == "tiny" and not cfg.data.key,  # targets are for the simulated clips
+        show_targets=cfg.name == "tiny" and not cfg.data.key,  # the targets hold for simulated clips
     )
     write_report(run.output("report"), report)
     write_json(run.directory / "metrics.json", metrics | dict.fromkeys(result.reasons) | {"reasons": result.reasons})
@@ -57,7 +57,7 @@ def _figure(result: evaluation.Evaluation, row: int, config: Config) -> ClipFigu
         arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
     label = f"test clip {int(shown['clip'][row])}"
     title = f"{label}: {shown['task'][row] or 'no task named'}"
-    if shown["success"].any():  # otherwise success may be unknown
+    if shown["success"].any():  # otherwise it may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
     if "rank" in shown:  # not in files of earlier versions
         rank, score = _rank(int(shown["rank"][row]), int(result.metrics["clips"])), f"{shown['psnr'][row]:.1f} dB"
@@ -67,7 +67,7 @@ def _figure(result: evaluation.Evaluation, row: int, config: Config) -> ClipFigu
 
 
 def _rank(rank: int, clips: int) -> str:
-    """Returns a clip's rank from below in words; 0 is a typical clip."""
+    """Describes a clip's rank, counted from the worst, in words; 0 means a typical clip."""
     if not rank:
         return "typical"
     ending = {1: "st ", 2: "nd ", 3: "rd "}.get(rank % 10 * (rank // 10 % 10 != 1), "th ")
@@ -76,7 +76,7 @@ def _rank(rank: int, clips: int) -> str:
 
 def _versions(run: Run) -> dict[str, str]:
     start = read_starts(run.directory)[-1]
-    machine, versions = start["machine"], start["packages"]  # perhaps without the simulator's
+    machine, versions = start["machine"], start["packages"]  # may lack the simulator's packages
     return {name: versions[name] for name in LIBRARIES if name in versions} | {
         "python": machine["python"],
         "system": machine["system"],

@@ -31,7 +31,7 @@ def load_config(run: Path) -> Config:
     """Reads the configuration of a run directory.
 
     Raises:
-        UserError: it is missing, damaged or of another version.
+        UserError: the configuration is missing, damaged or of another version.
     """
     path = run / "config.json"
     if not path.exists():
@@ -46,7 +46,7 @@ def load_config(run: Path) -> Config:
 
 
 def load_assets(config: Config, run: Path) -> Assets:
-    """Loads the data that the run's world model needs beside its own parameters."""
+    """Loads the data that the run's world model needs in addition to its own parameters."""
     return Assets(Normalization.load(run / "tokens"), load_tokenizer(config, run))
 
 

@@ -33,13 +33,13 @@ from rsjax.training.validation import Validation, validation_loss
 class WorldModelValidation:
     """Computes the loss over ``eval.loss_clips`` test clips, and videos of ``eval.batch_size`` of them.
 
-    It opens the run's stores at its first call.
+    The first call opens the run's stores.
     """
 
     run: Run
 
     def __call__(self, step: int, weights: Params) -> Validation:
-        """Scores weights of the world model.
+        """Scores the world model with these weights.
 
         Raises:
             StoreError: the run's stores are missing, or their test split has no readable clip.
@@ -94,7 +94,7 @@ class WorldModelValidation:
 
 
 def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
-    """Computes the metrics that are watched during training."""
+    """Computes the metrics whose ``watch`` is set."""
     scores, scene = {}, Scene(clips.metric_video, made, prompt_frames)
     for metric in metrics().values():
         if metric.watch and metric.function is not None:
@@ -108,13 +108,13 @@ def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
 class TokenizerValidation:
     """Scores the reconstruction of frames, and of depth maps if they are encoded, of ``eval.clips`` test clips.
 
-    It opens the run's store at its first call.
+    The first call opens the run's store.
     """
 
     run: Run
 
     def __call__(self, step: int, weights: Params) -> Validation:
-        """Scores weights of the tokenizer by the negative PSNR of frames and depth maps, mixed as in training.
+        """Scores the tokenizer with these weights: the negative PSNR of frames and depth maps, mixed as in training.
 
         Raises:
             StoreError: the run's store is missing, or its test split has no readable clip.
@@ -167,7 +167,7 @@ def _sheet(title: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> UInt8[np.n
 def record_batches(
     model: WorldModel[Any], normalization: Normalization, source: RecordSource, size: int, numbers: Sequence[int]
 ) -> Iterator[Any]:
-    """Yields records as batches of one shape, each clip with its number as index, which decides its masks.
+    """Yields records as batches of one shape; each clip's index is its number, which determines its masks.
 
     Args:
         source: a split of the prepared store.

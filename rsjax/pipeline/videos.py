@@ -1,4 +1,4 @@
-"""Generates videos from a trained run, one per clip."""
+"""Generates videos with the model of a trained run, one per clip."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ class Request:
     """The clips, actions and settings to generate with.
 
     Attributes:
-        split: of the run's data set.
+        split: a split of the run's data set.
         clips: numbers of the clips within the split; empty: the first four.
         actions_from: a clip of the same split whose actions are used for all clips; None: each clip's own.
         actions: a .npy file of actions that are used for all clips, (T, A) in the data's units.
@@ -61,7 +61,7 @@ def write_videos(
 ) -> Iterator[Path]:
     """Generates and writes a video per clip: truth and prediction side by side, with depth if the model has it.
 
-    Under other actions, or beyond a clip's end, only the prediction is shown, since there is no truth.
+    With actions of another source, or beyond a clip's end, there is no truth, so the video shows only the prediction.
 
     Args:
         run, data: the directories of the run and of simulated data sets.
@@ -102,7 +102,7 @@ def chosen_clips(request: Request, source: Source) -> tuple[int, ...]:
     """Returns the numbers of the clips to generate.
 
     Raises:
-        UserError: the split does not have them, or not the one whose actions are wanted.
+        UserError: the split lacks one of them, or the clip whose actions are wanted.
     """
     if not len(source):
         raise UserError(f"the {request.split} split has no clips; choose another with --split")
@@ -152,7 +152,7 @@ def resampled(trained: TrainedModel, sample: dict[str, Any]) -> TrainedModel:
     """Returns the model with changed fields of ``model.sample``.
 
     Raises:
-        ConfigError: the model does not support these settings.
+        UserError: the model's family has no such settings, or a value is not allowed.
     """
     if not sample:
         return trained
