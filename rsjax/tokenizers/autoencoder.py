@@ -1,17 +1,17 @@
-"""The interface of what maps frames to tokens or latents and back, trained in the stage "tokenizer" before the model.
+"""The interface of networks that map frames to tokens or latents and back; the stage "tokenizer" trains them.
 
-The MAGVIT-2 tokenizer implements it (:class:`rsjax.tokenizers.training.TokenizerTraining`), and so may a family of
-world models with an autoencoder of its own. Such a family
+The MAGVIT-2 tokenizer implements it (:class:`rsjax.tokenizers.training.TokenizerTraining`). A family of world models
+may implement it with its own autoencoder. Such a family
 
 - has in its settings ``uses_tokenizer = True`` and a property ``own_autoencoder``, which returns the network's settings
   (a nested dataclass, such as its field ``autoencoder``). Steps, batch, optimizer, frames per clip and the weights of
-  common loss terms are ``Config.tokenizer_train``'s, as for every tokenizer;
+  common loss terms come from ``Config.tokenizer_train``, as for every tokenizer;
 - overrides :meth:`rsjax.models.base.WorldModel.autoencoder` to return a subclass of :class:`Autoencoder`;
 - makes the records that its model trains on in ``prepare``, by :func:`rsjax.tokenizers.tokenize.prepare_store`, and
   reads the trained parameters as ``assets.tokenizer``.
 
-Public weights that stay frozen are a stage of no steps: ``tokenizer_train.start_from`` names their directory and
-``tokenizer_train.steps`` is 0. Resuming, logging, replaying, validation, describe and bench need nothing else.
+For public weights that stay frozen, the stage has no steps: ``tokenizer_train.start_from`` names their directory and
+``tokenizer_train.steps`` is 0. Resuming, logging, replaying, validation, describe and bench need no further code.
 """
 
 from pathlib import Path
@@ -43,7 +43,7 @@ class VideoCodec(Protocol):
 
 
 class Autoencoder(Trainable[B], Protocol[B]):
-    """What the stage "tokenizer" trains: a frozen dataclass of settings, without arrays."""
+    """An autoencoder that the stage "tokenizer" trains: a frozen dataclass of settings, without arrays."""
 
     def transform(self) -> Transform:
         """Returns the function that converts a clip's record to arrays of fixed shapes, in the loader.
@@ -53,9 +53,9 @@ class Autoencoder(Trainable[B], Protocol[B]):
         ...
 
     def batch(self, arrays: Arrays) -> Any:
-        """Returns the batch for ``loss_terms`` from a loader's stacked arrays; its rows are clips, or a multiple.
+        """Returns the batch for ``loss_terms`` from a loader's stacked arrays, with one or several rows per clip.
 
-        Random draws of a row must follow from the array ``index``, the clip's place in the batch over all processes.
+        A row's random draws must follow from the array ``index``, the clip's place in the batch over all processes.
         """
         ...
 
@@ -84,13 +84,13 @@ class Autoencoder(Trainable[B], Protocol[B]):
         return saved
 
     def notes(self) -> list[str]:
-        """Returns what a user should know before training, a line each."""
+        """Returns what a user should know before training, one line for each message."""
         return []
 
     def flops(self) -> dict[str, int]:
         """Returns floating-point operations of one pass, "encoder" and "decoder"; empty if there are no counts.
 
-        They are those of a frame; where frames are encoded together, of a training clip divided by its
+        The counts are for one frame; where frames are encoded together, they are for a training clip, divided by its
         ``tokenizer_train.frames_per_clip``.
         """
         return {}

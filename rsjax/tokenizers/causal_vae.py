@@ -1,4 +1,4 @@
-"""CogVideoX's autoencoder of videos: convolutions that are causal in time, and pieces that continue each other.
+"""CogVideoX's autoencoder of videos: its convolutions are causal in time, and it takes videos in successive pieces.
 
 Norms see the frames of one piece (8 frames in the encoder, 2 latent frames in the decoder), so videos must be cut as in
 the public code. Between pieces, every causal convolution keeps its last two frames in the collection "past".
@@ -28,7 +28,7 @@ PAST = "past"
 
 
 class CausalConv(nn.Module):
-    """A convolution over 3 frames of 3×3 cells: this one and the two before; before the first frame stands itself."""
+    """A convolution over 3×3 cells of a frame and the two before it; copies of the first frame precede that frame."""
 
     features: int
 
@@ -44,7 +44,7 @@ class CausalConv(nn.Module):
 
 
 def convolve(frames: Video, kernel: Float[Array, "3 3 3 C D"]) -> Video:
-    """Returns the 3-D convolution, padded by zeros in space alone, by the fastest implementation on this platform."""
+    """Returns the 3-D convolution, padded with zeros in space only, by the fastest implementation on this platform."""
     around = ((1, 1), (1, 1))
     if jax.default_backend() != "cpu":
         names = ("NTHWC", "THWIO", "NTHWC")
@@ -68,13 +68,13 @@ class CellNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Video, latents: Float[Array, "B t h w z"]) -> Video:
-        # Repeating cells after the layers gives the same as before them, with less work.
+        # Repeating cells after the layers gives the same result as before them, with less work.
         scale, shift = (spread(nn.Dense(x.shape[-1], name=f"conv_{name}")(latents), x) for name in "yb")
         return group_norm(self.groups, name="norm_layer")(x) * scale + shift
 
 
 def spread(cells: Video, like: Video) -> Video:
-    """Repeats cells to the frames, rows and columns of another video; the first of an odd number stays alone."""
+    """Repeats cells to the frames, rows and columns of another video; of an odd number of frames, all but the first."""
     frames, times, alone = like.shape[1], like.shape[2] // cells.shape[2], cells.shape[1] % 2
     if cells.shape[1] != frames:
         cells = _repeat(cells, (frames - alone) // (cells.shape[1] - alone))
@@ -82,13 +82,13 @@ def spread(cells: Video, like: Video) -> Video:
 
 
 def _repeat(x: Video, times: int) -> Video:
-    """Repeats frames; the first of an odd number stays alone."""
+    """Repeats frames; the first of an odd number is not repeated."""
     alone = x.shape[1] % 2
     return jnp.concatenate([x[:, :alone], x[:, alone:].repeat(times, axis=1)], axis=1)
 
 
 def _halve(x: Video) -> Video:
-    """Averages pairs of frames; the first of an odd number stays alone."""
+    """Averages pairs of frames; the first of an odd number stays as it is."""
     alone = x.shape[1] % 2
     pairs = x[:, alone:].reshape(len(x), -1, 2, *x.shape[2:])
     return jnp.concatenate([x[:, :alone], pairs.mean(axis=2)], axis=1)
@@ -178,7 +178,7 @@ def _in_pieces(network: nn.Module, params: Params, x: Video, size: int) -> Video
 
 
 def pieces(frames: int, size: int) -> Iterator[slice]:
-    """Yields the pieces of a video: of ``size`` frames each, the first with what remains."""
+    """Yields the pieces of a video, of ``size`` frames each; the first piece also has the remaining frames."""
     rest = frames % size
     for i in range(max(1, frames // size)):
         yield slice(i * size + rest * (i > 0), (i + 1) * size + rest)

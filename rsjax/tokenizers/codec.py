@@ -98,9 +98,10 @@ class Codec:
 def in_chunks(
     apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int = CHUNK
 ) -> np.ndarray:
-    """Returns ``apply`` of all items, which it maps one by one, in passes of at most ``most``.
+    """Applies a function to all items, in passes of at most ``most`` items.
 
     Args:
+        apply: the function; its result for an item must not depend on the other items.
         items: with any leading axes before the ``item_axes`` of an item.
     """
     lead, item = items.shape[:-item_axes], items.shape[-item_axes:]

@@ -1,7 +1,7 @@
-"""The conditional VQ tokenizer of iVideoGPT: context frames in all their tokens, later frames in few.
+"""The conditional VQ tokenizer of iVideoGPT: context frames have many tokens, later frames few.
 
-A later frame is encoded and decoded with cross-attention to the features of the context, so its tokens only have to say
-what has changed. Submodules are named after the public checkpoints' keys.
+A later frame is encoded and decoded with cross-attention to the features of the context, so its tokens only have to
+describe what has changed. Submodules are named after the public checkpoints' keys.
 
 Axes: B clips, c context frames, F later frames, N = B·c or B·F images, H×W pixels, g×g cells, n tokens of a later
 frame, C channels.
@@ -48,7 +48,7 @@ class CrossAttention(nn.Module):
         return nn.silu(z + self._drop(nn.Dense(width, name="out_proj")(out), index).reshape(z.shape))
 
     def _drop(self, x: Float[Array, "B ..."], index: Index) -> Float[Array, "B ..."]:
-        """Dropout that follows the clip, so that a step does not depend on how its batch is split."""
+        """Applies dropout by the clip's number, so that a step does not depend on how its batch is split."""
         if index is None or not self.config.dropout:
             return x
         key, share = self.make_rng("dropout"), 1 - self.config.dropout
@@ -60,7 +60,7 @@ class CrossAttention(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Maps images in [0, 1] to latents; with ``context`` features, those of later frames."""
+    """Maps images in [0, 1] to latents; later frames need the features of the ``context``."""
 
     config: ConditionalVQConfig
 
@@ -77,7 +77,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Maps latents to images in about [0, 1] (not clipped); with ``context`` features, those of later frames."""
+    """Maps latents to images in about [0, 1] (not clipped); later frames need the features of the ``context``."""
 
     config: ConditionalVQConfig
 
@@ -96,7 +96,7 @@ class Decoder(nn.Module):
 def _crossing(
     config: ConditionalVQConfig, context: Features | None, index: Index, features: list[Map]
 ) -> Callable[[Map], Map]:
-    """Returns what follows each level: attention to the context where the grid is small; ``features`` collects all."""
+    """Returns the function after each level: attention to the context if the grid is small; adds to ``features``."""
     crossed = count()
 
     def after(x: Map) -> Map:
@@ -137,7 +137,7 @@ class Codebook(nn.Module):
 
 
 class Reconstruction(NamedTuple):
-    """What training compares: images in about [0, 1], and the losses of both codebooks."""
+    """The output of a training pass: images in about [0, 1], and the summed losses of both codebooks."""
 
     context: Float[Array, "B c H W 3"]
     future: Float[Array, "B F H W 3"]

@@ -1,9 +1,9 @@
 """Convolutions with bf16 operands and float32 accumulation, as matrix products on CPUs.
 
-XLA's CPU backend convolves in float32 whatever its operands are, without bf16 units and, for small images, on one core.
-So, on processors that have such units, each row of a 3×3 kernel becomes one product over the whole image: three
-neighbouring cells of a row lie side by side in memory, and the image's rows are shifted by taking another part of the
-same array. Large images are cut into strips, so that these copies stay in the processor's cache.
+XLA's CPU backend convolves in float32 whatever its operands are. It does not use bf16 units, and for small images only
+one core. So, on processors that have such units, each row of a 3×3 kernel becomes one product over the whole image:
+three neighbouring cells of a row lie side by side in memory, and the image's rows are shifted by taking another part of
+the same array. Large images are cut into strips, so that these copies stay in the processor's cache.
 
 Axes: B images, h×w cells, C channels in, D channels out, i×j cells of a kernel, N = B·h·w.
 """
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from rsjax.matmul import bf16_pays, matmul_bf16, transposed_in_memory
 
 LEAST = 64  # channels, in and out, from which the products save more time than their copies of the image cost
-STRIP = 2**20  # numbers of an unfolded strip: 2 MiB
+STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
 
 
 def conv(
@@ -50,7 +50,7 @@ def convolve(
 ) -> Float[Array, "B h w D"]:
     """Convolves as ``jax.lax.conv_general_dilated`` does, in bf16 where this is faster on this platform.
 
-    On an accelerator the result is rounded to bf16 too, as by the layers of other libraries.
+    On an accelerator the result is rounded to bf16 too, as in the layers of other libraries.
     """
     if jax.default_backend() != "cpu":
         x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
@@ -83,8 +83,8 @@ def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Arra
     turned = kernel[::-1, ::-1].swapaxes(2, 3)
 
     def gradients(total: Array, strip: Array, x: Array) -> tuple[Array, Array]:
-        # Shifting the image against the cotangent is shifting the cotangent the other way; of the two, the cotangent
-        # is unfolded anyway. Without the barrier, XLA swaps the operands to a form for which it has no bf16 kernel.
+        # Shifting the image against the cotangent is the same as shifting the cotangent the other way, and the
+        # cotangent is unfolded anyway. Without the barrier, XLA swaps the operands to a form without a bf16 kernel.
         across = transposed_in_memory(x.reshape(-1, inputs))  # C N
         rows = [jax.lax.optimization_barrier(_product(across, row)) for row in _rows(strip, size)]
         return total + jnp.stack(rows), _products(strip, turned)
@@ -104,13 +104,13 @@ def _in_strips(
 ) -> tuple[Any, Float[Array, "B h w D"]]:
     """Runs a function on strips of images that fit the processor's cache, one after another.
 
-    XLA gathers a batch that is sharded over devices in one program (``mesh``) before it is cut; under ``pmap`` each
-    device has its own.
+    If one program serves several devices (``mesh``), XLA gathers the sharded batch before it is cut; under ``pmap``
+    each device cuts its own part.
 
     Args:
-        run: from a total, an unfolded strip of ``x``, and the same strips of the other maps to a new total and a strip
-            of the result.
-        total: the first one.
+        run: takes a total, an unfolded strip of ``x`` and the same strips of the other maps; returns a new total and a
+            strip of the result.
+        total: the initial total.
         size: of the kernel.
 
     Returns:
@@ -140,7 +140,7 @@ def _unfold(strip: Float[Array, "B h2 w2 C"], size: int) -> Float[Array, "B h2 w
 
 
 def _rows(unfolded: Float[Array, "B h2 w jC"], size: int) -> list[Float[Array, "N jC"]]:
-    """Returns what each row of the kernel sees at every cell."""
+    """Returns the inputs of each row of the kernel at every cell."""
     height = unfolded.shape[1] - size + 1
     return [unfolded[:, i : i + height].reshape(-1, unfolded.shape[-1]) for i in range(size)]
 

@@ -1,4 +1,4 @@
-"""Floating-point operations of autoencoders: of the tokenizer by formula, of the others in the traced program.
+"""Floating-point operations of autoencoders: the tokenizer's by a formula, the others' from the traced program.
 
 The formula counts 2 per weight of a kernel and output position. Norms, activations and the quantiser are left out.
 Convolutions count padding like pixels, as libraries do.
@@ -45,8 +45,8 @@ def traced_flops(
     """Returns the operations of both halves of any autoencoder, the "encoder" and the "decoder".
 
     Args:
-        params: their shapes.
-        frames: the shape of what is encoded, float32.
+        params: the parameters' shapes.
+        frames: the shape of the frames to encode, float32.
         encode: from parameters and frames to latents or tokens.
         decode: from parameters and what ``encode`` returns to frames.
     """
@@ -56,7 +56,7 @@ def traced_flops(
 
 
 def products(jaxpr: Any) -> int:
-    """Returns the operations of the products and convolutions in a program, those of a scan as often as it turns."""
+    """Returns the operations of the products and convolutions in a program; a scan's count once per iteration."""
     total = 0
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "dot_general":

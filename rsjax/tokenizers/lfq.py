@@ -98,7 +98,7 @@ def entropy_loss(
         offset: added to the average code's probabilities p in log p, 1e-5 in the reference; 0 gives the true entropy.
             It matters at 18 bits, where most of the 262,144 codes are rarer than 1e-5: the gradient's cosine to that
             of the true entropy is 0.8 to 0.95 for 16,384 tokens (latents of scale 0.05 to 1), for 64 even negative.
-        total: adds arrays over devices. The average code covers all devices' tokens, the mean entropy this device's.
+        total: adds arrays over devices. The average code covers all devices' tokens, the mean entropy only this one's.
     """
     logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
     log_one, log_zero = jax.nn.log_sigmoid(logits), jax.nn.log_sigmoid(-logits)

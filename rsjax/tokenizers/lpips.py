@@ -92,7 +92,7 @@ def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
     """Loads the weights of a file as a nested dict, such as ``["backbone"]["0"]["weight"]``.
 
     Args:
-        wanted_net: the network that the file has to be of; any if empty.
+        wanted_net: the network whose weights the file must contain; any if empty.
 
     Raises:
         LpipsError: the file is missing or damaged, or a tensor is missing, unexpected or of another shape.

@@ -65,17 +65,17 @@ def prepare_store(
     more: Callable[[Record], Record] | None = None,
     more_key: tuple[int, ...] = (),
 ) -> Store:
-    """Makes what an autoencoder maps every clip to, unless it exists.
+    """Makes the store of every clip's tokens or latents, unless it exists.
 
     Args:
         config: the autoencoder's settings (``Config.autoencoder``).
         params: its trained parameters.
-        encode: returns a clip's token record, with the fields of :func:`described` beside its tokens or latents.
+        encode: returns a clip's token record, with the fields of :func:`described` besides its tokens or latents.
         image_size: pixels per side of its images.
         place: a directory for the list of damaged clips, and for the tokens if the store is write-protected.
         max_damaged: the share of a split's clips that may be damaged.
         more: returns further fields of a training clip's token record.
-        more_key: what these depend on.
+        more_key: numbers that these further fields depend on.
 
     Returns:
         The store of tokens.
@@ -147,7 +147,7 @@ def _write(
 
 
 def _listed(path: Path, clips: Store, max_damaged: float, place: Path) -> Store:
-    """Opens the store of tokens and lists clips without tokens; raises if too many or of the test split."""
+    """Opens the store of tokens and lists clips without tokens; raises if too many, or any of the test split."""
     tokens = open_store(path)
     for split, numbers in tokens.manifest.get(_LEFT_OUT, {}).items():
         source = clips.source(split)
@@ -174,7 +174,7 @@ def token_record(codec: Codec, clip: Record) -> Record:
 
 
 def shifted_tokens(codec: Codec, clip: Record, count: int, pixels: int) -> Record:
-    """Returns the tokens of a clip's moved copies, which the clip itself decides.
+    """Returns the tokens of a clip's moved copies; the moves depend only on the clip's pixels.
 
     Returns:
         ``shifts``, the moves to the right and down in widths of the image (count, 2), and ``rgb_shifted`` and
@@ -191,7 +191,7 @@ def shifted_tokens(codec: Codec, clip: Record, count: int, pixels: int) -> Recor
 
 
 def described(clip: Record) -> Record:
-    """Returns the fields that a clip's token record has beside its tokens: actions, tracks, labels."""
+    """Returns the fields that a clip's token record has besides its tokens: actions, tracks, labels."""
     return {
         "actions": clip["actions"],
         "tracks": clip["tracks"],

@@ -75,7 +75,7 @@ class TokenizerTraining(Autoencoder[Images]):
         return {"generator": generator, "discriminator": Discriminator().init_params(jax.random.fold_in(key, 1))}
 
     def init_extra(self) -> Extra:
-        """Returns LeCAM's averages and LPIPS's weights, which would be 59 MB of constants in the compiled step.
+        """Returns LeCAM's averages and LPIPS's weights, which would otherwise be 59 MB of constants in the program.
 
         Raises:
             LpipsError: the file ``train.lpips_weights`` is missing or damaged.

@@ -1,7 +1,7 @@
 """The public image autoencoders (VAE, VQ) of ``diffusers``: both halves, and their layers.
 
-Convolutions have biases, norms are GroupNorms with epsilon 1e-6. :mod:`rsjax.convert.vae_names` knows the public names
-of the modules here.
+Convolutions have biases, norms are GroupNorms with epsilon 1e-6. :mod:`rsjax.convert.vae_names` lists the public names
+of these modules.
 
 Axes: N images, h×w cells, C channels.
 """
@@ -73,7 +73,7 @@ class SelfAttention(nn.Module):
 
 
 def middle(x: Map, groups: int, attention: bool) -> Map:
-    """Computes two residual blocks, perhaps with attention between, in the module that calls it."""
+    """Computes two residual blocks, optionally with attention between them, in the module that calls it."""
     x = ResBlock(x.shape[-1], groups, name="mid_block_0")(x)
     if attention:
         x = SelfAttention(groups, name="mid_attention")(x)
@@ -89,12 +89,12 @@ def encode(
     attention: bool,
     after: Callable[[Map], Map] = lambda x: x,
 ) -> Map:
-    """Computes the encoder in the module that calls it, a compact one; every level but the last halves the grid.
+    """Computes the encoder in the compact module that calls it; every level but the last halves the grid.
 
     Args:
         widths: channels of each level.
         out: channels of the result.
-        attention: whether the middle attends.
+        attention: whether the middle has attention.
         after: applied to the features after each level.
     """
     x = conv3(widths[0], "conv_in")(x)
@@ -117,7 +117,7 @@ def decode(
     attention: bool,
     after: Callable[[Map], Map] = lambda x: x,
 ) -> Map:
-    """Inverts :func:`encode` with one residual block more at each level; ``after`` also follows the middle."""
+    """Inverts :func:`encode` with one more residual block at each level; ``after`` also follows the middle."""
     x = after(middle(conv3(widths[-1], "conv_in")(x), groups, attention))
     for level, width in enumerate(reversed(widths)):
         for i in range(res_blocks + 1):
