@@ -1,1 +1,1 @@
-"""Grids of runs: some fields of a configuration vary, every combination runs with several seeds, one table."""
+"""Grids of runs: some fields of a configuration vary, each combination runs with several seeds, and a table results."""

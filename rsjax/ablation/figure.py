@@ -1,4 +1,4 @@
-"""A grid's table as a picture: a panel per metric, a line per combination of values."""
+"""Draws a grid's table as a picture: a panel per metric, a line per combination of values."""
 
 import io
 import textwrap
@@ -12,13 +12,13 @@ from rsjax.ablation.table import Row, best
 from rsjax.evaluation.registry import ABSENT, Metric
 
 PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
-PANEL, LINE = 2.3, 0.42  # inches: width of a panel, height of a line
+PANEL, LINE = 2.3, 0.42  # width of a panel and height of a line, in inches
 MAX_LINES = 150  # viewers refuse taller pictures
 LEGEND = "circles: seeds; bar: mean ± sample standard deviation; orange: best mean, which may be chance"
 
 
 def draw(rows: Sequence[Row], columns: Sequence[Metric], title: str) -> bytes:
-    """Returns the picture as PNG. Circles are seeds, bars the mean ± sample deviation; the best mean is orange."""
+    """Returns the picture as PNG: circles are seeds, bars are mean ± sample deviation, and the best mean is orange."""
     shown = rows[:MAX_LINES]
     left = 0.075 * max(len(row.label) for row in shown)
     size = (left + PANEL * max(1, len(columns)), 1.5 + LINE * len(shown))

@@ -1,4 +1,4 @@
-"""The cells of a grid, one for every combination of values with every seed, and ``grid.json``, which lists them."""
+"""Makes the cells of a grid, one per combination of values and seed, and ``grid.json``, which lists them."""
 
 import dataclasses
 import fnmatch
@@ -31,19 +31,19 @@ SWITCHES = {  # a field → the switch without which the field has no effect
 }
 SEED = "train.seed"
 FILE = "grid.json"
-LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # whose versions the file names
-NAME_LENGTH = 180  # of a cell's directory: file systems allow 255, and temporary files add suffixes
+LIBRARIES = ("rsjax", "jax", "flax", "optax", "numpy")  # libraries whose versions the file records
+NAME_LENGTH = 180  # limit for a cell's directory: file systems allow 255, and temporary files add suffixes
 NUMBERS = {int: "a whole number", float: "a number"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Cells and what they vary.
+    """Cells and the fields that vary among them.
 
     Attributes:
-        fields: the dotted names of the fields that vary; the configurations agree in all others but the seed.
+        fields: the dotted names of the fields that vary; the configurations agree in all other fields except the seed.
         cells: configuration by name, in order. A cell's name is its directory within the grid's.
-        versions: library → version, of the command that made the grid.
+        versions: library → version, for the command that made the grid.
     """
 
     fields: tuple[str, ...]
@@ -114,7 +114,7 @@ def parse_value(name: str, kind: Any, text: str) -> Value:
     """Parses one value of a field.
 
     Args:
-        name: the field, for the error.
+        name: the field's name, for the error.
         kind: its declared type.
 
     Raises:
@@ -136,11 +136,11 @@ def parse_value(name: str, kind: Any, text: str) -> Value:
 
 
 def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[int]) -> Grid:
-    """Returns all cells. The last axis changes fastest and the seed slowest: a grid that stops early has whole tables.
+    """Returns all cells. The last axis changes fastest and the seed slowest, so a stopped grid has complete tables.
 
     Raises:
-        ConfigError: no seed, a repeated one or one outside [0, 2³²); or cells that cannot run, with the first one's
-            name.
+        ConfigError: there is no seed, or a seed is repeated or outside [0, 2³²); or some cells cannot run, and the
+            message names the first of them.
     """
     flag = f"--seeds {' '.join(map(str, seeds))}"
     require(0 < len(seeds) == len(set(seeds)), f"{flag}: name one or more, each once")
@@ -163,9 +163,9 @@ def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
 
 
 def cell_name(values: Mapping[str, Value], seed: int) -> str:
-    """Returns a directory's name that shows the values: ``model.use_depth=True,loss.gamma=5.0,seed=0``.
+    """Returns a directory name that shows the values, such as ``model.use_depth=True,loss.gamma=5.0,seed=0``.
 
-    A name that is too long or has unsafe characters is shortened and cleaned, and a hash keeps it unique.
+    A name that is too long is shortened, unsafe characters are replaced, and a hash then keeps the name unique.
     """
     name = ",".join([*(f"{field}={value}" for field, value in values.items()), f"seed={seed}"])
     safe = re.sub(r"[^A-Za-z0-9_.=,+-]", "-", name)
@@ -175,7 +175,7 @@ def cell_name(values: Mapping[str, Value], seed: int) -> str:
 
 
 def repeated_cells(grid: Grid) -> list[str]:
-    """Returns one line per field that varies among cells whose switch takes its effect away."""
+    """Returns one line per field that varies among cells in which its switch is off, so that it has no effect."""
     cells, lines = [leaves(config) for config in grid.cells.values()], []
     for field, switch in SWITCHES.items():
         off = {known[field].value for known in cells if field in known and switch in known and not known[switch].value}
@@ -187,8 +187,8 @@ def repeated_cells(grid: Grid) -> list[str]:
 def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, ...]]:
     """Adds cells to a directory's grid.
 
-    A cell with the values of an earlier one is that one, under its earlier name. The others are named by all fields
-    that vary now.
+    A cell with the same values as an earlier cell is that cell, and keeps its earlier name. The others are named by all
+    fields that vary now.
 
     Args:
         out: the directory, for the error.
@@ -197,7 +197,7 @@ def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, .
         The whole grid, and the names of the new cells in it.
 
     Raises:
-        ConfigError: the earlier cells have another configuration; the message names the differing fields.
+        ConfigError: the earlier cells differ in other fields, which the message names.
     """
     if before is None:
         return new, tuple(new.cells)
@@ -226,7 +226,7 @@ def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, .
 
 
 def read_grid(out: Path) -> Grid | None:
-    """Reads a directory's ``grid.json``; returns None where there is none.
+    """Reads a directory's ``grid.json``; returns None if there is none.
 
     Raises:
         ConfigError: the file is damaged or of another version.
@@ -247,10 +247,10 @@ def add_cells(out: Path, new: Grid, choice: Choice) -> tuple[Grid, tuple[str, ..
     """Writes ``grid.json`` with these cells added; a bad choice changes nothing.
 
     Returns:
-        The whole grid, and the names of the chosen ones among the new cells.
+        The whole grid, and the names of the chosen cells among the new ones.
 
     Raises:
-        ConfigError: as :func:`merge` and :meth:`Choice.of`.
+        ConfigError: as for :func:`merge` and :meth:`Choice.of`.
     """
     with lock(out / ".locks" / "grid", wait=f"{out}: waiting for another command that writes {FILE}"):
         before = read_grid(out)

@@ -1,9 +1,9 @@
 """Runs the cells of a grid one after another; any number of processes may work on it at once, on several machines.
 
-What several cells need is made once. The clips lie outside the runs. A tokenizer, its tokens and, where cells differ
-only in how they are sampled or scored, the world model are made under ``shared``, each in a run directory named by its
-content key. They come into the cells as hard links, so every cell is a whole run directory that can be moved, resumed
-or deleted by itself and takes no disk space twice.
+What several cells need is made once. The clips are stored outside the runs. A tokenizer, its tokens and, if cells
+differ only in how they are sampled or scored, the world model are made under ``shared``, each in a run directory named
+by its content key. They are put into the cells as hard links, so every cell is a complete run directory, which can be
+moved, resumed or deleted on its own, and no file takes disk space twice.
 """
 
 import os
@@ -39,21 +39,21 @@ from rsjax.pipeline import stages
 from rsjax.pipeline.run import Run, link
 from rsjax.progress import note, stage
 
-SHARED = ("tokenizer", "tokens", "world_model")  # each needs those before it
+SHARED = ("tokenizer", "tokens", "world_model")  # each stage needs the stages before it
 
 
 def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "") -> dict[str, State]:
-    """Adds cells to a directory, runs the chosen ones that are not finished, and writes the tables after each.
+    """Adds cells to a directory, runs the chosen ones that are not finished, and writes the tables after each cell.
 
-    A cell that fails is recorded and the next one starts. An interrupt or SIGTERM ends the command.
+    A cell that fails is recorded, and the next one starts. An interrupt or SIGTERM ends the command.
 
     Args:
         out: the grid's directory, with a run directory per cell.
         data: the directory of simulated data sets.
-        command: how to repeat the sweep, for the cells' reports.
+        command: the command that repeats the sweep, for the cells' reports.
 
     Returns:
-        The state of each chosen cell, by name; "running" where another process runs it.
+        The state of each chosen cell, by name; "running" if another process runs it.
 
     Raises:
         ConfigError: ``out`` holds a grid of another configuration, or the choice fits no cell.
@@ -79,12 +79,13 @@ def run_cell(name: str, runs: Mapping[str, Run], shared: Path, place: tuple[int,
     """Runs a cell unless it is finished or another process runs it. A failure is recorded in its ``error.json``.
 
     Args:
-        name: of the cell among ``runs``, from which it may take what they have in common.
+        name: the cell's name among ``runs``; it may take the stages that it has in common with the others.
         shared: the directory where shared stages are made and kept.
-        place: the cell's number and that of all, for the headline.
+        place: the cell's number and the number of cells, for the headline.
+        command: the command that repeats the sweep, for the report.
 
     Returns:
-        Its state; "running" where another process runs it.
+        The cell's state; "running" if another process runs it.
 
     Raises:
         Preempted: SIGTERM; the unfinished cell is saved.
@@ -114,23 +115,23 @@ def _run_cell(run: Run, others: Sequence[Run], shared: Path, command: str) -> St
         line = " ".join((str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}").split())
         note(f"failed: {line}")
         record = {"error": line, "time": time.strftime("%Y-%m-%d %H:%M:%S"), "traceback": traceback.format_exc()}
-        with suppress(FileError):  # on a full disk only the terminal shows it, and the cell counts as interrupted
+        with suppress(FileError):  # on a full disk, only the terminal shows the error; the cell counts as interrupted
             write_json(failure, record)
         return "failed"
     finally:
-        jax.clear_caches()  # no other cell uses a cell's compiled programs; they would pile up
+        jax.clear_caches()  # no other cell uses this cell's compiled programs, which would accumulate
     return "finished"
 
 
 def share(run: Run, others: Sequence[Run], shared: Path) -> None:
-    """Gives a cell's run the stages that it has in common with others, and makes those that nobody has made.
+    """Gives a cell's run the stages that it has in common with others, and makes those that do not exist yet.
 
-    Any finished run beside it serves, also one of an earlier command, if its own mark has the stage's content key.
-    Processes that need the same stage wait for the one that makes it. If that one is killed, the next continues from
-    its checkpoints.
+    A stage is taken from any run in the same directory that has finished it, also from a run of an earlier command, if
+    the mark of its stage has the same content key. Processes that need the same stage wait for the one that makes it.
+    If that process is killed, the next one continues from its checkpoints.
 
     Args:
-        others: the other cells' runs, for which it makes what they have in common.
+        others: the other cells' runs; a world model is made under ``shared`` only if one of them needs the same.
         shared: the directory where shared stages are made and kept.
     """
     if not run.finished("collect"):
@@ -151,7 +152,7 @@ def share(run: Run, others: Sequence[Run], shared: Path) -> None:
 
 
 def _make(maker: Run, run: Run, name: str) -> None:
-    """Makes a stage in a shared run directory, from the stages before it, which the cell's run has."""
+    """Makes a stage in a shared run directory; the stages before it are taken from the cell's run."""
     maker.prepare(overwrite=False)
     for before in (before for before in SHARED[: SHARED.index(name)] if before in run.stages):
         link_stage(run, maker, before)
@@ -162,10 +163,10 @@ def _make(maker: Run, run: Run, name: str) -> None:
 
 
 def link_stage(source: Run, run: Run, name: str) -> None:
-    """Puts a finished stage of one run into another, where it appears whole. Its checkpoints stay behind.
+    """Puts a finished stage of one run into another run, where it appears at once and complete, without checkpoints.
 
-    The stage's output never changes and is linked, also the tokens that it keeps itself (``OWN``); logs and marks are
-    copied.
+    The stage's output never changes, so it is hard-linked, as are the tokens that the stage itself keeps (``OWN``);
+    logs and marks are copied.
     """
     if run.finished(name):
         return
@@ -197,10 +198,10 @@ def _hard_link(path: str, to: str) -> bool:
 def write_tables(out: Path, data: Path) -> list[Row]:
     """Writes ``table.md``, ``.csv``, ``.json`` and ``.png`` of all cells in ``grid.json`` as they are now.
 
-    Of several processes the last one to write has also read last, so the files never fall behind.
+    If several processes write, the last one to write has also read last, so the files are never out of date.
 
     Raises:
-        ConfigError: ``out`` holds no grid.
+        ConfigError: ``out`` contains no grid.
         FileError: the disk is full.
     """
     require((out / FILE).exists(), f"{out} holds no grid ({FILE}); choose its directory with --out, or run it first")
@@ -218,13 +219,13 @@ def write_tables(out: Path, data: Path) -> list[Row]:
 
 
 def print_table(out: Path, data: Path) -> None:
-    """Writes the tables, and prints the table and the paths of the files. Raises as :func:`write_tables`."""
+    """Writes the tables, and prints the table and the paths of the files. Errors as in :func:`write_tables`."""
     print(f"\n{as_markdown(write_tables(out, data))}")
     print(f"table: {(out / 'table.md').absolute()} (and .csv, .json)\npicture: {(out / 'table.png').absolute()}")
 
 
 def print_cells(new: Grid, choice: Choice, out: Path, data: Path) -> None:
-    """Prints the chosen cells with their numbers and states. Nothing is written. Raises as :func:`run_sweep`."""
+    """Prints the chosen cells with their numbers and states, and writes nothing. Errors as in :func:`run_sweep`."""
     grid, names = merge(read_grid(out), new, out)
     chosen, runs = choice.of(names), runs_of(grid, out, data)
     for number, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""The results of a grid's cells and their table: a row per combination of values, mean ± deviation over the seeds."""
+"""Reads the results of a grid's cells and makes their table: a row per combination, mean ± deviation over the seeds."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ from rsjax.pipeline.run import Run
 from rsjax.training.log import read_log
 
 ERROR = "error.json"  # in the directory of a cell that failed
-FINAL_SHARE = 0.1  # of the logged steps, over which a loss term is averaged
+FINAL_SHARE = 0.1  # share of the logged steps, at the end, over which a loss term is averaged
 LEGEND = (
     "Mean ± sample standard deviation over the finished seeds (of all). **Bold**: the best mean of its column, "
     "which may be chance. L: training loss terms, mean over the last tenth of the logged steps."
@@ -32,8 +32,8 @@ class Result:
 
     Attributes:
         reason: one line that says why there are no metrics.
-        metrics: the numbers of ``metrics.json``, and ``loss_rgb`` … at the end of training.
-        reasons: why it has no number for a registered metric, by name.
+        metrics: the numbers of ``metrics.json``, and the loss terms (``loss_rgb``, …) at the end of training.
+        reasons: why a registered metric has no number, by name.
     """
 
     run: Run
@@ -44,7 +44,7 @@ class Result:
 
     @property
     def name(self) -> str:
-        """The cell's."""
+        """The cell's name."""
         return self.run.directory.name
 
 
@@ -58,12 +58,12 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The cells that differ in their seed alone.
+    """The cells that differ only in their seed.
 
     Attributes:
         values: the value of every field that varies.
         results: one per seed.
-        spreads: of the finished results, for every metric that any of them has.
+        spreads: those of the finished results, for every metric that any of them has.
     """
 
     values: dict[str, Value]
@@ -72,18 +72,18 @@ class Row:
 
     @property
     def label(self) -> str:
-        """``model.use_depth True, model.loss.use_keypoints False``."""
+        """The row's values, such as ``model.use_depth True, model.loss.use_keypoints False``."""
         return ", ".join(f"{name} {value}".strip() for name, value in self.values.items()) or "as configured"
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why a result has no number for a metric, by name."""
+        """Why a result of the row has no number for a metric, by name."""
         return {name: reason for result in self.results for name, reason in result.reasons.items()}
 
 
 def read_result(run: Run) -> Result:
     """Reads a cell's state and metrics; damaged files count as unfinished, and nothing is changed."""
-    if (metrics := read_metrics(run)) is not None:  # though another evaluation of it may be under way
+    if (metrics := read_metrics(run)) is not None:  # even while another command evaluates it again
         return Result(run, "finished", "", metrics, read_reasons(run))
     if is_held(run.lock_file):
         return Result(run, "running", f"in {holder(run.lock_file)}", {})
@@ -96,7 +96,7 @@ def read_result(run: Run) -> Result:
 
 
 def read_metrics(run: Run) -> dict[str, float] | None:
-    """Returns a run's metrics and the end of its loss terms; None where it is not finished or a file is damaged."""
+    """Returns a run's metrics and final loss terms; None if the run is not finished or a file is damaged."""
     if not run.finished("report"):
         return None
     try:
@@ -110,7 +110,7 @@ def read_metrics(run: Run) -> dict[str, float] | None:
 
 
 def read_reasons(run: Run) -> dict[str, str]:
-    """Returns why a run's ``metrics.json`` has no number for a metric, by name; empty where it does not say."""
+    """Returns why a run's ``metrics.json`` has no number for a metric, by name; empty if the file gives no reasons."""
     with suppress(FileError):
         reasons = read_json(run.directory / "metrics.json").get("reasons")
         return {name: str(reason) for name, reason in reasons.items()} if isinstance(reasons, dict) else {}
@@ -119,7 +119,7 @@ def read_reasons(run: Run) -> dict[str, str]:
 
 def final_terms(log: Sequence[Mapping[str, Any]], terms: Sequence[str]) -> dict[str, float]:
     """Returns ``loss_<term>``: each term's mean over the last tenth of the logged steps (at least one)."""
-    steps = [row for row in log if any(term in row for term in terms)]  # validation metrics have rows of their own
+    steps = [row for row in log if any(term in row for term in terms)]  # validation metrics are in separate rows
     last = steps[-max(1, round(FINAL_SHARE * len(steps))) :]
     values = {term: [row[term] for row in last if term in row] for term in terms}
     return {f"loss_{term}": float(np.mean(numbers)) for term, numbers in values.items() if numbers}
@@ -145,7 +145,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def best(rows: Sequence[Row], column: Metric) -> set[int]:
-    """Returns the rows whose mean, rounded as shown, is the best; none where fewer than two rows have a mean."""
+    """Returns the rows whose mean, rounded as shown, is the best; an empty set if fewer than two rows have a mean."""
     spreads = {i: row.spreads[column.name] for i, row in enumerate(rows) if column.name in row.spreads}
     means = {i: round(s.mean, column.decimals) for i, s in spreads.items() if not math.isnan(s.mean)}
     top = (max if column.better == "higher" else min)(means.values(), default=None)
@@ -153,10 +153,10 @@ def best(rows: Sequence[Row], column: Metric) -> set[int]:
 
 
 def shown_columns(rows: Sequence[Row], with_reasons: bool = False) -> tuple[Metric, ...]:
-    """Returns the registered metrics, and the loss terms of the last steps, that any row has a number for.
+    """Returns the metrics with a column, and the loss terms of the last steps, for which any row has a number.
 
     Args:
-        with_reasons: also those that a row only has a reason for.
+        with_reasons: also return metrics for which a row only has a reason.
     """
     names = dict.fromkeys(name for row in rows for name in row.spreads)
     terms = [name for name in names if name.startswith("loss_")]
@@ -167,7 +167,7 @@ def shown_columns(rows: Sequence[Row], with_reasons: bool = False) -> tuple[Metr
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """Returns the table, its legend, reasons for absent metrics, and every cell that is not in it with its reason."""
+    """Returns the table, its legend, reasons for absent metrics, and each cell that is missing, with the reason."""
     columns, fields, notes = shown_columns(rows, with_reasons=True), list(rows[0].values), Footnotes()
     texts = [[*fields, "seeds", *(column.heading for column in columns)]]
     for row in rows:
@@ -194,7 +194,7 @@ def _number(row: Row, column: Metric, notes: Footnotes) -> str:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """Returns one line per row: its values, then mean, standard deviation and n of every metric, empty where absent."""
+    """Returns one line per row: its values, then mean, deviation and n of every metric; absent numbers are empty."""
     names = dict.fromkeys(name for row in rows for name in row.spreads)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -8,7 +8,7 @@ _METRICS = ("psnr", "delta_psnr")
 
 
 def _departure(name: str, title: str, statement: str, letter: dict[str, Any], metrics: tuple[str, ...]) -> None:
-    """Registers the claim that our choice is better than ``letter``, the fields that follow the paper or its code."""
+    """Registers the claim that our choice is better than ``letter``, the values of the paper or the public code."""
     register(
         Claim(
             name=f"departure-{name}",
