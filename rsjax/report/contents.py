@@ -1,4 +1,4 @@
-"""The contents of a store: counts, shapes and histograms as text."""
+"""Describes the contents of a store as text: counts, shapes and histograms."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +11,8 @@ from rsjax.data.store import NO_ARRAY, Store, StoreError
 from rsjax.data.token_sets import token_sets
 
 BARS = " ▁▂▃▄▅▆▇█"
-MOST_DIMENSIONS = 32  # of actions whose means are listed one by one
-MOST_WORDS = 10  # of a column's labels
+MOST_DIMENSIONS = 32  # actions with at most this many dimensions get a line for each dimension
+MOST_WORDS = 10  # labels listed per column
 TRACK_UNIT = "% of a side per frame"
 MOTION_UNIT = "px/s of a 256-pixel-wide picture (as --windows.least-motion)"
 
@@ -21,10 +21,10 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
     """Describes a store of clips or of tokens.
 
     Args:
-        most: how many records are read, spread evenly over the splits; counts and labels are of all.
+        most: how many records are read, spread evenly over the splits; counts and labels cover all records.
 
     Returns:
-        Lines of text, and the messages of damaged records, which the lines include.
+        Lines of text, and the messages of damaged records, which the lines include as well.
     """
     damaged: list[str] = []
     lengths, cameras, rates = Counter[int](), Counter[str](), Counter[str]()
@@ -64,7 +64,7 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
 
 
 def left_out(manifest: Mapping[str, Any]) -> dict[str, int]:
-    """Returns how much is not in a store, by reason; of a merged store, which has no counts, only its episodes."""
+    """Returns how much was left out of a store, by reason; for a merged store, which has no counts, only episodes."""
     counts = manifest.get("counts") or {}
     reasons = {
         "episodes without a clip": counts.get("without", len(manifest.get("filtered") or {})),
@@ -76,7 +76,7 @@ def left_out(manifest: Mapping[str, Any]) -> dict[str, int]:
 
 
 def motion_of(record: Record) -> float:
-    """Returns the mean distance that tracks move to the next frame where they are visible in both, in % of a side."""
+    """Returns the mean distance that tracks move between frames in which they are visible, in % of a side per frame."""
     steps = np.linalg.norm(np.diff(record["tracks"], axis=1), axis=-1)
     seen = record["visible"][:, 1:] & record["visible"][:, :-1]
     return float(100 * steps[seen].mean()) if seen.any() else 0.0
@@ -93,10 +93,10 @@ def histogram(values: Sequence[float], unit: str, bins: int = 24) -> str:
 
 
 def clips_of(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
-    """Yields clips with pictures, as :func:`sampled` does.
+    """Yields clips as :func:`sampled` does, and checks that they have pictures.
 
     Raises:
-        StoreError: the store holds tokens, or no clip can be read.
+        StoreError: the store contains tokens, or no clip can be read.
     """
     none = True
     for split, number, record in sampled(store, most, damaged):
@@ -109,11 +109,11 @@ def clips_of(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str,
 
 
 def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, int, Record]]:
-    """Yields split, number and record of records spread evenly over all splits.
+    """Yields split, number and record of records that are spread evenly over all splits.
 
     Args:
-        most: how many.
-        damaged: gets the messages of records that cannot be read.
+        most: the largest number of records.
+        damaged: a list to which the messages of unreadable records are added.
     """
     sources = [store.source(split) for split in store.splits]
     ends = np.cumsum([len(source) for source in sources])
@@ -128,7 +128,7 @@ def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, 
 
 
 def _rate(provenance: Mapping[str, Any]) -> list[str]:
-    """Returns how a record's frames lie in its recording, in words, if its provenance says so."""
+    """Returns, in words, at which rate a record's frames were taken from its recording, if its provenance says so."""
     fps, frames = provenance.get("fps"), provenance.get("frames", [])
     if not fps or len(frames) < 2:
         return []
@@ -139,7 +139,7 @@ def _rate(provenance: Mapping[str, Any]) -> list[str]:
 
 
 def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Returns a line for each dimension of the actions where their names are known, otherwise one for all."""
+    """Returns a line for each dimension of the actions if their names are known, otherwise one line for all."""
     figures = zip((manifest.get("action_mean") or []), (manifest.get("action_std") or []), strict=False)
     units = [f"{mean:.3g}±{std:.2g}" for mean, std in figures]
     names = manifest.get("action_dimensions") or []
@@ -149,7 +149,7 @@ def _dimensions(manifest: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _ranges(actions: Sequence[np.ndarray]) -> str:
-    """Returns dimensions, least, greatest and mean value of the actions of some clips."""
+    """Returns the number of dimensions and the least, greatest and mean value of some clips' actions, as text."""
     rows = [one for one in actions if one.size]
     if not rows:
         return ""
@@ -159,7 +159,7 @@ def _ranges(actions: Sequence[np.ndarray]) -> str:
 
 
 def _words(store: Store) -> dict[str, Counter[str]]:
-    """Returns the number of records by label, by column; the splits together."""
+    """Returns, for each column of labels, the number of records with each label, over all splits."""
     words: dict[str, Counter[str]] = {}
     for name in filter(store.labelled, store.splits):
         for column, counts in store.labels(name).counts().items():

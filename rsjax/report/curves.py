@@ -23,8 +23,8 @@ def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
     """Draws a small chart per scalar of a log, as :func:`charts_svg` does.
 
     Args:
-        log: one dict per logged step, with "step"; its other numbers are drawn, other values are ignored. A scalar may
-            be missing at some steps. Values that are not finite leave a gap.
+        log: one dict per logged step, with "step"; its other numbers are drawn, and values that are not numbers are
+            ignored. A scalar may be missing at some steps. Values that are not finite leave a gap.
         name: makes the element ids of several drawings on a page distinct.
 
     Raises:
@@ -38,13 +38,13 @@ def curves_svg(log: Sequence[dict[str, Any]], name: str) -> str:
 
 
 def charts_svg(charts: Sequence[Chart], name: str, legend: bool = False, height: float = 1.9) -> str:
-    """Draws charts, four in a row, as one <svg> element that inherits the page's font and text colour.
+    """Draws charts, four per row, as one <svg> element that inherits the page's font and text colour.
 
     Args:
         charts: each draws into the axes that it gets; ``INK`` becomes the text colour.
         name: says what is drawn, and makes the element ids of several drawings on a page distinct.
-        legend: draw one legend, of the first chart's labels, above all.
-        height: of a row, where the width of four charts is 11.6.
+        legend: draw one legend with the first chart's labels above all charts.
+        height: the height of a row, in units in which the whole width is 11.6.
     """
     rows = math.ceil(len(charts) / _COLUMNS)
     settings: dict[Any, Any] = {

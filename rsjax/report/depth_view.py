@@ -1,6 +1,6 @@
-"""Colours depth for viewing, in reports, sheets and videos alike, and draws the scale of the colours.
+"""Colours depth in the same way for reports, sheets and videos, and draws the scale of the colours.
 
-The tokenizer sees other colours: those of :mod:`rsjax.data.depth_color`.
+The tokenizer uses other colours, those of :mod:`rsjax.data.depth_color`.
 """
 
 import matplotlib
@@ -17,10 +17,10 @@ _TICK_APART = 90  # pixels
 
 
 def depth_range(*depths: Float[np.ndarray, "..."]) -> tuple[float, float]:
-    """Returns the depths of the first and last colour: 1st and 99th percentile of those that are known.
+    """Returns the depths of the first and last colour: the 1st and 99th percentile of the known depths.
 
     Raises:
-        ValueError: none is.
+        ValueError: no depth is known.
     """
     known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths])
     if not known.size:
@@ -32,10 +32,10 @@ def depth_range(*depths: Float[np.ndarray, "..."]) -> tuple[float, float]:
 def depth_to_colors(depth: Float[np.ndarray, "..."], near: float, far: float) -> UInt8[np.ndarray, "... 3"]:
     """Colours depth with the turbo map: red at ``near`` and closer, violet at ``far`` and farther.
 
-    Colour is linear in 1/depth, which resolves close depths best. Where there is no depth (0 or NaN) it is black.
+    Colour is linear in 1/depth, which resolves close depths best. Pixels without depth (0 or NaN) are black.
 
     Raises:
-        ValueError: not 0 < ``near`` < ``far``.
+        ValueError: 0 < ``near`` < ``far`` does not hold.
     """
     if not 0 < near < far:
         raise ValueError(f"depth colours need 0 < near < far, not near = {near} m and far = {far} m")
@@ -47,7 +47,7 @@ def depth_to_colors(depth: Float[np.ndarray, "..."], near: float, far: float) ->
 def depth_scale(
     near: float, far: float, width: int, unit: str, background: tuple[int, int, int]
 ) -> UInt8[np.ndarray, "30 width 3"]:
-    """Draws the colours from ``near`` to ``far``, with depths below them.
+    """Draws the colours from ``near`` to ``far``, with numbers for depth below them.
 
     Args:
         unit: "metres" or "relative" (see :mod:`rsjax.ingest.annotators.depth`).

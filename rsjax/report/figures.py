@@ -11,7 +11,7 @@ from rsjax.report.depth_view import SCALE, depth_range, depth_scale, depth_to_co
 from rsjax.report.lettering import font
 from rsjax.report.video import resize
 
-_BACKGROUND = (24, 26, 30)  # dark, which suits light and dark pages alike
+_BACKGROUND = (24, 26, 30)  # dark, which suits both light and dark pages
 _TEXT = (222, 225, 230)
 _FAINT = (120, 126, 136)
 _GAP = 6
@@ -25,7 +25,7 @@ _CELL_KEYPOINTS = 448
 
 @dataclass(frozen=True)
 class ClipFigure:
-    """A test clip and the frames generated from its prompt. A field that is None has no row.
+    """A test clip and the frames generated from its prompt; a field that is None has no row.
 
     Attributes:
         title: the caption.
@@ -34,7 +34,7 @@ class ClipFigure:
         reconstruction: the truth, encoded and decoded by the tokenizer: an upper bound on any prediction's quality.
         other_actions: frames generated from the same prompt and another clip's actions.
         true_depth: metres, or relative; 0 or NaN where there is none.
-        predicted_depth: likewise, from the depth branch.
+        predicted_depth: the depth branch's, in the same unit.
         depth_unit: "metres" or "relative".
         tracks: keypoints, x and y in 0–1 as in :class:`rsjax.clip.Clip`.
         visible: as in :class:`rsjax.clip.Clip`.
@@ -70,14 +70,14 @@ class ClipFigure:
             raise ValueError(f"visible of clip {self.title!r} must have its tracks' shape {self.tracks.shape[:2]}")
 
     def depth_range(self) -> tuple[float, float]:
-        """Returns the depths of the first and last colour, of the truth if known."""
+        """Returns the depths of the first and last colour, from the true depth if it is known."""
         depth = self.true_depth if self.true_depth is not None else self.predicted_depth
         if depth is None:
             raise ValueError(f"clip {self.title!r} has no depth")
         return depth_range(depth)
 
     def has_depth(self) -> bool:
-        """Returns whether rows of depth, and their scale, are drawn."""
+        """Returns whether rows of depth and their scale are drawn."""
         return self.true_depth is not None or self.predicted_depth is not None
 
     def rows(self) -> list[tuple[str, UInt8[np.ndarray, "T H W 3"]]]:
@@ -165,15 +165,15 @@ def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
 def keypoints(clip: ClipFigure) -> UInt8[np.ndarray, "h w 3"]:
     """Draws the first frame with a dot where each track starts, and the trails of the selected tracks.
 
-    Colour encodes how far a point moves over the steps at which it is visible at both ends, from blue for the least
-    of the selected points to orange for the most. Trails cover only those steps.
+    Colour encodes how far a point moves over the steps in which it is visible in both frames, from blue for the
+    selected point that moves least to orange for the one that moves most. Trails cover only these steps.
 
     Raises:
         ValueError: the clip has no tracks.
     """
     if clip.tracks is None or clip.visible is None:
         raise ValueError(f"clip {clip.title!r} has no tracks")
-    over = 2  # draw at twice the size and reduce, for smooth lines
+    over = 2  # draw at twice the size, then reduce it, for smooth lines
     image = Image.fromarray(resize(clip.truth[:1], over * _scale(clip, _CELL_KEYPOINTS))[0])
     draw = ImageDraw.Draw(image)
     points = clip.tracks * np.array(image.size)

@@ -1,4 +1,4 @@
-"""Draws text on pictures, in a font of this machine that has its letters."""
+"""Chooses a font of this machine that has the letters of a text, to draw the text on pictures."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -11,7 +11,7 @@ _DEFAULT = str(font_manager.findfont("DejaVu Sans"))  # comes with matplotlib
 
 
 def font(size: int, text: str = "") -> ImageFont.FreeTypeFont:
-    """Returns the font in which to draw a text: the first one with all its letters, else the one with most."""
+    """Returns the font in which to draw a text: the first font with all its letters, else the one with most of them."""
     wanted = _letters(text)
     best = _DEFAULT
     for path in _fonts():

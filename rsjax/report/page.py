@@ -19,7 +19,7 @@ from rsjax.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, pl
 from rsjax.report.targets import judge
 from rsjax.report.video import webp_uri
 
-_FPS = 4  # at which the player starts; one of its rates
+_FPS = 4  # the rate at which the player starts; one of its rates
 
 Row = tuple[str, str]
 Column = tuple[str, str, int]
@@ -45,16 +45,16 @@ _CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
 
 @dataclass(frozen=True)
 class Report:
-    """The contents of a page. The page leaves out the sections of empty fields.
+    """The contents of a page; the page leaves out the sections of empty fields.
 
     Attributes:
         preset: the run's preset.
         metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` bound the 95 % interval of ``name``. The page
-            lists all of them, and tabulates those of its columns.
-        reasons: why a metric is absent, by name; footnotes of its cells.
-        clips: test clips; the player that heads the page opens with the first one.
+            lists all of them, and its tables show those of their columns.
+        reasons: why a metric is absent, by name; the cells of absent metrics refer to them in footnotes.
+        clips: test clips; the player at the top of the page opens with the first one.
         curves: scores at each predicted frame, as in curves.json.
-        per_clip: the scores of single clips by name, of which the errors of places are drawn.
+        per_clip: the scores of single clips by name; only the errors of places are drawn.
         logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
         config: nested settings, JSON-ready.
         versions: library → version.
@@ -81,7 +81,7 @@ def write_report(path: Path, report: Report) -> None:
     """Writes the page atomically.
 
     Raises:
-        ValueError: a log without numbers.
+        ValueError: a log has no numbers.
         FileError: the disk is full or the directory is not writable.
     """
     environment = template_environment()
@@ -112,7 +112,7 @@ def write_report(path: Path, report: Report) -> None:
 
 
 def template_environment(package: str = "rsjax.report") -> jinja2.Environment:
-    """Returns the environment of a package's templates, which may include those of this one, such as the style."""
+    """Returns the environment of a package's templates; they may include those of rsjax.report, such as the style."""
     loaders = [jinja2.PackageLoader(name, ".") for name in dict.fromkeys((package, "rsjax.report"))]
     return jinja2.Environment(
         loader=jinja2.ChoiceLoader(loaders),
@@ -138,7 +138,7 @@ def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
 
 
 def _table(report: Report, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
-    """Returns the header and the cells of the rows and columns with a metric or a reason; None without any metric."""
+    """Returns the header and the cells of rows and columns that have a metric or a reason; None without any metric."""
     if not any(key.format(suffix) in report.metrics for key, _, _ in columns for suffix, _ in rows):
         return None
     known = {*report.metrics, *report.reasons}

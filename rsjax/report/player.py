@@ -1,7 +1,7 @@
-"""The report's player: what its scripts show of each clip, and the scripts themselves.
+"""The report's player: the data of each clip that its scripts show, and the scripts themselves.
 
-The modules in ``player/`` are plain JavaScript. The page of :mod:`rsjax.play` loads some of them as they are; the
-report, which has to open from a disk, holds them as one script.
+The modules in ``player/`` are plain JavaScript. The page of :mod:`rsjax.play` loads some of them as they are. The
+report has to open directly from a disk, so it contains them as one script.
 """
 
 import re
@@ -16,12 +16,12 @@ from rsjax.report.depth_view import depth_to_colors
 from rsjax.report.figures import ClipFigure
 from rsjax.report.video import sprite_uri
 
-SCRIPTS = ("dom.js", "transport.js", "chart.js", "gallery.js")  # a module after those that it imports
+SCRIPTS = ("dom.js", "transport.js", "chart.js", "gallery.js")  # each module comes after those that it imports
 STYLES = ("controls.css", "gallery.css")
-# Rows by place: a wide page shows three beside each other, a narrow one two, each depth below its picture.
+# The order of the rows: a wide page shows three side by side, a narrow page two, each depth below its picture.
 _WIDE = ("truth", "prediction", "tokenizer's reconstruction", "true depth", "predicted depth")
 _NARROW = ("truth", "prediction", "true depth", "predicted depth", "tokenizer's reconstruction")
-_COLORS = 12  # of the scale of depths
+_COLORS = 12  # colours in the scale of depth
 
 
 def player_script() -> str:
@@ -36,7 +36,7 @@ def player_style() -> str:
 
 
 def player_clip(clip: ClipFigure) -> dict[str, Any]:
-    """Returns what ``gallery.js`` needs of a clip: its videos as pictures of tiles, and the PSNR of each frame."""
+    """Returns the data that ``gallery.js`` needs for a clip: videos as pictures of tiles, and each frame's PSNR."""
     rows = {label.replace("\n", " "): frames for label, frames in clip.rows()}
     generated = {name: frames for name, frames in rows.items() if name != "truth" and not name.endswith("depth")}
     return {
@@ -59,7 +59,7 @@ def _place(name: str, order: Sequence[str]) -> int:
 
 
 def _psnr(clip: ClipFigure, frames: np.ndarray) -> list[float | None]:
-    """Returns the PSNR of each frame in dB; None for the prompt's."""
+    """Returns the PSNR of each frame in dB; None for prompt frames."""
     scores = np.asarray(psnr(clip.truth, frames))
     return [None if t < clip.prompt_frames else round(float(score), 2) for t, score in enumerate(scores)]
 

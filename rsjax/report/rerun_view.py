@@ -1,4 +1,4 @@
-"""Clips for the Rerun viewer: pictures, depth, tracks and actions by frame. Needs the extra ``rerun``."""
+"""Shows clips in the Rerun viewer: pictures, depth, tracks and actions by frame. Needs the extra ``rerun``."""
 
 import os
 import sys
@@ -20,20 +20,21 @@ TIMELINE = "frame"
 def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[str]:
     """Opens some clips in the viewer, or writes them to a file that ``rerun FILE.rrd`` opens.
 
-    Clip n is the entity ``clip_00n``: below it ``camera``, ``camera/tracks`` (the visible points, in pixels),
-    ``depth`` (if it has any; in metres if its provenance says so), ``actions``, and once ``task``.
+    Clip n is the entity ``clip_00n``. Below it are ``camera``, ``camera/tracks`` (the visible points, in pixels),
+    ``depth`` (if the clip has it; in metres unless its provenance names another unit), ``actions``, and ``task``, which
+    is the same for all frames.
 
     Args:
         store: a store of clips.
         clips: how many clips, spread evenly over the store.
-        file: written instead of opening the viewer.
+        file: the file to write instead of opening the viewer.
 
     Returns:
         Messages of the clips that cannot be read.
 
     Raises:
         UserError: the extra is not installed, the viewer does not answer, or the file cannot be written.
-        StoreError: the store holds tokens, or no clip can be read.
+        StoreError: the store contains tokens, or no clip can be read.
     """
     try:
         import rerun
@@ -66,7 +67,7 @@ def _reported(file: Path | None) -> Iterator[None]:
 
 
 def _spawn(recording: Any) -> None:
-    """Opens the viewer; searches for it on the path and beside this Python, whose environment may be inactive."""
+    """Opens the viewer; looks for it on the path and next to this Python, whose environment may be inactive."""
     before = os.environ.get("PATH", "")
     os.environ["PATH"] = os.pathsep.join(filter(None, (before, str(Path(sys.executable).parent))))
     try:

@@ -1,4 +1,4 @@
-"""Draws scores as inline SVG: curves over the predicted frames, and the errors of places clip by clip."""
+"""Draws scores as inline SVG: curves over the predicted frames, and the errors of places, sorted over clips."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,17 +20,17 @@ PLACE_SCENES = SCENES | {"_truth": "true frames (the reading network's own error
 _COLORS = {"": LINE, "_repeat_first": "#d9822b", "_tokenizer": "#3f9a63", "_truth": INK}
 _DASHES = {"": "-", "_repeat_first": "--", "_tokenizer": "-.", "_truth": ":"}
 
-_LEAST_ERROR = 0.01  # widths of the cube; smaller errors are drawn here, as the scale is logarithmic
+_LEAST_ERROR = 0.01  # widths of the cube; smaller errors are drawn at this value, since the scale is logarithmic
 
 
 def frame_curves_svg(curves: Curves, metrics: Sequence[Metric]) -> str:
-    """Draws one chart per metric that has curves, with a line and a band per scene; "" where none has."""
+    """Draws one chart per metric that has curves, with a line and a band per scene; returns "" if no metric has any."""
     charts = [_curve_chart(curves, metric) for metric in metrics if metric.name in curves]
     return charts_svg(charts, "scores frame by frame", legend=True) if charts else ""
 
 
 def place_errors_svg(per_clip: Mapping[str, Sequence[float]], metrics: Sequence[Metric]) -> str:
-    """Draws each metric's errors in widths of the cube, from the best clip to the worst; "" where there are none."""
+    """Draws each metric's errors in widths of the cube, from the best clip to the worst; returns "" without errors."""
     charts = [_sorted_chart(per_clip, metric) for metric in metrics if metric.name in per_clip]
     return charts_svg(charts, "errors of places", legend=True, height=2.3) if charts else ""
 

@@ -1,4 +1,4 @@
-"""Clips of a store as a sheet of pictures: a picture file, or a page whose captions any browser can show.
+"""Draws clips of a store as a sheet: one picture, or a page, whose captions a browser shows in any script.
 
 Axes: T frames, H×W pixels, n pictures.
 """
@@ -24,12 +24,12 @@ Captioned = tuple[str, UInt8[np.ndarray, "h w 3"]]
 
 
 def sheet_rows(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -> Iterator[Captioned]:
-    """Yields, for each of some clips, a caption and ``frames`` of its frames, with their depth and its scale below.
+    """Yields, for some clips, a caption and ``frames`` of each clip's frames, with their depth and its scale below.
 
-    The clips are spread evenly over the store. A caption is a clip's split, its number there and its task.
+    The clips are spread evenly over the store. A caption names the clip's split, its number in the split and its task.
 
     Raises:
-        StoreError: the store holds tokens, or no clip can be read.
+        StoreError: the store contains tokens, or no clip can be read.
     """
     for split, number, record in clips_of(store, clips, []):
         times = np.linspace(0, len(record["rgb"]) - 1, frames).round().astype(int)
@@ -43,12 +43,12 @@ def sheet_rows(store: Store, clips: int = 12, frames: int = 8, side: int = 96) -
 
 
 def sheet_picture(rows: Sequence[Captioned]) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns one picture of all rows, each below its caption, which is cut off at the width."""
+    """Returns one picture of all rows, each below its caption, which is cut off at the picture's width."""
     return np.concatenate([part for text, row in rows for part in (_caption(text, row.shape[1]), row)])
 
 
 def sheet_page(rows: Sequence[Captioned], title: str) -> str:
-    """Returns the same as one HTML page."""
+    """Returns all rows with their captions as one HTML page."""
     figures = "".join(
         f'<figure><figcaption dir="auto">{html.escape(text)}</figcaption><img src="{webp_uri(row)}" alt=""></figure>\n'
         for text, row in rows

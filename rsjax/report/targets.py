@@ -48,7 +48,7 @@ TARGETS = (
 
 
 def judge(metrics: Mapping[str, float]) -> list[Verdict]:
-    """Judges those targets whose metrics were measured."""
+    """Judges the targets whose metrics were measured."""
     verdicts = []
     for target in TARGETS:
         try:

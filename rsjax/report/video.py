@@ -17,7 +17,7 @@ from rsjax.files import write_file
 Resample = Literal["nearest", "bicubic"]
 
 _FILTERS = {"nearest": Image.Resampling.NEAREST, "bicubic": Image.Resampling.BICUBIC}
-_HOLD = 4  # the last frame of a GIF lasts this many times longer
+_HOLD = 4  # a GIF's last frame lasts this many times as long as the others
 _H264 = {"crf": "16"}  # constant rate factor: 0 is lossless, 23 the default
 
 
@@ -25,13 +25,13 @@ def write_mp4(path: Path, frames: UInt8[np.ndarray, "T H W 3"], fps: float, upsc
     """Writes an H.264 (yuv420p) video that browsers and players can open.
 
     Args:
-        path: ends in .mp4. The file is written atomically, with its parent directories.
-        frames: 0–255, RGB. Odd sides repeat their last row or column, since yuv420p needs even ones.
+        path: ends in .mp4. The file is written atomically, and its parent directories are made.
+        frames: 0–255, RGB. If a side is odd, its last row or column is repeated, since yuv420p needs even sides.
         fps: frames per second, above 0.
-        upscale: side of the square that each pixel becomes.
+        upscale: side of the square of pixels that each pixel becomes.
 
     Raises:
-        ValueError: frames of another shape or dtype, no frames, or a frame rate that is not positive.
+        ValueError: the frames have another shape or dtype, there are none, or the frame rate is not positive.
     """
     _check(frames, fps)
     frames = resize(frames, upscale, "nearest")
@@ -71,7 +71,7 @@ def webp(image: UInt8[np.ndarray, "H W 3"], quality: int = 90) -> bytes:
 
 
 def sprite_uri(frames: UInt8[np.ndarray, "T H W 3"]) -> str:
-    """Returns frames as one ``data:image/webp`` URI: a near-square of tiles, row by row, the rest black."""
+    """Returns frames as one ``data:image/webp`` URI: tiles in a near-square, row by row; unused tiles are black."""
     count, height, width, _ = frames.shape
     columns = math.ceil(math.sqrt(count))
     lines = -(-count // columns)
