@@ -27,7 +27,7 @@ from rsjax.training.retention import retention
 # and the error is raised as well.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
-MOST_FILE = 2**31  # bytes; orbax begins another file then
+MOST_FILE = 2**31  # bytes after which orbax begins another file
 UNFINISHED = ".orbax-checkpoint-tmp"  # what orbax adds to the name of a checkpoint while it writes it
 
 Tree = TypeVar("Tree")  # a tree of arrays, or of their shapes
@@ -45,7 +45,7 @@ class Checkpoints:
 
     Args:
         directory: has one folder for each checkpoint; created if missing. All processes see the same one.
-        keep_last: keep so many of the newest checkpoints …
+        keep_last: keep this many of the newest checkpoints …
         keep_every: … and those whose step is a multiple of this (0: none) …
         keep_best: … and the one with the lowest metric.
         read_only: remove and move nothing, because another process may be writing here.
@@ -86,7 +86,7 @@ class Checkpoints:
                 the best.
 
         Raises:
-            FileError: the disk is full or refuses, for this checkpoint or the one before.
+            FileError: this checkpoint, or the one before, cannot be written; for example, the disk is full.
         """
         self.wait()
         if step in self.steps():
@@ -134,7 +134,7 @@ class Checkpoints:
         """Waits until the last save is on disk.
 
         Raises:
-            FileError: it could not be written; the checkpoints before it are unchanged.
+            FileError: the save could not be written; the checkpoints before it are unchanged.
         """
         with self._writes():
             self._manager.wait_until_finished()
@@ -206,9 +206,9 @@ class Checkpoints:
 
 
 def save_weights(path: Path, weights: PyTree) -> None:
-    """Writes parameters alone; those that are there are replaced when the new ones are whole.
+    """Writes only parameters; existing ones are replaced when the new ones are complete.
 
-    Of several processes one calls this; arrays on a mesh of all processes have to be gathered first.
+    If there are several processes, only one calls this. Arrays on a mesh of all processes must be gathered first.
 
     Raises:
         FileError: the disk is full.
@@ -228,7 +228,7 @@ def load_weights(path: Path, like: Tree) -> Tree:
         like: parameters of the same structure, or their shapes.
 
     Raises:
-        CheckpointError: there are none, they have another architecture, or they are damaged.
+        CheckpointError: the parameters are missing or damaged, or have another architecture.
     """
     if not path.exists():
         raise CheckpointError(f"{path}: no such weights; train first (python -m experiments.train)")
@@ -251,7 +251,7 @@ def _need_space(folder: Path, tree: PyTree) -> None:
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
-    """Returns one that waits for no other process."""
+    """Returns a checkpointer that waits for no other process."""
     me = jax.process_index()
     alone = ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process{me}"

@@ -1,6 +1,6 @@
 """Sizes and checksums of a checkpoint's files, kept in a file of the checkpoint.
 
-It is written before the checkpoint gets its step's name, so a checkpoint without it is damaged.
+This file is written before the checkpoint gets its step's name, so a checkpoint without it is damaged.
 """
 
 import json

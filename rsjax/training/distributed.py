@@ -1,7 +1,7 @@
 """Several processes that train together through ``jax.distributed``: one on each host, or one for each device.
 
-Process 0 is the lead: only it writes what is written once. With one process, all functions here work and wait for
-nobody.
+Process 0 is the lead: only it writes what must be written once. With one process, all functions here work and wait
+for nobody.
 """
 
 import importlib.util
@@ -45,13 +45,13 @@ def has_peers(environ: Mapping[str, str]) -> bool:
     """Returns whether this process was started as one of several by Open MPI, Slurm, GKE or Kubernetes.
 
     ``jax.distributed.initialize`` recognizes these itself, but cannot be called to find out: without a cluster it
-    fails, a lone Slurm task or MPI rank it leaves one GPU of all, and it has to come before any computation.
+    fails, it gives a lone Slurm task or MPI rank only one of all GPUs, and it has to come before any computation.
 
     Args:
-        environ: environment variables; nothing else is looked at, no server is asked.
+        environ: environment variables; nothing else is read, and no server is asked.
 
     Raises:
-        HostsError: a variable with a number of processes is no number.
+        HostsError: a variable for the number of processes is not a number.
     """
     if any(mark in environ and _count(environ, size) > 1 for mark, size in _LAUNCHERS.items()):
         return True
@@ -107,7 +107,7 @@ def initialize(coordinator: str = "", processes: int | None = None, process_id: 
             f"process {'of a cluster' if alone else process_id} cannot join the others ({first_line(error)}); start "
             f"all of them, with the same --coordinator and --processes, and a --coordinator that all of them can reach"
         ) from error
-    patient.set()  # one that ended alone would take the others along
+    patient.set()  # a process that ended alone would end the others too
 
 
 def _address(coordinator: str, processes: int | None, process_id: int | None) -> dict[str, Any]:
@@ -131,12 +131,12 @@ def _address(coordinator: str, processes: int | None, process_id: int | None) ->
 
 
 def is_lead() -> bool:
-    """Returns whether this process writes what is written once."""
+    """Returns whether this process is the lead, which writes what must be written once."""
     return jax.process_index() == 0
 
 
 def barrier(name: str) -> None:
-    """Waits until every process is here.
+    """Waits until every process has called this.
 
     Args:
         name: names the place in the error.
@@ -162,10 +162,10 @@ def agree(value: Json, name: str = "agree") -> Json:
     """
     if jax.process_count() == 1:
         return value
-    barrier(name)  # a collective of the devices would not wait as long
+    barrier(name)  # first, as a collective of the devices would not wait as long
     text = json.dumps(value).encode() if is_lead() else b""
     size = int(multihost_utils.broadcast_one_to_all(np.int32(len(text))))
-    padded = np.zeros(-(-size // 256) * 256, np.uint8)  # each size is compiled, so there are few
+    padded = np.zeros(-(-size // 256) * 256, np.uint8)  # rounded up to few sizes, as each one is compiled
     padded[: len(text)] = np.frombuffer(text, np.uint8)
     return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded))[:size])
 

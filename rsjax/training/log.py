@@ -30,7 +30,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     """Reads a file of JSON lines, each with its ``step``. Returns [] if there is none; a torn last line is left out.
 
     Raises:
-        FileError: it cannot be read, or another line is damaged.
+        FileError: the file cannot be read, or another line is damaged.
     """
     return read_json_lines(path, "step", int)
 
@@ -46,7 +46,7 @@ def read_log(directory: Path) -> list[dict[str, Any]]:
 
 
 def read_curve(directory: Path) -> list[dict[str, Any]]:
-    """Does :func:`read_log` without machine measurements: an interrupted run gives the same as an uninterrupted one."""
+    """Reads the log without machine measurements: an interrupted run gives the same rows as an uninterrupted one."""
     return [{k: v for k, v in row.items() if k not in MEASURED} for row in read_log(directory)]
 
 
@@ -105,7 +105,7 @@ class ScalarLog:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         def guard() -> AbstractContextManager[None]:
-            # The error under way counts; a full disk would be reported a second time.
+            # Errors here must not replace the one under way, which may be the same full disk.
             return disk_guard(self._directory) if kind is None else suppress(OSError)
 
         with guard():

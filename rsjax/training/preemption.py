@@ -12,14 +12,14 @@ import jax
 from rsjax.runtime import patient
 from rsjax.training.distributed import anywhere
 
-HOSTS_EVERY = 5  # steps between two exchanges among several processes of whether one has to stop
+HOSTS_EVERY = 5  # steps after which several processes tell each other again whether one has to stop
 
 
 class StopRequest:
     """Wraps a training loop: SIGTERM is only recorded, so that the current step can finish and be saved.
 
-    Before the first step, while that compiles, there is nothing to save, and the handler before answers. Off the main
-    thread, the only one that may handle signals, nothing is recorded.
+    Until the first step, which takes long to compile, is done, there is nothing to save, and the previous handler
+    answers. Off the main thread, the only one that may handle signals, nothing is recorded.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class StopRequest:
             signal.signal(signal.SIGTERM, self._before)
             if jax.process_count() == 1:
                 patient.clear()
-            if self._received and kind is None:  # after the last step: leave it to the handler before
+            if self._received and kind is None:  # after the last step: leave it to the previous handler
                 signal.raise_signal(signal.SIGTERM)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
@@ -57,8 +57,8 @@ class StopRequest:
     def impatient(self) -> Iterator[None]:
         """Wraps work between steps that may take longer than a scheduler waits, such as compiling the validation.
 
-        If it outlasts SIGTERM by :data:`rsjax.runtime.STOP_SECONDS`, the process ends, and the run resumes from the
-        newest checkpoint.
+        If the work goes on for :data:`rsjax.runtime.STOP_SECONDS` after SIGTERM, the process ends, and the run resumes
+        from the newest checkpoint.
         """
         was_set = patient.is_set() and jax.process_count() == 1
         if was_set:

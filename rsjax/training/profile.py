@@ -14,10 +14,10 @@ SKIPPED = 5  # steps before the trace: the first one compiles, the next ones fil
 
 
 class Profile:
-    """A context manager around a training loop that traces some steps. Of several processes only the lead traces.
+    """A context manager around a training loop that traces some steps. With several processes, only the lead traces.
 
     Args:
-        directory: each trace gets a folder of its own in it.
+        directory: each trace gets its own folder in it.
         first: the first step to trace.
         count: number of steps; 0: none.
     """

@@ -8,9 +8,9 @@ from orbax.checkpoint import checkpoint_managers as ocm
 
 @dataclass
 class Best(ocm.PreservationPolicy):
-    """Keeps the checkpoint with the lowest metric, the newest one of equals; none if none has a metric.
+    """Keeps the checkpoint with the lowest metric, the newest of equal ones; keeps none if none has a metric.
 
-    Orbax's BestN keeps the metrics in each checkpoint, where a damaged one stops it from opening the others.
+    Orbax's BestN reads the metrics from the checkpoints, where a damaged one stops it from opening the others.
 
     Attributes:
         metrics: by step.

@@ -1,6 +1,6 @@
 """Runs the train step on one device, on many with replicated states, or on a mesh with a sharded state.
 
-A state is an ordinary tree of arrays under all three, so checkpoints do not depend on the sharding.
+A state is an ordinary tree of arrays in all three cases, so checkpoints do not depend on the sharding.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,7 @@ class Sharding:
     """The layout of states and batches on devices, and the compiled step for it.
 
     Attributes:
-        kind: jit: one device. pmap: each device has the whole state and a part of the batch. mesh: likewise, but each
+        kind: jit: one device. pmap: each device has the whole state and a part of the batch. mesh: the same, but each
             group of ``fsdp`` devices shares one state, split by :mod:`rsjax.training.sharding_rules`.
         mesh: the devices, as data × fsdp; on one axis for jit and pmap.
     """
@@ -162,13 +162,13 @@ class Sharding:
         return {name: float(value) for name, value in jax.device_get(metrics).items()}
 
     def portable(self, state: TrainState) -> TrainState:
-        """Returns the state as global arrays of all processes, for a checkpoint. No copy: the next step donates it."""
+        """Returns the state as global arrays of all processes, for a checkpoint. The next step donates them."""
         if self.kind == "jit" or jax.process_count() == 1:
             return state
         return jax.tree.map(self._shared, state)
 
     def adopt(self, state: TrainState) -> TrainState:
-        """Returns a state of numpy arrays or another sharding in this sharding, without a copy if it already is."""
+        """Returns a state of numpy arrays or another sharding in this sharding, without a copy if it has this one."""
         return _place(state, self._shardings(state))
 
     def gather(self, tree: Tree) -> Tree:

@@ -1,4 +1,4 @@
-"""The steps that training skipped because their loss or gradient was not finite, with what it takes to replay them."""
+"""The steps that training skipped because their loss or gradient was not finite, with the data to replay them."""
 
 from pathlib import Path
 from typing import Any

@@ -39,8 +39,8 @@ def find_wandb() -> ModuleType:
 class WandbRun:
     """The Weights & Biases run of one trained stage, which continues after every interruption.
 
-    Its id is in ``wandb.json`` beside the log. ``WANDB_MODE=offline`` keeps everything on disk. Once started, an error
-    of W&B never stops training: it is reported once, and the mirror stays off until the next start.
+    Its id is in ``wandb.json`` next to the log. ``WANDB_MODE=offline`` keeps everything on disk. Once the run has
+    started, an error of W&B never stops training: it is reported once, and the mirror stays off until the next start.
 
     Args:
         directory: the stage's; ``config.json`` in the directory above becomes W&B's configuration.
@@ -70,7 +70,7 @@ class WandbRun:
             # W&B's own step cannot go back, but after a kill the steps since the last checkpoint are logged again.
             self._run.define_metric("step")
             self._run.define_metric("*", step_metric="step")
-        except Exception as error:  # W&B reports a missing key, a refused one and a missing network as many types
+        except Exception as error:  # W&B reports a missing or refused key and a missing network as errors of many types
             raise WandbError(
                 f"Weights & Biases cannot start ({first_line(error)}); log in (wandb login), set WANDB_MODE=offline, "
                 f"or leave --wandb out"
