@@ -1,8 +1,8 @@
 """Turns recorded actions into the actions of a clip: the command that led from one *sampled* frame into the next.
 
 An :class:`rsjax.ingest.episode.Episode` has a row of actions for each recorded frame, in its data set's units. A clip
-keeps every tenth frame or so; its actions combine the rows between two kept frames, in the way that
-:class:`ActionConfig` says and :class:`Layout` allows.
+keeps about every tenth frame; each of its actions combines the rows between two kept frames, in the way that
+:class:`ActionConfig` chooses and :class:`Layout` allows.
 
 Axes: N recorded frames, T sampled frames, K rows between two of these, A recorded and A' resulting action dimensions.
 """
@@ -25,14 +25,15 @@ Compose = Literal["join", "last", "stack"]
 
 @dataclass(frozen=True)
 class Layout:
-    """What the numbers of an action mean; readers store it in ``episode.meta["actions"]``.
+    """The meaning of an action's numbers; readers store it in ``episode.meta["actions"]``.
 
     Attributes:
-        kind: absolute: where to be; delta: how far to go, or a velocity or torque of the step; undeclared: nobody says.
+        kind: absolute: a target; delta: a change, or the step's velocity or torque; undeclared: the data set does not
+            say.
         quaternions: first of the four dimensions of each unit quaternion, x y z w.
-        held: dimensions whose command stays in force until the next one, such as a gripper's open or closed, whatever
-            ``kind`` says. They have no differences, and of several commands the last one counts.
-        unclear: which dimensions cannot be steps, and why, unless the data set declares what they are.
+        held: dimensions whose command stays in force until the next one, such as open or closed for a gripper, whatever
+            ``kind`` is. Differences of them are never taken, and of several commands the last one counts.
+        unclear: dimensions that cannot be steps, each with the reason; empty if the data set declares what they are.
     """
 
     kind: Kind | Literal["undeclared"] = "delta"
@@ -41,23 +42,23 @@ class Layout:
     unclear: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready; ``unclear`` only if anything is."""
+        """Returns the fields, JSON-ready; ``unclear`` only if it is not empty."""
         values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
         return values if self.unclear else {name: value for name, value in values.items() if name != "unclear"}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Layout":
-        """The inverse of :meth:`to_json`; missing fields have their defaults."""
+        """Inverts :meth:`to_json`; missing fields get their defaults."""
         dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear"))
         return cls(values.get("kind", "delta"), *dims)
 
 
 @dataclass(frozen=True)
 class ActionConfig:
-    """How a source's actions become those of clips.
+    """How a source's actions become the actions of clips.
 
     Attributes:
-        offset: frames by which this source recorded its commands too early (> 0) or too late (< 0), beyond its
+        offset: frames by which this source recorded its commands too early (> 0) or too late (< 0), in addition to its
             format's documented alignment, which the reader undoes: row t becomes the one recorded at t - offset.
         compose: how the rows between two sampled frames become one. ``join``: one row of the same effect: deltas are
             added, quaternions multiplied, and the last absolute and held value counts. ``last``: the last row.
@@ -89,12 +90,12 @@ def check_layout(layout: Layout, width: int, where: Path | str) -> None:
 
 
 def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
-    """Raises :class:`EpisodeError` if nobody says what must be known to make a clip's actions.
+    """Raises :class:`EpisodeError` if it is not declared what must be known to make a clip's actions.
 
     Args:
-        layout: of the recorded actions.
-        skipped: most recorded rows between two frames of a clip.
-        config: how they become one.
+        layout: layout of the recorded actions.
+        skipped: largest number of recorded rows that one action of a clip combines.
+        config: how these rows are combined.
     """
     needed = (skipped > 1 and config.compose == "join") or config.offset != 0 or config.kind != "recorded"
     if not needed or layout.kind == "absolute" or (layout.kind == "delta" and not layout.unclear):
@@ -111,12 +112,12 @@ def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
 
 
 def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float32[np.ndarray, "N A"]:
-    """Aligns actions with the frame that each led into; row 0 becomes zeros.
+    """Aligns each action with the frame into which it led; row 0 becomes zeros.
 
     Args:
         rows: an action for each frame.
         after: whether each frame was recorded after the action of its row, so that rows stay where they are. Otherwise
-            row t leads into frame t+1, and the last row leads nowhere.
+            row t leads into frame t+1, and the last row is dropped.
     """
     aligned = np.zeros(rows.shape, np.float32)
     aligned[1:] = rows[1:] if after else rows[:-1]
@@ -126,17 +127,19 @@ def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float3
 def sampled_actions(
     actions: Float32[np.ndarray, "N A"], frames: Int[np.ndarray, " T"], config: ActionConfig, layout: Layout
 ) -> Float32[np.ndarray, "T A2"]:
-    """Returns what led into each of these frames from the one before it in ``frames``; row 0 is zeros.
+    """Returns the action that led to each of these frames from the previous one in ``frames``; row 0 is zeros.
 
     Args:
-        actions: an episode's; row t led into frame t, row 0 means nothing.
+        actions: an episode's actions; row t led into frame t, row 0 has no meaning.
         frames: numbers of the sampled frames, increasing, each below N.
         config: how rows are combined.
-        layout: of ``actions``.
+        layout: layout of ``actions``.
 
     Raises:
-        ConfigError: the configuration wants absolute actions of deltas, or ``stack`` of unevenly spaced frames.
-        EpisodeError: the layout names dimensions that the actions do not have, or it must be declared what they are.
+        ConfigError: the configuration asks for absolute actions but the source records deltas, or for ``stack`` but the
+            frames are unevenly spaced.
+        EpisodeError: the layout names dimensions that the actions do not have, or the meaning of the actions has to be
+            declared.
     """
     check_layout(layout, actions.shape[1], "meta.actions")
     if config.kind == "absolute" and layout.kind == "delta":
@@ -159,14 +162,14 @@ def sampled_actions(
 
 
 def continuous_signs(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Returns the same rotations, each with the sign nearer to the one before; q and -q are the same rotation."""
+    """Returns the same rotations, each with the sign that is nearer to the previous one; q and -q are one rotation."""
     flips = np.sum(quaternions[1:] * quaternions[:-1], -1) < 0
     signs = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
     return quaternions * signs[: len(quaternions), None].astype(quaternions.dtype)
 
 
 def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
-    """Moves row t - offset to row t. Beyond the ends absolute and held values repeat, deltas are no motion."""
+    """Moves row t - offset to row t. Beyond the ends, absolute and held values repeat and deltas mean no motion."""
     wanted = np.arange(len(rows)) - offset
     nearest = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
     shifted = rows[nearest]
@@ -179,7 +182,7 @@ def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> F
 
 
 def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np.ndarray, "N A"]:
-    """Turns absolute rows into steps from the row before; quaternions into q₋₁⁻¹ q, in the hand's own frame."""
+    """Turns absolute rows into steps from the previous row; quaternions become q₋₁⁻¹ q, in the hand's own frame."""
     steps = np.diff(rows, axis=0, prepend=rows[:1])
     before = np.concatenate([rows[:1], rows[:-1]])
     for first in layout.quaternions:
@@ -215,7 +218,7 @@ def _composed(
 
 
 def _unit(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
-    """Scales to length 1; zeros, which fill up damaged data, become no rotation."""
+    """Scales quaternions to length 1; zeros, which pad damaged data, become the identity."""
     length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.where(length > 0, quaternion / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])
 

@@ -1,13 +1,13 @@
-"""The annotation steps: each runs one annotator on an episode and writes records, which are read again here too.
+"""The annotation steps: each runs one annotator on an episode and writes records, which this module also reads.
 
-* ``shots``: ``spans`` int64 (S, 2), first frame and the one after the last.
+* ``shots``: ``spans`` int64 (S, 2), the first frame and the one after the last.
 * ``motion``: ``motion`` float32 (N,), ``high`` of :class:`rsjax.ingest.annotators.protocols.Motion`.
-* ``depth``: records of some frames each, in order: ``first``, ``depth`` float (n, H, W) from ``first`` on, ``unit``.
+* ``depth``: records of a few frames each, in order: ``first``, ``depth`` float (n, H, W) from ``first`` on, ``unit``.
 * ``tracks``: a record for each shot: ``first``, ``points`` float (P, n, 2) as in :class:`rsjax.clip.Clip`, ``visible``
   bool (P, n).
 * ``semantics``: ``task``, ``scene``, ``segments`` (a list of [start, end, text, skill]) and ``key_frames``.
 
-Pictures are read a few at a time, so memory does not grow with the length of an episode.
+Pictures are read a few at a time, so that memory does not grow with the length of an episode.
 
 Axes: N recorded frames, n some of them, T frames of a clip, H×W pixels, P points, S shots.
 """
@@ -56,12 +56,12 @@ def annotation_steps(annotators: Annotators, camera: str, cpus: float = 1.0, gpu
     """Returns a step for each annotator, in order.
 
     Args:
-        camera: the one that is annotated; "" is the episode's first.
-        cpus: of a worker of each step, on a Ray cluster.
-        gpus: likewise, of a worker of a step with a network.
+        camera: the camera to annotate; "" is the episode's first.
+        cpus: CPUs of a worker of each step, on a Ray cluster.
+        gpus: GPUs of a worker of each step that has a network, on a Ray cluster.
     """
     needs: dict[str, tuple[str, ...]] = {"tracks": ("shots",), "semantics": ("motion",)}
-    if _is_network(annotators.tracks):  # some look at depth
+    if _is_network(annotators.tracks):  # some of these trackers use depth
         needs["tracks"] = ("shots", "depth")
     methods = {name: method for name in _WORK if (method := getattr(annotators, name)) is not None}
     return tuple(
@@ -113,7 +113,7 @@ def _depth(estimate: DepthEstimator, camera: str, episode: Episode, inputs: Inpu
     estimated = estimate(episode, camera)
     for first in range(0, len(estimated.maps), CHUNK):
         maps = estimated.maps.read(range(first, min(first + CHUNK, len(estimated.maps))))
-        # Half precision has three decimal digits, more than the 766 levels that the colour map keeps.
+        # Half precision has three decimal digits, more than the 766 levels that the depth colour map distinguishes.
         yield {"first": first, "depth": maps.astype(np.float16), "unit": estimated.unit}
     return {"unit": estimated.unit, "extent": list(estimated.extent)}
 
@@ -160,7 +160,7 @@ _WORK: dict[str, Callable[[Any, str, Episode, Inputs], Records]] = {
 
 @dataclass(frozen=True)
 class _Shot:
-    """The frames of a camera, pictures or depth maps, from ``first`` to before ``end``."""
+    """The frames of a camera (pictures or depth maps) from ``first`` up to but not including ``end``."""
 
     whole: Any
     first: int
@@ -175,7 +175,7 @@ class _Shot:
 
 @dataclass(frozen=True)
 class Annotated:
-    """An episode and its annotations; None or empty where their steps were left out."""
+    """An episode and its annotations; an annotation is None or empty if its step was left out."""
 
     episode: Episode
     shots: Sequence[Span] = ()
@@ -189,7 +189,7 @@ class Annotated:
 
     @classmethod
     def load(cls, episode: Episode, inputs: Inputs) -> "Annotated":
-        """Reads the steps' records; words are the data set's own where ``semantics`` was left out."""
+        """Reads the steps' records; texts are the data set's own if ``semantics`` was left out."""
         fields: dict[str, Any] = {name: inputs[name] for name in ("depth", "tracks") if name in inputs}
         fields |= {"task": episode.task, "scene": str(episode.meta.get("scene", "")), "segments": episode.segments}
         if "shots" in inputs:
@@ -208,8 +208,8 @@ class StoredDepths:
     """The maps of the depth step, as :class:`rsjax.ingest.episode.Depths`.
 
     Args:
-        records: at least one.
-        episode: the one that they belong to.
+        records: the step's records, at least one.
+        episode: the episode of the records.
 
     Attributes:
         unit: "metres" or "relative" (see :mod:`rsjax.ingest.annotators.depth`).
@@ -234,13 +234,13 @@ class StoredDepths:
 
 
 class FrameRecords:
-    """Records of consecutive frames, of depth or tracks. The last one read is kept, as windows come in order."""
+    """Records of consecutive frames, of depth or tracks. The last record read is kept, since windows come in order."""
 
     def __init__(self, records: Source) -> None:
         self._records, self._number, self._current = records, -1, Record()
 
     def with_frames(self, first: int, last: int) -> Record | None:
-        """Returns the record with these two frames and all between; None where there is none."""
+        """Returns the record that contains these two frames and all between them; None if there is none."""
         begin = max(0, self._number)
         for number in [*range(begin, len(self._records)), *range(begin)]:
             if number != self._number:

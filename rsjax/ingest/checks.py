@@ -78,11 +78,11 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class EpisodeStats:
-    """What is kept of an episode to compare it with the others: some hundred bytes.
+    """Statistics of an episode by which it is compared with the others: a few hundred bytes.
 
     Attributes:
-        digest: of its actions, states and first picture; None where no picture could be decoded.
-        cameras: their names.
+        digest: hash of its actions, states and first picture; None if no picture could be decoded.
+        cameras: names of its cameras.
         reach: largest absolute action of each dimension.
         jump: largest step of each dimension of the state.
     """
@@ -94,7 +94,7 @@ class EpisodeStats:
 
 
 def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], EpisodeStats]:
-    """Returns all problems of one episode by itself, and its statistics."""
+    """Returns all problems found in one episode by itself, and its statistics."""
     problems = [*_time(episode, limits.gap), *_actions(episode), *_flips(episode), *_segments(episode)]
     first: UInt8[np.ndarray, "H W 3"] | None = None
     for name, frames in episode.cameras.items():
@@ -115,7 +115,7 @@ def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], 
 
 
 def _largest(rows: Float[np.ndarray, "N n"]) -> Float32[np.ndarray, " n"]:
-    """Returns the largest absolute value of each column, 0 where there are no rows."""
+    """Returns the largest absolute value of each column; 0 if there are no rows."""
     return np.abs(rows).max(0, initial=0).astype(np.float32)
 
 
@@ -162,9 +162,9 @@ def _segments(episode: Episode) -> Iterator[Problem]:
 
 
 def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
-    """Returns where four consecutive columns look like a quaternion: each row has length 1.
+    """Returns the first of each four consecutive columns that look like a quaternion: each row has length 1.
 
-    A gripper's 1 or -1 behind three zeros does not count.
+    A 1 or -1 beside three zeros in every row, such as a gripper's, does not count.
     """
     found: list[int] = []
     for first in range(rows.shape[1] - 3 if len(rows) else 0):
@@ -176,7 +176,7 @@ def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
 
 
 def _sample(count: int, frames: int) -> list[int]:
-    """Spreads ``frames`` indices evenly over ``count``, with the first and the last; 0 means all."""
+    """Spreads ``frames`` indices evenly over ``count``, including the first and the last; 0 means all."""
     return list(range(count)) if not frames else np.unique(np.linspace(0, count - 1, frames).astype(int)).tolist()
 
 

@@ -1,6 +1,6 @@
 """The last step: cuts an episode into clips of one length and size, one at a time.
 
-It reads the records of the annotation steps (:mod:`rsjax.ingest.annotate`), as far as those were run.
+It reads the records of those annotation steps (:mod:`rsjax.ingest.annotate`) that were run.
 
 Axes: N recorded frames, T frames of a clip, N₀ tracks of a clip, S×S a clip's pixels.
 """
@@ -43,7 +43,7 @@ from rsjax.ingest.windows import (
 from rsjax.ingest.work_items import Inputs, Records, Step
 
 CLIPS = "clips"  # the step's name
-_UNEVEN = 1e-3  # seconds that times between frames may be off before they are written down
+_UNEVEN = 1e-3  # seconds by which frame intervals may differ from the frame rate's; beyond it, times are stored
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class ClipConfig:
     windows: WindowConfig = field(default_factory=WindowConfig)
     image_size: int = 64  # pixels
     tracks: int = 256  # N₀
-    camera: str = ""  # none: the episode's first
-    fit: Fit = "crop"  # how pictures of another shape become squares
-    recorded_depth: bool = True  # take the depth that the data set has
-    most_holes: float = 0.5  # of a recorded depth map; holes are filled from the nearest measured pixel
+    camera: str = ""  # "": the episode's first
+    fit: Fit = "crop"  # how pictures that are not square become squares
+    recorded_depth: bool = True  # use the data set's own depth
+    most_holes: float = 0.5  # share of a recorded depth map; holes are filled from the nearest measured pixel
     actions: ActionConfig = field(default_factory=ActionConfig)
     categories: CategoryConfig = field(default_factory=CategoryConfig)
 
@@ -67,12 +67,12 @@ class ClipConfig:
 
 
 def check_first(source: EpisodeSource, config: ClipConfig) -> None:
-    """Reads the first episode, to find before anything is annotated that nobody says what its actions are.
+    """Checks on the first episode, before anything is annotated, that the meaning of its actions is declared.
 
     Raises:
-        ConfigError: its rows of actions would have to be combined for that.
+        ConfigError: the meaning is not declared, and clips cannot be made without it.
     """
-    with contextlib.suppress(EpisodeError):  # what cannot be read is quarantined later
+    with contextlib.suppress(EpisodeError):  # an episode that cannot be read is quarantined later
         for ref in itertools.islice(source.episodes(), 1):
             episode = source.read(ref)
             step = check_rate(episode.fps, config.windows)
@@ -92,18 +92,18 @@ def _cut_episode(config: ClipConfig, episode: Episode, inputs: Inputs) -> Record
 
 
 def cut(annotated: Annotated, config: ClipConfig) -> Records:
-    """Cuts an episode into clips, as records of :class:`rsjax.clip.Clip`; ``depth`` is None where there is none.
+    """Cuts an episode into clips and yields them as records of :class:`rsjax.clip.Clip`; ``depth`` may be None.
 
     Returns:
-        ``windows`` (how many are kept, and left out by reason), ``left_out`` (their first frames by reason), ``fit``
-        (what became of the pictures, in words; "" where they are square), ``short`` (how many ``spans`` are too short
-        for a window, the ``longest`` of all in recorded frames, how many a ``window`` takes, and the ``cure``, in
-        words), ``actions`` (statistics of the clips' actions), ``action_dim``, ``dimensions`` (a line for each),
-        ``depth`` (its range), ``depth_unit`` ("metres" or "relative"; both None without depth), ``success`` (the number
-        of clips that end in success; None where the data set does not record it).
+        ``windows`` (how many are kept, and how many are left out for each reason), ``left_out`` (first frames of the
+        windows left out, by reason), ``fit`` (how the pictures became square, in words; "" if they were), ``short``
+        (how many ``spans`` are too short for a window, the ``longest`` of all in recorded frames, how many a ``window``
+        takes, and the ``cure``, in words), ``actions`` (statistics of the clips' actions), ``action_dim``,
+        ``dimensions`` (a line for each), ``depth`` (its range), ``depth_unit`` ("metres" or "relative"; both None
+        without depth), ``success`` (the number of clips that end in success; None if the data set does not record it).
 
     Raises:
-        EpisodeError: no such camera, or pictures, depth or annotations that cannot be read or do not fit.
+        EpisodeError: there is no such camera, or pictures, depth or annotations cannot be read or do not fit.
     """
     episode, windows = annotated.episode, config.windows
     camera = camera_of(episode, config.camera)
@@ -116,7 +116,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     reasons = judge(index, episode.timestamps, motion, annotated.key_frames, windows)
     step = check_rate(episode.fps, windows)
     whole = abs(step - round(step)) < 0.01 * step  # otherwise sampled_actions says what to do
-    stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows of each action
+    stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows that each action stacks
     layout = Layout.from_json(episode.meta.get("actions", {}))
     names = flat_names(episode.meta.get("action_names"), episode.actions.shape[1])
     pictures = _Fitted(episode.cameras[camera].read, config)
@@ -140,7 +140,7 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         statistics = statistics.merged(rows) if statistics else rows
         if depth is not None:
             near, far = min(near, float(depth[depth > 0].min())), max(far, float(depth.max()))
-        success = np.asarray(episode.meta.get("success", False), bool)  # by frame, or for the whole
+        success = np.asarray(episode.meta.get("success", False), bool)  # one value per frame, or one for the episode
         success = success[frames] if success.ndim else np.full(len(frames), bool(success))
         succeeded += bool(success[-1])
         yield {
@@ -206,7 +206,7 @@ def _words(
     }
     times = episode.timestamps[frames]
     if not np.allclose(np.diff(times), np.diff(frames) / episode.fps, atol=_UNEVEN):
-        provenance["times"] = times.tolist()  # seconds; elsewhere they follow from frames and fps
+        provenance["times"] = times.tolist()  # seconds; other clips' times follow from frames and fps
     if annotated.motion is not None:
         provenance["motion"] = float(np.mean(annotated.motion[frames[0] + 1 : frames[-1] + 1]))
     return {"task": task or UNKNOWN, "provenance": provenance}
@@ -221,9 +221,9 @@ def clip_labels(record: Record) -> dict[str, str]:
 def _tracks(
     stored: FrameRecords | None, frames: Int[np.ndarray, " T"], count: int, placement: Placement | None
 ) -> Tracked | None:
-    """Returns ``count`` of the points that are visible in a clip's first frame; None where there are none.
+    """Returns tracks of ``count`` of the points that are visible in a clip's first frame; None if there are none.
 
-    Without a tracks step they are zeros that are never visible.
+    Without a tracks step, the tracks are zeros that are never visible.
     """
     if stored is None:
         return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
@@ -236,7 +236,7 @@ def _tracks(
 
 
 def _depths(annotated: Annotated, camera: str, config: ClipConfig, pictures: "_Fitted") -> "tuple[_Fitted | None, str]":
-    """Returns the depth maps and their unit; None and "" where there are none. Measured ones are preferred."""
+    """Returns the depth maps and their unit; None and "" if there are none. Measured maps are preferred."""
     episode = annotated.episode
     if camera in episode.depth and config.recorded_depth:
         where = f"episode {episode.id}: depth of {camera}"
@@ -249,11 +249,11 @@ def _depths(annotated: Annotated, camera: str, config: ClipConfig, pictures: "_F
 
 
 class _Fitted:
-    """Pictures or depth maps as clips have them; each is read once for the overlapping windows that need it.
+    """Pictures or depth maps in the size of clips; each is read once for all overlapping windows that need it.
 
     Args:
-        read: reads the recorded ones.
-        pictures: those that depth maps belong to, and follow in their placement; they are read first.
+        read: reads recorded pictures or maps.
+        pictures: for depth maps, the pictures whose placement they follow; these are read first.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class _Fitted:
         self._kept: dict[int, np.ndarray] = {}
 
     def read(self, frames: list[int]) -> Float[np.ndarray, "T S S *C"]:
-        """Returns these frames. Calls come with increasing first frames; what lies before the first is forgotten."""
+        """Returns these frames. The first frame must not decrease from call to call: earlier frames are dropped."""
         missing = [frame for frame in frames if frame not in self._kept]
         new = self._read(missing) if missing else ()
         kept = {frame: picture for frame, picture in self._kept.items() if frame >= frames[0]}
@@ -276,7 +276,7 @@ class _Fitted:
         return np.stack([self._kept[frame] for frame in frames])
 
     def _fitted(self, picture: np.ndarray) -> np.ndarray:
-        leading = self._pictures or self  # kept in a field, a reference to itself would keep its pictures in memory
+        leading = self._pictures or self  # not an attribute: a reference to itself would keep its pictures in memory
         if leading.placement is None:
             height, width = picture.shape[:2]
             leading.placement = Placement.create(self._config.fit, height, width, self._config.image_size)

@@ -1,4 +1,4 @@
-"""What each dimension of recorded actions is: a step, which adds up over skipped frames, or a target, which does not.
+"""Decides what each dimension of recorded actions is: a step, which adds up over skipped frames, or a target.
 
 Axes: N recorded frames, A action dimensions.
 """
@@ -11,13 +11,13 @@ from jaxtyping import Float
 
 from rsjax.ingest.actions import ActionConfig, Kind, Layout
 
-_FEWEST = 16  # rows from which staying away from zero says something
-_NEAR = 0.1  # of a dimension's largest value
-_FOLLOWS = 0.5  # of the deviation of the state
+_FEWEST = 16  # with fewer rows, staying away from zero means nothing
+_NEAR = 0.1  # share of a dimension's largest value below which a value is near zero
+_FOLLOWS = 0.5  # share of the state's standard deviation within which actions follow the state
 
 
 class Declared(NamedTuple):
-    """What a data set or its user says of actions, as :func:`layout_of` takes it; None: nothing."""
+    """What a data set or its user declares about actions, as arguments of :func:`layout_of`; None: nothing."""
 
     kind: Kind | None
     held: tuple[int, ...] | None
@@ -32,15 +32,15 @@ def layout_of(
     names: Sequence[str] = (),
     states: Float[np.ndarray, "N S"] | None = None,
 ) -> Layout:
-    """Builds the layout of an episode's actions from what its data set declares, and notes what speaks against steps.
+    """Builds the layout of an episode's actions from what its data set declares; notes which cannot be steps.
 
     Args:
-        actions: aligned as :class:`rsjax.ingest.episode.Episode` has them.
-        kind: as in :class:`rsjax.ingest.actions.Layout`; None: nobody says.
-        held: likewise; None: nobody says. What is declared is believed.
+        actions: aligned as in :class:`rsjax.ingest.episode.Episode`.
+        kind: as in :class:`rsjax.ingest.actions.Layout`; None: not declared.
+        held: likewise; None: not declared. If it is declared, no dimension is questioned.
         quaternions: likewise.
-        names: of the dimensions.
-        states: what the robot measured.
+        names: names of the dimensions.
+        states: the robot's measured states.
     """
     unclear: tuple[str, ...] = ()
     if kind != "absolute" and held is None:
@@ -54,7 +54,10 @@ def layout_of(
 def _no_steps(
     rows: Float[np.ndarray, "N A"], known: set[int], names: Sequence[str], states: Float[np.ndarray, "N A"] | None
 ) -> Iterator[str]:
-    """Yields each dimension that cannot be a step, and why: a switch, a gripper, never near zero, or the state."""
+    """Yields each dimension that cannot be a step, with the reason.
+
+    It has only two values, is a gripper, is never near zero, or follows the state.
+    """
     for place, values in enumerate(rows.T):
         if place in known or not values.any():
             continue
@@ -73,15 +76,15 @@ def _no_steps(
 
 
 def _follows(values: Float[np.ndarray, " N"], state: Float[np.ndarray, " N"]) -> bool:
-    """Whether values are the state, about; steps are as far from it as zero is."""
+    """Returns whether values roughly equal the state; real steps would be as far from the state as zero is."""
     return bool(np.sqrt(np.mean(np.square(values - state))) < _FOLLOWS * state.std())
 
 
 def flat_names(names: Any, width: int) -> list[str]:
-    """Returns a name for each dimension out of lists and objects of names; none if there are not as many.
+    """Returns a name for each dimension from lists or objects of names; [] if their number does not match.
 
     Args:
-        names: as a data set has them, such as LeRobot's ``{"motors": ["x", "y"]}``.
+        names: as a data set stores them, such as LeRobot's ``{"motors": ["x", "y"]}``.
         width: how many dimensions there are.
     """
     if isinstance(names, dict):
@@ -97,10 +100,10 @@ def describe_dimensions(layout: Layout, names: Sequence[str], config: ActionConf
     """Returns a line for each dimension of a clip's actions: its name, and what it is.
 
     Args:
-        layout: of the recorded actions.
-        names: of their dimensions; "" or none: unknown.
-        config: how they became the clip's.
-        width: dimensions of the clip's actions; more than the recorded ones where rows were stacked.
+        layout: layout of the recorded actions.
+        names: names of their dimensions; "" or none: unknown.
+        config: how they became the clip's actions.
+        width: dimensions of the clip's actions; more than the recorded ones if rows were stacked.
     """
     turned = {first + place for first in layout.quaternions for place in range(4)}
     recorded = len(names) or width

@@ -1,7 +1,7 @@
-"""Checks a whole data set, and lists the episodes that had better be left out.
+"""Checks a whole data set, and lists the episodes that should be left out.
 
-Each episode is checked by itself (:mod:`rsjax.ingest.checks`) and then against the others, by its statistics alone, so
-memory does not depend on the pictures.
+Each episode is checked by itself (:mod:`rsjax.ingest.checks`) and then compared with the others by its statistics
+alone, so that memory does not depend on the pictures.
 """
 
 from collections import Counter
@@ -20,9 +20,9 @@ from rsjax.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSourc
 from rsjax.ingest.formats import FORMATS, open_source
 from rsjax.processes import WorkerDied, run_items
 
-FEWEST = 5  # episodes below which nothing counts as usual
+FEWEST = 5  # with fewer episodes, they are not compared with what is usual
 
-Checked = tuple[EpisodeRef, list[Finding], EpisodeStats | None, str]  # the last: what the reader mended
+Checked = tuple[EpisodeRef, list[Finding], EpisodeStats | None, str]  # the last: what the reader repaired
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Diagnosis:
     Attributes:
         refs: every episode's id and fingerprint, in order.
         findings: in the order of the episodes.
-        mended: id and notes of each episode in which the reader mended something.
-        unread: ids of the episodes that the reader refuses.
+        mended: id and notes of each episode in which the reader repaired something.
+        unread: ids of the episodes that could not be read or checked.
     """
 
     refs: tuple[tuple[str, str], ...]
@@ -43,19 +43,19 @@ class Diagnosis:
 
     def counts(self) -> dict[str, int]:
         """Counts the episodes that have each kind of finding, in the order of :data:`KINDS`."""
-        episodes = Counter(name for name, _ in self.refs)  # several may have one id
+        episodes = Counter(name for name, _ in self.refs)  # several may share one id
         affected: Counter[str] = Counter()
         for name, kind in {(finding.episode, finding.kind) for finding in self.findings}:
             affected[kind] += episodes[name]
         return {kind: affected[kind] for kind in KINDS if affected[kind]}
 
     def usual(self) -> list[str]:
-        """Returns the kinds that every episode has, though each can be read and decoded: perhaps it should be so."""
+        """Returns the kinds of finding that every episode has, if all can be read and decoded: they may be intended."""
         kinds = {} if self.unread else self.counts()
         return [kind for kind, count in kinds.items() if count == len(self.refs) and kind != "undecodable"]
 
     def reasons(self) -> dict[str, list[str]]:
-        """Returns the findings of each episode that has some, as text by its id."""
+        """Returns the findings of each episode that has any, as texts by its id."""
         reasons: dict[str, list[str]] = {}
         for finding in self.findings:
             reasons.setdefault(finding.episode, []).append(f"{finding.kind}: {finding.detail}")
@@ -67,11 +67,11 @@ def open_any(what: str, path: Path | None, **options: object) -> EpisodeSource:
 
     Args:
         what: a store's directory, or a format's name.
-        path: of the data set, with a format.
-        options: of the format.
+        path: the data set's path, if ``what`` is a format.
+        options: options of the format.
 
     Raises:
-        SourceError: it is neither.
+        SourceError: ``what`` is neither.
     """
     if path is not None:
         return open_source(what, path, **options)
@@ -95,13 +95,13 @@ def diagnose(
     """Checks every episode of a data set.
 
     Args:
-        limits: of the checks.
+        limits: limits of the checks.
         ignored: kinds of findings to leave out.
         progress: called with the number of episodes done.
-        workers: processes; 1: this one.
+        workers: number of processes; 1: only this one.
 
     Raises:
-        SourceError: the data set cannot be listed, or an ignored kind does not exist.
+        SourceError: the data set cannot be listed or is empty, or an ignored kind does not exist.
     """
     for kind in ignored:
         if kind not in KINDS:
@@ -156,7 +156,7 @@ def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checke
     try:
         episode = source.read(ref)
         return ref, *check_episode(episode, limits), _mended(episode)
-    except Exception as error:  # whatever is wrong with one episode must not hide the others
+    except Exception as error:  # an error in one episode must not hide the others
         line = " ".join(str(error).split())
         kind, detail = ("unreadable", f"{type(error).__name__}: {line}")
         if isinstance(error, EpisodeError):
@@ -165,7 +165,7 @@ def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checke
 
 
 def _mended(episode: Episode) -> str:
-    """Returns the reader's notes on what it mended."""
+    """Returns the reader's notes on what it repaired."""
     notes = []
     for name, value in episode.meta.get("notes", {}).items():
         parts = [f"{key} {number}" for key, number in value.items()] if isinstance(value, dict) else value
@@ -174,10 +174,10 @@ def _mended(episode: Episode) -> str:
 
 
 def compare(stats: dict[str, EpisodeStats], unusual: float) -> Iterator[Finding]:
-    """Yields findings on episodes that differ from the others, and on those that equal another one.
+    """Yields findings on episodes that differ from the others or duplicate another one.
 
     Args:
-        stats: of each episode by its id.
+        stats: each episode's statistics by its id.
         unusual: as in :class:`Thresholds`.
     """
     seen: dict[bytes, str] = {}
@@ -196,7 +196,7 @@ def compare(stats: dict[str, EpisodeStats], unusual: float) -> Iterator[Finding]
 
 
 def _outliers(kind: str, figures: dict[str, Float32[np.ndarray, " n"]], verb: str, unusual: float) -> Iterator[Finding]:
-    """Yields the episodes whose figures have another length than most, or are far above the median."""
+    """Yields findings on episodes whose figures differ in length from most, or are far above the median."""
     width = Counter(len(figure) for figure in figures.values()).most_common(1)[0][0]
     alike = {name: figure for name, figure in figures.items() if len(figure) == width}
     for name, figure in figures.items():

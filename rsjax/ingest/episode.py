@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32, UInt8
 from rsjax.errors import UserError
 from rsjax.files import placeholder, regular
 
-_WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints take files up to the first whole, and both ends of larger ones
+_WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints read files of up to _WHOLE fully, and _EDGE at both ends of others
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
 MAX_FPS = 10_000.0  # more is a mistake, not a camera
 FETCH_AGAIN = "fetch the file again or leave the episode out"
@@ -29,11 +29,11 @@ LEAVE_OUT = "leave the episode out"
 
 
 class SourceError(UserError):
-    """A data set that cannot be read at all. The message names the file, the field and the cure."""
+    """A data set cannot be read at all. The message names the file, the field and the cure."""
 
 
 class EpisodeError(UserError):
-    """An episode that cannot be read, which runs quarantine. The message names the file, the field and the cure.
+    """An episode cannot be read, so it is quarantined. The message names the file, the field and the cure.
 
     Attributes:
         kind: one of :data:`rsjax.ingest.checks.KINDS`.
@@ -123,9 +123,9 @@ class EpisodeRef:
 
     Attributes:
         id: unique within the source, safe as a file name (see :func:`rsjax.files.safe_id`).
-        fingerprint: 16 hex digits of what the episode would be read from.
-        location: what the source's ``read`` needs, or ``error``: why the episode cannot be read; ``split``: the side
-            of a store that it stays on.
+        fingerprint: 16 hex digits, a hash of what the episode would be read from.
+        location: what the source's ``read`` needs, or ``error``: why the episode cannot be read. Also ``split``: the
+            split of a store in which the episode stays.
     """
 
     id: str
@@ -139,15 +139,15 @@ class Episode:
 
     Attributes:
         id: unique within the source, safe as a file name.
-        fingerprint: 16 hex digits of what it was read from.
-        task: what the robot is to do; "" if the data set does not say.
+        fingerprint: 16 hex digits, a hash of what it was read from.
+        task: what the robot has to do; "" if the data set does not say.
         fps: frames per second, > 0.
         timestamps: seconds from the first frame, increasing.
         actions: row t led from frame t-1 into frame t, in the data set's own units; row 0 is zeros.
         states: what the robot measured of itself at each frame; None if it was not recorded.
         cameras: pictures by the camera's name.
         depth: depth maps by the same names; empty if none were recorded.
-        segments: the data set's own, in order.
+        segments: the data set's own segments, in order.
         meta: JSON-ready; ``meta["actions"]`` is the :class:`rsjax.ingest.actions.Layout` of the actions.
     """
 
@@ -187,10 +187,10 @@ class EpisodeSource(Protocol):
 
 
 def checked(episode: Episode, where: Path | str) -> Episode:
-    """Returns the same episode if it keeps what :class:`Episode` promises.
+    """Returns the same episode if it satisfies what :class:`Episode` promises.
 
     Args:
-        where: the file that messages name.
+        where: the file that error messages name.
 
     Raises:
         EpisodeError: there are no frames, numbers of rows or pictures differ from the number of timestamps, values are
@@ -224,7 +224,7 @@ def checked(episode: Episode, where: Path | str) -> Episode:
 
 
 def data_file(path: Path) -> Path:
-    """Returns the same path, but refuses what :func:`regular` does and files with something else in place of data.
+    """Returns the same path; refuses what :func:`regular` refuses, and files that hold something else than data.
 
     Raises:
         OSError: it cannot be read, or is a pipe, a device, a Git-LFS pointer or a web page.
@@ -235,9 +235,10 @@ def data_file(path: Path) -> Path:
 
 
 def fingerprint(paths: Sequence[Path], *values: object) -> str:
-    """Returns 16 hex digits of files and values. A missing file counts too; folders do not, so a data set may be moved.
+    """Returns a hash of files and values, 16 hex digits.
 
-    Of files above 256 KiB only size, date and both ends count: reading all videos of a data set would take too long.
+    A missing file counts too; folder names do not, so a data set may be moved. Of files above 256 KiB only size, date
+    and both ends count: reading all videos of a data set would take too long.
     """
     digest = hashlib.sha256(repr(values).encode())
     for path in paths:

@@ -1,6 +1,6 @@
-"""How recorded pictures, depth maps and tracks lie in the square of a clip.
+"""Fits recorded pictures, depth maps and tracks into the square of a clip.
 
-Pictures of one camera may have another resolution than its depth maps, so all places are shares of a side.
+A camera's pictures may differ in resolution from its depth maps, so all positions are shares of a side.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ _DONE = {
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a recorded picture lies in the square: a place x of the picture is ``scale * x + offset`` of the square.
+    """Where a recorded picture lies in the square: position x of the picture is ``scale * x + offset`` of the square.
 
     Attributes:
-        scale: of x and y; 0 and 1 are the outer edges of the picture, and of the square.
+        scale: for x and y; 0 and 1 are the outer edges of the picture and of the square.
         offset: likewise.
-        size: of a side of the square, in pixels.
-        words: what becomes of the pictures, such as ``640 × 480 cropped …``; "" where they are square.
+        size: side of the square in pixels.
+        words: how the pictures become square, such as ``640 × 480 cropped …``; "" if they are square.
     """
 
     scale: tuple[float, float]
@@ -36,7 +36,7 @@ class Placement:
 
     @classmethod
     def create(cls, fit: Fit, height: int, width: int, size: int) -> "Placement":
-        """Places a picture of H×W pixels in a square of S×S: whole pixels of the picture (crop) or the square (pad)."""
+        """Places a picture of H×W pixels in a square of S×S, at whole pixels of the picture (crop) or square (pad)."""
         words = "" if height == width else f"{width} × {height} {_DONE[fit]}"
         if fit == "crop":
             side = min(height, width)
@@ -49,10 +49,10 @@ class Placement:
         return cls((1.0, 1.0), (0.0, 0.0), size, words)
 
     def picture(self, picture: np.ndarray) -> np.ndarray:
-        """Returns a picture, or a depth map, of S×S; pixels that it does not reach are 0: black, and no depth.
+        """Returns a picture or depth map as S×S pixels; pixels that it does not cover are 0 (black, or no depth).
 
-        A picture is shrunk to means over areas; a depth map to its nearest values, as a mean of two surfaces lies on
-        neither.
+        A resized pixel is a mean over an area of the picture, but the nearest value of a depth map, because a mean of
+        two surfaces lies on neither.
         """
         source: list[slice] = []
         target: list[slice] = []
@@ -73,7 +73,7 @@ class Placement:
     def tracks(
         self, points: Float[np.ndarray, "P T 2"], visible: Bool[np.ndarray, "P T"]
     ) -> tuple[Float32[np.ndarray, "P T 2"], Bool[np.ndarray, "P T"]]:
-        """Returns points of the picture as points of the square; those that were cut off are not visible."""
+        """Maps points of the picture to points of the square; points that were cut off are not visible."""
         placed = (points * np.array(self.scale) + np.array(self.offset)).astype(np.float32)
         if max(self.scale) > 1:
             visible = visible & ((placed >= 0) & (placed <= 1)).all(-1)
@@ -81,6 +81,6 @@ class Placement:
 
 
 def _pixels(first: float, end: float, side: int) -> slice:
-    """Returns the pixels between two shares of a side, at least one, without what lies outside."""
+    """Returns the pixels between two shares of a side: at least one, and none outside."""
     start = min(max(0, round(first * side)), side - 1)
     return slice(start, max(start + 1, min(side, round(end * side))))

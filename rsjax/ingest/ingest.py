@@ -20,15 +20,15 @@ from rsjax.ingest.work_items import EpisodeWork, IngestPlan, mark_path, run_epis
 from rsjax.processes import WorkerDied, count_cores, run_items
 
 LOCK = "lock"
-Settle = Callable[[EpisodeRef, int, int], None]  # an episode, the work items that were run on it, and their clips
-Progress = Callable[[int, int], None]  # done, of how many
-# Runs the work items that have no mark, on workers that may die, and settles every episode; raises a UserError where no
-# work item could be run: a full disk, a missing package.
+Settle = Callable[[EpisodeRef, int, int], None]  # takes an episode, how many work items were run, how many clips made
+Progress = Callable[[int, int], None]  # takes (done, in all)
+# Runs the work items that have no mark, on workers that may die, and calls Settle for every episode. Raises a UserError
+# if no work item could be run, for example because the disk is full or a package is missing.
 Runner = Callable[[IngestPlan, Sequence[EpisodeRef], Settle], None]
 
 
 def run_on_this_machine(plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Settle, workers: int = 0) -> None:
-    """Runs the work items in this process, or in ``workers`` others. A :class:`Runner`."""
+    """Runs the work items in this process, or in ``workers`` other processes. A :data:`Runner`."""
 
     def settled(ref: EpisodeRef, result: tuple[int, int] | WorkerDied) -> None:
         if isinstance(result, WorkerDied):
@@ -58,20 +58,20 @@ def ingest(
     keep_clips: bool = False,
     retry: bool = False,
 ) -> IngestSummary | None:
-    """Runs the work items that are missing and packs the clips; the store appears whole or not at all.
+    """Runs the missing work items and packs the clips; the store appears complete or not at all.
 
     Args:
-        progress: called with how many of :func:`count_steps` are done, and with that number.
-        listed: what :func:`list_episodes` returned, if it was called before.
-        keep_clips: keep the cut clips beside the store too, which saves time when episodes are added.
-        retry: run the quarantined again.
+        progress: called with the number of steps done and that of :func:`count_steps`.
+        listed: the result of :func:`list_episodes`, if it was called before.
+        keep_clips: also keep the cut clips beside the store, which saves time when episodes are added.
+        retry: run the quarantined episodes again.
 
     Returns:
-        What became of every episode; None where the store is up to date.
+        What became of every episode; None if the store is up to date.
 
     Raises:
-        UserError: the source cannot be listed, nothing can be written, no episode gave a clip, another process makes
-            the same store, or something else is in its place.
+        UserError: the source cannot be listed, nothing can be written, no episode gave a clip, another process is
+            making the same store, or something else is in its place.
     """
     refs, duplicates = listed or list_episodes(plan)
     up_to_date = is_up_to_date(plan, refs)
@@ -87,15 +87,15 @@ def ingest(
 
 
 def count_steps(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
-    """Returns how many steps an ingest has, packing each episode included."""
+    """Returns how many steps an ingest has, including the packing of each episode."""
     return len(refs) * (len(plan.steps) + 1)
 
 
 def list_episodes(plan: IngestPlan) -> tuple[list[EpisodeRef], list[EpisodeRef]]:
-    """Returns a source's episodes, and apart from them those with the id of an earlier one.
+    """Returns a source's episodes, and separately those that repeat the id of an earlier one.
 
     Raises:
-        UserError: there are none, or they cannot be listed.
+        UserError: there are no episodes, or they cannot be listed.
     """
     refs: dict[str, EpisodeRef] = {}
     duplicates: list[EpisodeRef] = []
@@ -108,10 +108,10 @@ def list_episodes(plan: IngestPlan) -> tuple[list[EpisodeRef], list[EpisodeRef]]
 
 
 def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
-    """Returns whether the store exists, made from the same episodes in the same way.
+    """Returns whether the store exists and was made from the same episodes in the same way.
 
     Raises:
-        StoreError: something else is in its place, which must not be replaced.
+        StoreError: something else is in the store's place, which must not be replaced.
     """
     out, name = plan.out, plan.source.name
     if out.exists() and not (out / MANIFEST).exists():
@@ -120,7 +120,7 @@ def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
         manifest = open_store(out).manifest
     except StoreError:  # missing or damaged
         return False
-    ours = "counts" in manifest and manifest.get("source") == name  # merging and splitting leave the counts out
+    ours = "counts" in manifest and manifest.get("source") == name  # stores that were merged or split have no counts
     if not ours or manifest.get("kind") != "clips":
         what = f"{manifest.get('kind')} of {manifest.get('source', 'another origin')}"
         raise StoreError(f"{out}: holds {what}, not what this makes of {name}; move it away or choose another --out")
@@ -128,7 +128,7 @@ def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
 
 
 def _forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
-    """Removes the marks of what is quarantined, so that it is run again; returns how many there were."""
+    """Removes the marks of failed work items, so that these are run again; returns how many there were."""
     failures = 0
     for work in (EpisodeWork(plan, ref) for ref in refs):
         for step in plan.steps:
@@ -141,13 +141,13 @@ def _forget_failures(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> int:
 
 
 def limit_threads(count: int) -> None:
-    """Limits the threads of libraries in a worker, whose cores others share. Called before a network is loaded."""
+    """Limits the threads of libraries, since workers share the cores. Call it before a network is loaded."""
     os.environ["OMP_NUM_THREADS"] = str(count)  # PyTorch
     cv2.setNumThreads(count)
 
 
 def _run(plan: IngestPlan, refs: list[EpisodeRef], run: Runner, progress: Progress) -> dict[str, float]:
-    """Runs what is missing; returns ``this_run`` of :class:`IngestSummary`."""
+    """Runs the missing work items; returns ``this_run`` of :class:`IngestSummary`."""
     began, episodes, items, clips = time.monotonic(), 0, 0, 0
 
     def settle(ref: EpisodeRef, ran: int, cut: int) -> None:
@@ -183,7 +183,7 @@ def _pack(
         raise StoreError(no_clips(plan, summary))
     steps = count_steps(plan, refs)
     plan_key = _plan_key(plan, refs)
-    cut = [f"{cut.ref.id} {cut.records}" for cut in contents.episodes()]  # as some episodes may fail
+    cut = [f"{cut.ref.id} {cut.records}" for cut in contents.episodes()]  # some episodes may have failed
     keys = {"asked": plan_key, "key": content_key(plan_key, contents.depth_unit, *cut)}
     pack(plan, contents, summary, keys, lambda packed: progress(steps - summary.done + packed, steps))
     for path in plan.items.rglob("*.tmp"):  # killed workers left these

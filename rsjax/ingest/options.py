@@ -1,4 +1,4 @@
-"""The options of an ingest, and the plan and the runner that they make."""
+"""The options of an ingest, and the plan and runner that are made from them."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.ingest.actions import ActionConfig
 from rsjax.ingest.windows import WindowConfig
 
-if TYPE_CHECKING:  # loaded when they are needed, as --help needs none of them
+if TYPE_CHECKING:  # loaded only when needed: --help needs none of them
     from rsjax.ingest.episode import EpisodeSource
     from rsjax.ingest.ingest import Runner
     from rsjax.ingest.work_items import IngestPlan
@@ -35,20 +35,20 @@ class IngestOptions:
     fit: Literal["crop", "pad", "stretch"] = "crop"
     """How a picture that is not square becomes a clip: crop its middle square, pad it with bars, or stretch it."""
     points: int = 256
-    """Tracks of a clip."""
+    """Number of tracks of a clip."""
     selection: Path | None = None
     """A list written by experiments.doctor --fix: the episodes that it leaves out are quarantined with its reasons."""
     camera: str = ""
     """The camera to use; the episode's first by default."""
     difficulty: tuple[str, ...] = ()
-    """The difficulty of tasks, by the first pattern that matches: 'pick*=simple' '*fold*=difficult'. Where none matches
-    the task, the patterns are tried on the text of the segment, and then on its skill."""
+    """The difficulty of tasks, by the first pattern that matches: 'pick*=simple' '*fold*=difficult'. If none matches
+    the task, the patterns are tried on the segment's text, and then on its skill."""
     scene: tuple[str, ...] = ()
     """The word for a scene, by the first pattern that matches its description."""
     test_share: float = 0.1
-    """Share of the episodes whose clips are the test split."""
+    """Share of the episodes whose clips form the test split."""
     shots: str = "hsv-histogram"
-    """hsv-histogram, transnetv2 or none, as docs/annotate.md explains; so are the next four."""
+    """hsv-histogram, transnetv2 or none; docs/annotate.md explains these and the next four options."""
     motion: str = "dis"
     """dis, raft or none."""
     depth: str = "recorded"
@@ -60,17 +60,17 @@ class IngestOptions:
     runner: Literal["pool", "ray"] = "pool"
     """Processes of this machine, or a Ray cluster."""
     workers: int = -1
-    """Processes; 0: this one alone, -1: one per core. With Ray, of each step at most; -1: as many as fit."""
+    """Processes; 0: this one alone, -1: one per core. With Ray: workers of each step at most; -1: as many as fit."""
     ray_address: str = "local"
-    """Of the cluster (auto: the one that this machine belongs to)."""
+    """Address of the cluster (auto: the one that this machine belongs to)."""
     cpus: float = 1.0
-    """Of each worker, on Ray; fractions share a core."""
+    """CPUs of each worker, on Ray; fractions share a core."""
     gpus: float = 0.0
-    """Of each worker that has a network, on Ray; fractions share a GPU."""
+    """GPUs of each worker that has a network, on Ray; fractions share a GPU."""
     retry: bool = False
     """Try the quarantined episodes again."""
     keep_clips: bool = False
-    """Keep the clips of each episode beside the store too: more disk, less time when episodes are added."""
+    """Also keep the clips of each episode beside the store: more disk, less time when episodes are added."""
 
     def __post_init__(self) -> None:
         require(
@@ -90,8 +90,8 @@ class IngestOptions:
                 require(getattr(self, name) == default, f"{flag} is for Ray alone; add --runner ray or leave it out")
 
 
-# What the paper keeps (§2.2). It gives no bounds of motion: these keep all of BridgeData (3 to 41 px/s) and leave out
-# still pictures and those in which a twentieth moves by the picture's width each second.
+# The windows that the paper keeps (§2.2). It gives no bounds of motion: these bounds keep all of BridgeData (3 to 41
+# px/s) and leave out still pictures, and pictures of which a twentieth moves by the picture's width each second.
 RECIPES = {"paper": WindowConfig(within_segments=True, key_frame=True, least_motion=2.0, most_motion=256.0)}
 
 
@@ -148,10 +148,10 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
 
 
 def make_runner(options: IngestOptions) -> "Runner":
-    """Returns what runs the work items: processes of this machine, or a Ray cluster.
+    """Returns the runner of the work items: processes of this machine, or a Ray cluster.
 
     Raises:
-        UserError: more workers than this machine has work for.
+        UserError: there are too many workers for this machine.
     """
     if options.runner == "ray":
         from rsjax.ingest.ray_runner import run_on_ray
@@ -165,10 +165,10 @@ def make_runner(options: IngestOptions) -> "Runner":
 
 
 def source_options(words: Sequence[str]) -> dict[str, Any]:
-    """Reads settings of a source: ``fps=5`` as a number, ``held=[6]`` as a list, everything that is not JSON as text.
+    """Reads settings of a source: ``fps=5`` as a number, ``held=[6]`` as a list, a value that is not JSON as text.
 
     Raises:
-        ConfigError: a word is not of this form.
+        ConfigError: a word is not of this form, or names a setting twice.
     """
     settings: dict[str, Any] = {}
     for word in words:

@@ -1,4 +1,4 @@
-"""Packs cut clips into one store: which episodes, in which split, in which unit of depth, with what manifest."""
+"""Packs cut clips into one store: chooses its episodes, their splits and the unit of depth, and writes the manifest."""
 
 import math
 from collections import Counter
@@ -17,7 +17,7 @@ from rsjax.ingest.work_items import EpisodeWork, IngestPlan
 
 
 class CutEpisode(NamedTuple):
-    """An episode whose clips were cut; the fields after ``records`` are from the summary of :func:`clips.cut`."""
+    """An episode whose clips were cut; the fields after ``records`` come from the summary of :func:`clips.cut`."""
 
     ref: EpisodeRef
     records: int
@@ -29,12 +29,12 @@ class CutEpisode(NamedTuple):
 
 @dataclass(frozen=True)
 class Contents:
-    """What goes into the store.
+    """The contents of the store.
 
     Attributes:
         splits: the episodes of ``train`` and ``test``.
-        depth_unit: that of most train clips with depth; None where there are none. Other clips' depth is left out.
-        depth_range: of the train clips in that unit.
+        depth_unit: the unit of most train clips with depth; None if there are none. Depth in another unit is left out.
+        depth_range: depth range of the train clips in that unit.
     """
 
     splits: dict[str, list[CutEpisode]]
@@ -51,10 +51,11 @@ class Contents:
 
 
 def split_episodes(refs: Sequence[EpisodeRef], test_share: float) -> dict[str, list[EpisodeRef]]:
-    """Splits into ``train`` and ``test``, in order; each gets one at least of two or more.
+    """Splits episodes into ``train`` and ``test``, in order.
 
-    Clips of a store stay on the side they were on, since several can show the same recording, and ``test_share`` then
-    counts for nothing. Where the source has one side only, or none, a hash of the ids decides.
+    If the source is a store with both splits, its clips stay in theirs, since several clips can show the same
+    recording; ``test_share`` is then ignored. Otherwise a hash of the ids decides: of two or more episodes each split
+    gets at least one, but ``test`` is empty if ``test_share`` is 0.
     """
     test = {ref.id for ref in refs if ref.location.get("split", "train") != "train"}
     if not 0 < len(test) < len(refs):
@@ -73,7 +74,7 @@ def cut_episodes(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> list[CutEpisod
 
 
 def refuse_odd(cuts: list[CutEpisode]) -> tuple[list[CutEpisode], list[tuple[EpisodeRef, str]]]:
-    """Returns the episodes whose actions have as many dimensions as most, and the others with the reason."""
+    """Returns the episodes whose actions have the most common number of dimensions, and the others with the reason."""
     usual = Counter(cut.action_dim for cut in cuts).most_common(1)[0][0] if cuts else None
     why = f"dimensions, those of most others have {usual}; ingest it alone"
     odd = [(cut.ref, f"actions: {cut.action_dim} {why}") for cut in cuts if cut.action_dim != usual]
@@ -81,7 +82,7 @@ def refuse_odd(cuts: list[CutEpisode]) -> tuple[list[CutEpisode], list[tuple[Epi
 
 
 def choose_contents(cuts: Sequence[CutEpisode], test_share: float) -> Contents:
-    """Splits the episodes and chooses the unit of depth, as metres and relative depth do not mix in one store."""
+    """Splits the episodes and chooses the unit of depth, since one store cannot mix metres and relative depth."""
     by_id = {cut.ref.id: cut for cut in cuts}
     chosen = split_episodes([cut.ref for cut in cuts], test_share)
     splits = {split: [by_id[ref.id] for ref in refs] for split, refs in chosen.items()}
@@ -98,19 +99,19 @@ def choose_contents(cuts: Sequence[CutEpisode], test_share: float) -> Contents:
 def pack(
     plan: IngestPlan, contents: Contents, summary: IngestSummary, keys: dict[str, str], packed: Callable[[int], None]
 ) -> None:
-    """Writes the store out of the clips that were cut.
+    """Writes the store from the clips that were cut.
 
     Its manifest has the train split's action statistics, unit and range of depth (None without depth), the episodes of
     each split, what was left out and why, and every clip's labels.
 
     Args:
-        keys: further entries of the manifest, as are those of the plan.
+        keys: further entries of the manifest, in addition to those of the plan.
         packed: called with the number of episodes that are packed.
     """
     episodes = contents.episodes()
     successes = [(cut.success, cut.records) for cut in episodes if cut.success is not None]
     quarantine: dict[str, str] = {}
-    for row in summary.quarantined:  # several may have one id
+    for row in summary.quarantined:  # several may share one id
         reason = f"{row['stage']}: {row['error']}"
         quarantine[row["episode"]] = "; ".join(filter(None, (quarantine.get(row["episode"]), reason)))
     manifest = {
@@ -141,7 +142,7 @@ def pack(
 
 
 def _finite(value: Any) -> Any:
-    """Replaces numbers that JSON does not have (infinity, where an option bounds nothing) by null."""
+    """Replaces numbers that JSON lacks, such as infinity in an option without a bound, by null."""
     if isinstance(value, dict):
         return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -152,7 +153,7 @@ def _finite(value: Any) -> Any:
 def _records(
     plan: IngestPlan, cuts: Sequence[CutEpisode], contents: Contents, packed: Callable[[], None]
 ) -> Iterator[Record]:
-    """Reads the clips of these episodes, one at a time, with the store's unit of depth or without, and its range."""
+    """Yields the clips of these episodes, without depth that is not in the store's unit, and with its depth range."""
     for cut in cuts:
         source = EpisodeWork(plan, cut.ref).records(CLIPS, cut.records)
         changes: dict[str, Any] = {} if cut.depth_unit == contents.depth_unit else {"depth": None}
@@ -164,7 +165,7 @@ def _records(
 
 
 def _dimensions(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> list[str]:
-    """Returns what most episodes say of each dimension of the actions."""
+    """Returns the most common description of the actions' dimensions among the episodes."""
     marks = (EpisodeWork(plan, cut.ref).done(CLIPS) for cut in cuts)
     said = Counter(tuple(mark["summary"]["dimensions"]) for mark in marks if mark is not None)
     return list(said.most_common(1)[0][0]) if said else []

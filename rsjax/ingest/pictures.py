@@ -1,4 +1,4 @@
-"""Pictures and depth maps that are stored one by one or are in memory, behind the interface that videos have too."""
+"""Pictures and depth maps that are stored one by one or are in memory, with the same interface as videos."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -34,8 +34,8 @@ class EncodedFrames:
 
     Attributes:
         payloads: each frame's PNG or JPEG.
-        where: the file and field that messages name.
-        depth_scale: if above 0, they are depth maps, as ``Depths``: PNG of whole numbers that count this many metres,
+        where: the file and field that error messages name.
+        depth_scale: if above 0, they are depth maps, as ``Depths``: PNG of whole numbers in units of this many metres,
             or of four channels that are the bytes of float32 metres, as TFDS writes them.
     """
 
@@ -83,7 +83,7 @@ class PictureFiles:
 
 def _depth(payload: bytes, where: Path | str, scale: float) -> Float32[np.ndarray, "H W"]:
     raw = _decode(payload, cv2.IMREAD_UNCHANGED, where)
-    if raw.dtype == np.uint8 and raw.ndim == 3 and raw.shape[2] == 4:  # OpenCV has the red byte third
+    if raw.dtype == np.uint8 and raw.ndim == 3 and raw.shape[2] == 4:  # OpenCV stores the red byte third
         metres = np.ascontiguousarray(raw[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
         return np.nan_to_num(metres, nan=0, posinf=0, neginf=0)
     if raw.dtype != np.uint16 or raw.ndim != 2:
@@ -92,10 +92,10 @@ def _depth(payload: bytes, where: Path | str, scale: float) -> Float32[np.ndarra
 
 
 def decode_pictures(payloads: Iterable[tuple[Path | str, bytes]]) -> UInt8[np.ndarray, "n H W 3"]:
-    """Decodes PNG or JPEG pictures of one size as RGB, turned as their EXIF data say.
+    """Decodes PNG or JPEG pictures of one size as RGB, rotated as their EXIF data say.
 
     Args:
-        payloads: what messages name, and the encoded picture.
+        payloads: pairs of what error messages name and the encoded picture.
 
     Raises:
         EpisodeError: one is damaged, neither PNG nor JPEG, of impossible size, or of another size than the first.
@@ -104,7 +104,7 @@ def decode_pictures(payloads: Iterable[tuple[Path | str, bytes]]) -> UInt8[np.nd
 
 
 def stack_pictures(pictures: Iterable[tuple[Path | str, np.ndarray]]) -> np.ndarray:
-    """Stacks pictures or maps of one size, each after what messages name.
+    """Stacks pictures or maps of one size; each is paired with what error messages name.
 
     Raises:
         EpisodeError: one is of another size than the first.
@@ -121,7 +121,7 @@ def stack_pictures(pictures: Iterable[tuple[Path | str, np.ndarray]]) -> np.ndar
 
 
 def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
-    """Decodes a picture, sides first: a few bytes can claim a picture of gigabytes."""
+    """Decodes a picture after a check of its sides: a few bytes can claim a picture of gigabytes."""
     problem = f"not a readable picture ({len(payload)} bytes)"
     if payload.startswith(b"\x89PNG\r\n\x1a\n"):
         sides = _png_sides(payload)
@@ -142,7 +142,7 @@ def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
 
 
 def _png_sides(payload: bytes) -> tuple[int, int] | None:
-    """Returns None if a chunk claims to be longer than the file: OpenCV allocates as much as a chunk claims."""
+    """Returns a PNG's sides; None if a chunk claims to be longer than the file: OpenCV allocates what it claims."""
     place = 8
     while place + 12 <= len(payload):
         end = place + 12 + int.from_bytes(payload[place : place + 4], "big")
@@ -155,7 +155,7 @@ def _png_sides(payload: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_sides(payload: bytes) -> tuple[int, int] | None:
-    """Returns the sides in the largest frame header: the decoder would use a second one in place of the first."""
+    """Returns a JPEG's sides from its largest frame header: the decoder would use a second header over the first."""
     largest: tuple[int, int] | None = None
     place = payload.find(b"\xff", 2)
     while 0 <= place < len(payload) - 9:

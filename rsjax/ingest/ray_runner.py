@@ -1,7 +1,7 @@
 """Runs the work items of an ingest on a Ray cluster: a pool of actors for each step, with its CPUs and shares of GPUs.
 
-Messages are ids, places and marks; pictures stay where they are. Every node has to see the data set and the plan's
-folder under the same paths. Ray is an extra (``pip install -e '.[ray]'``).
+Messages contain only ids, locations and marks; pictures are not sent. Every node must see the data set and the plan's
+folder under the same paths. Ray is an optional package (``pip install -e '.[ray]'``).
 """
 
 import asyncio
@@ -17,9 +17,9 @@ from rsjax.ingest.ingest import Settle, limit_threads
 from rsjax.ingest.work_items import EpisodeWork, IngestPlan, Mark, Step, run_item
 from rsjax.processes import MAX_DEATHS, WorkerDied
 
-ANSWER_SECONDS = 5.0  # for which a cluster's address may stay silent
-MAX_FAILED_STARTS = 3  # of an actor, until it is the installation and not a node
-MAX_WAITING = 16  # episodes between two steps
+ANSWER_SECONDS = 5.0  # time that a cluster's address has to answer
+MAX_FAILED_STARTS = 3  # of an actor, after which the installation is to blame and not a node
+MAX_WAITING = 16  # episodes in progress beyond one per actor; they wait between steps
 OBJECT_STORE_BYTES = 100 * 2**20  # of a local cluster: messages are small
 
 
@@ -36,13 +36,13 @@ def run_on_ray(
     cpus: float | None = None,
     patience: float = 300.0,
 ) -> None:
-    """Runs the work items on a cluster. A :class:`rsjax.ingest.ingest.Runner`.
+    """Runs the work items on a cluster. A :data:`rsjax.ingest.ingest.Runner`.
 
     Args:
-        address: of the cluster; "local" starts one on this machine and stops it at the end.
-        most: actors of each step at most; None: as many as the CPUs and GPUs allow.
-        cpus: of a local cluster; None: the machine's, or as many as one actor of each step needs.
-        patience: seconds to wait for the cluster to place an actor of a step that has none, while nothing else runs.
+        address: the cluster's address; "local" starts one on this machine and stops it at the end.
+        most: largest number of actors of each step; None: as many as the CPUs and GPUs allow.
+        cpus: CPUs of a local cluster; None: the machine's, or as many as one actor of each step needs.
+        patience: seconds to wait for an idle actor of a step while no work item runs.
 
     Raises:
         RayError: Ray is missing, the cluster cannot be reached, or it cannot place one actor of each step at once.
@@ -85,7 +85,7 @@ def check_answers(address: str) -> None:
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS", address)
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not (port.isascii() and port.isdecimal()):  # Ray says what is wrong with it, or looks for a cluster itself
+    if not (port.isascii() and port.isdecimal()):  # Ray reports what is wrong with it, or finds a cluster itself
         return
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_SECONDS).close()
@@ -96,14 +96,14 @@ def check_answers(address: str) -> None:
 
 
 def count_actors(steps: Sequence[Step], cluster: Mapping[str, float], most: int | None = None) -> dict[str, int]:
-    """Returns the number of actors by step: one each first, then evenly while CPUs and GPUs last.
+    """Returns the number of actors of each step: one each first, then evenly while CPUs and GPUs last.
 
     Args:
-        cluster: ``CPU`` and ``GPU``, how many there are.
-        most: of each step; None: no limit.
+        cluster: the numbers of CPUs (``CPU``) and GPUs (``GPU``).
+        most: largest number of actors of each step; None: no limit.
 
     Raises:
-        RayError: they do not suffice for one of each.
+        RayError: CPUs or GPUs do not suffice for one actor of each step.
     """
     left = {name: float(cluster.get(name, 0.0)) for name in ("CPU", "GPU")}
     counts = {step.name: 0 for step in steps}
@@ -134,10 +134,10 @@ class _Actors:
         self._idle: dict[str, asyncio.Queue[Any]] = {step.name: asyncio.Queue() for step in plan.steps}
         self._actors: list[Any] = []
         self._starting: set[asyncio.Task[None]] = set()
-        self._running = 0  # work items
+        self._running = 0  # number of work items
 
     async def run(self, refs: Sequence[EpisodeRef], counts: Mapping[str, int], settle: Settle) -> None:
-        """Runs the work items of these episodes on ``counts`` actors of each step, and stops those."""
+        """Runs the work items of these episodes on ``counts`` actors of each step, and stops the actors."""
         for step in self._plan.steps:
             for _ in range(counts[step.name]):
                 self._begin_start(step)
@@ -174,7 +174,7 @@ class _Actors:
                 answer = await actor.run.remote(work.ref)
             except self._ray.exceptions.RayTaskError:  # a bug; Ray adds the actor's traceback
                 raise
-            except self._ray.exceptions.RayError:  # the actor is gone, or its node
+            except self._ray.exceptions.RayError:  # the actor or its node died
                 self._begin_start(step)
                 continue
             finally:
@@ -186,7 +186,7 @@ class _Actors:
         return work.fail(step.name, WorkerDied())
 
     async def _take_idle(self, step: Step) -> Any:
-        """Waits for an idle actor of a step, for as long as anything runs that may lead to one."""
+        """Waits for an idle actor of a step; gives up if no work item runs after ``patience`` seconds."""
         while True:
             try:
                 actor = await asyncio.wait_for(self._idle[step.name].get(), self._patience)
@@ -207,7 +207,7 @@ class _Actors:
         task.add_done_callback(self._starting.discard)
 
     async def _start(self, step: Step) -> None:
-        """Starts an actor, idle once the cluster has found a place for it, which may be never."""
+        """Starts an actor, which becomes idle once the cluster has placed it; this may never happen."""
         for attempt in range(MAX_FAILED_STARTS):
             actor = self._class.options(num_cpus=step.cpus, num_gpus=step.gpus).remote(self._shared, step.name)
             self._actors.append(actor)
@@ -232,7 +232,7 @@ class _Actor:
         limit_threads(max(1, math.ceil(self._step.cpus)))
 
     def run(self, ref: EpisodeRef) -> Mark | UserError:
-        """Returns the mark of this step on an episode, or why none could be run."""
+        """Returns the mark of this step on an episode, or the error because of which no work item could be run."""
         try:
             return run_item(EpisodeWork(self._plan, ref), self._step, self._prepared)
         except UserError as error:

@@ -1,4 +1,4 @@
-"""A list of the episodes of a data set to keep and to leave out, with reasons, and a source that follows it."""
+"""A list of a data set's episodes to keep and to leave out, with reasons, and a source that follows the list."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -14,16 +14,16 @@ FORMAT = 1
 def write_selection(
     path: Path, about: str, refs: tuple[tuple[str, str], ...], reasons: Mapping[str, list[str]]
 ) -> tuple[int, int]:
-    """Writes which episodes are kept, and which are left out and why.
+    """Writes which episodes are kept, which are left out, and why.
 
     Args:
-        path: the list, JSON.
+        path: the list, a JSON file.
         about: the data set, for human readers of the list.
         refs: every episode's id and fingerprint.
-        reasons: of those left out, by id.
+        reasons: why episodes are left out, by id.
 
     Returns:
-        How many are kept, how many are left out.
+        How many episodes are kept, and how many are left out.
 
     Raises:
         FileError: the file cannot be written.
@@ -38,14 +38,14 @@ def write_selection(
 
 @dataclass
 class Selected:
-    """A source that refuses the episodes that a list leaves out: they still count, and the error has the reasons.
+    """A source that refuses to read the episodes that a list leaves out; the error gives the reasons.
 
-    An episode that has changed since the list was written is read.
+    It still lists these episodes. An episode that has changed since the list was written is read.
 
     Attributes:
-        source: what is read.
-        reasons: by id and fingerprint.
-        name: of the source.
+        source: the source that is read.
+        reasons: why episodes are left out, by id and fingerprint.
+        name: name of the source.
     """
 
     source: EpisodeSource
@@ -53,7 +53,7 @@ class Selected:
     name: str
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists all; one that is left out has a fingerprint of its own, so that earlier work on it is not used."""
+        """Lists all episodes; one that is left out gets another fingerprint, so that earlier work on it is not used."""
         for ref in self.source.episodes():
             why = self.reasons.get((ref.id, ref.fingerprint))
             if why is None:
@@ -62,17 +62,17 @@ class Selected:
                 yield EpisodeRef(ref.id, fingerprint((), ref.fingerprint, why), {"left_out": why})
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """Reads one episode; :class:`EpisodeError` with the reasons if it is left out."""
+        """Reads one episode; raises :class:`EpisodeError` with the reasons if it is left out."""
         if "left_out" in ref.location:
             raise EpisodeError(f"{ref.id}: left out by the list: {ref.location['left_out']}")
         return self.source.read(ref)
 
 
 def select(source: EpisodeSource, path: Path) -> Selected:
-    """Returns the source without what the list at ``path`` leaves out.
+    """Returns a source that refuses the episodes that the list at ``path`` leaves out.
 
     Raises:
-        SourceError: the list cannot be read, or is about other episodes or about these with other options.
+        SourceError: the list cannot be read, or is about other episodes or about these read with other options.
     """
     try:
         content = parse_json(regular(path).read_bytes())

@@ -23,20 +23,20 @@ _ROW = ("episode", "stage", "key", "error", "option", "traceback")
 
 @dataclass(frozen=True)
 class IngestSummary:
-    """What became of every episode: episodes = done + filtered + quarantined; and of windows.
+    """What became of every episode (episodes = done + filtered + quarantined) and of every window.
 
     Attributes:
         episodes: how many the source lists.
         done: how many gave a clip.
-        filtered: reason by episode, for those that were read and gave none.
+        filtered: the reason by episode, for episodes that were read and gave no clip.
         quarantined: rows of the quarantine table: ``episode``, ``stage`` (the step), ``key``, ``error``, ``option``
-            (the one that rules the episode out, or ""), ``traceback``.
-        windows: how many were ``kept``, and how many each reason left out.
-        steps: of each, how many work items are done and failed, their seconds on a worker and on its cores, and the
-            clips per second of such a worker.
-        fits: episodes by what became of their pictures, in words, if they were not square.
-        cut: episodes of more than one shot.
-        test_clips: of the store; None while it is not packed.
+            (the option that rules the episode out, or ""), ``traceback``.
+        windows: how many were ``kept``, and how many were left out for each reason.
+        steps: for each step, how many work items are done and failed, their seconds on a worker and on its cores, and
+            the clips per second of one worker.
+        fits: number of episodes by how their pictures, if not square, became square, in words.
+        cut: number of episodes with more than one shot.
+        test_clips: number of the store's test clips; None while it is not packed.
         depth_left_out: clips that lost their depth because its unit is not the store's.
         this_run: ``items`` (work items that were run), ``clips``, ``seconds`` and ``clips_per_second`` of the last
             run alone.
@@ -55,12 +55,12 @@ class IngestSummary:
     this_run: dict[str, float] | None = None
 
     def ruled_out_by(self) -> str:
-        """Returns the one option that ruled out every quarantined episode; "" where there is none."""
+        """Returns the one option that ruled out every quarantined episode; "" if there is none."""
         options = {row["option"] for row in self.quarantined}
         return options.pop() if len(options) == 1 else ""
 
     def tables(self) -> str:
-        """Names the files that have the reasons for what was left out, as far as anything was."""
+        """Names the files that give the reasons for what was left out; "" if nothing was."""
         windows = sum(number for reason, number in self.windows.items() if reason != "kept")
         filled = {SUMMARY: self.filtered, QUARANTINE: self.quarantined, WINDOWS: windows}
         return " and ".join(name for name, rows in filled.items() if rows)
@@ -69,7 +69,7 @@ class IngestSummary:
 def summarise(
     plan: IngestPlan, refs: Sequence[EpisodeRef], refused: Sequence[tuple[EpisodeRef, str]] = ()
 ) -> IngestSummary:
-    """Counts by the marks of an ingest whose work items were all run.
+    """Makes the summary from the marks of an ingest whose work items were all run.
 
     Args:
         refused: further episodes that are not in the store, and why.
@@ -101,7 +101,7 @@ def summarise(
             if mark["status"] == "failed":
                 quarantined.append({name: mark.get(name, "") for name in _ROW})
                 break
-        else:  # the last mark is that of the cut
+        else:  # the last mark is that of cutting clips
             windows.update(last["summary"]["windows"])
             fits.update(filter(None, [last["summary"].get("fit")]))
             clips += last["records"]
@@ -113,7 +113,7 @@ def summarise(
                 short[ref.id] = last["summary"]["short"]
     for row in steps.values():
         row["clips_per_second"] = clips / row["seconds"] if row["seconds"] else None
-    # The same words for all episodes with the same cure.
+    # All episodes with the same cure get the same reason.
     longest = Counter[tuple[str, str]]()
     for why in short.values():
         cause = why["window"], why["cure"]

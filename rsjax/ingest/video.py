@@ -1,8 +1,8 @@
-"""Reads pictures of video files by number or by time, through PyAV (H.264, AV1 and whatever else FFmpeg decodes).
+"""Reads pictures of video files by number or by time with PyAV (H.264, AV1 and any other codec of FFmpeg).
 
-Reading seeks to the key frame before the picture (:mod:`rsjax.ingest.video_index` knows where it is) and decodes on
-from there, or just decodes on if that is nearer. Each process keeps a few files open and closes the least recently used
-one first.
+Reading seeks to the key frame before the picture (:mod:`rsjax.ingest.video_index` lists the key frames) and decodes
+from there, or continues from the current position if that is nearer. Each process keeps a few files open and closes the
+least recently used one first.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from rsjax.ingest.episode import EpisodeError
 from rsjax.ingest.pictures import stack_pictures
 from rsjax.ingest.video_index import OPEN_FILES, VideoIndex, decoded, open_decoder, scan
 
-_COMPARED = 64  # first frames of a file among which seeking is checked
+_COMPARED = 64  # seeking is checked among this many first frames of a file
 
 
 class VideoFrames:
@@ -30,7 +30,7 @@ class VideoFrames:
 
     Args:
         path: the file.
-        numbers: the frames of the file that count, in order; None: all.
+        numbers: the file's frames that belong to the video, in order; None: all.
     """
 
     def __init__(self, path: Path, numbers: Int64[np.ndarray, " n"] | None = None) -> None:
@@ -40,7 +40,7 @@ class VideoFrames:
         return len(scan(self.path).stamps) if self._numbers is None else len(self._numbers)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
-        """Returns these pictures, 0–255, RGB, turned as the file's display matrix says.
+        """Returns these pictures, 0–255, RGB, rotated as the file's display matrix says.
 
         Raises:
             EpisodeError: the file is damaged at one of them.
@@ -56,7 +56,7 @@ class VideoFrames:
 
 
 def misread(path: Path, count: int = 5) -> int | None:
-    """Returns the first frame that decoding in order gives and seeking does not; None if all checked are alike.
+    """Returns the first checked frame whose picture differs between decoding in order and seeking; None if none does.
 
     Args:
         count: frames to check, spread over the first few dozen of the file.
@@ -69,10 +69,10 @@ def misread(path: Path, count: int = 5) -> int | None:
     chosen, known = np.unique(np.linspace(0, last, count).astype(int)).tolist(), set(index.labels.tolist())
     sought = dict[int, UInt8[np.ndarray, "H W 3"]]()
     with contextlib.closing(_Decoder(path, index)) as decoder:
-        for number in reversed(chosen):  # so that each is sought
+        for number in reversed(chosen):  # in this order each read seeks
             with contextlib.suppress(EpisodeError):
                 sought[number] = decoder.picture(number)
-    with open_decoder(path) as container, contextlib.suppress(av.FFmpegError):  # damage is found where frames are read
+    with open_decoder(path) as container, contextlib.suppress(av.FFmpegError):  # reading frames reports damage
         frames = (frame for frame in decoded(container) if frame.pts in known)
         for number, frame in enumerate(itertools.islice(frames, last + 1)):
             if number in chosen and not (number in sought and np.array_equal(sought[number], _upright(frame))):
@@ -85,10 +85,10 @@ def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> 
 
     Args:
         seconds: the times, increasing.
-        tolerance: seconds that a frame may be away.
+        tolerance: largest distance of a frame from its time, in seconds.
 
     Raises:
-        EpisodeError: no frame is that near, or one frame is nearest to two of the times.
+        EpisodeError: a time has no frame that near, or one frame is nearest to two of the times.
     """
     times = scan(path).times()
     after = np.clip(np.searchsorted(times, seconds), min(1, len(times) - 1), len(times) - 1)
@@ -114,14 +114,14 @@ _inherited: list[object] = []
 
 
 def _set_aside() -> None:
-    """Lets a forked process open files of its own: reading the parent's would move the parent's place in them.
+    """Makes a forked process open its own files: reading the parent's would move the parent's position in them.
 
-    This also runs between the fork and the exec of a command that is started with a ``preexec_fn``, as Ray's are. So it
-    frees nothing: FFmpeg waits for its threads when it is freed, and a fork does not copy them.
+    This also runs between the fork and the exec of a command that is started with a ``preexec_fn``, as Ray's commands
+    are. So it frees nothing: freeing a decoder waits for FFmpeg's threads, and a fork does not copy threads.
     """
     global _decoders, _lock
     _inherited.append(_decoders)
-    _decoders, _lock = OrderedDict(), threading.RLock()  # another thread of the parent may have had the lock
+    _decoders, _lock = OrderedDict(), threading.RLock()  # another thread of the parent may have held the lock
 
 
 os.register_at_fork(after_in_child=_set_aside)
@@ -129,7 +129,7 @@ os.register_at_fork(after_in_child=_set_aside)
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator["_Decoder"]:
-    """Lends the file's decoder to this thread alone; one that failed is not kept."""
+    """Lends the file's decoder to this thread alone; a decoder that failed is not kept."""
     index = scan(path)
     with _lock:
         decoder = _decoders.pop(str(path), None)
@@ -151,7 +151,7 @@ def _opened(path: Path) -> Iterator["_Decoder"]:
 
 
 class _Decoder:
-    """One open file and the position of decoding in it."""
+    """An open file and the current decoding position in it."""
 
     def __init__(self, path: Path, index: VideoIndex) -> None:
         self.path, self.index = path, index
@@ -171,9 +171,10 @@ class _Decoder:
         return _upright(self._decode(number))
 
     def _decode(self, number: int) -> Any:
-        """Decodes a frame: on from here if that is nearest, from the key frame before it, or from farther back.
+        """Decodes a frame from the current position if that is nearest, else from a key frame before the frame.
 
-        In an open group of pictures the first frames depend on the group before, so one key frame may not be enough.
+        In an open group of pictures the first frames depend on the previous group. So if the nearest key frame is not
+        enough, decoding starts at the one before it, and then at the first frame.
         """
         near = self._start(number)
         attempts: list[int | None] = [near, self._start(max(0, near - 1)), 0]
@@ -196,7 +197,7 @@ class _Decoder:
         return int(self._starts[place]) if place >= 0 else 0
 
     def _decode_until(self, number: int) -> Any:
-        """Decodes on up to this frame; None if the decoder passes it by."""
+        """Continues decoding up to this frame; returns None if the decoder skips it."""
         for frame in self._frames:
             if (place := self._numbers.get(frame.pts)) is None:
                 continue
@@ -207,6 +208,6 @@ class _Decoder:
 
 
 def _upright(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
-    """Returns a decoded frame as RGB, turned as the file's display matrix says."""
+    """Returns a decoded frame as RGB, rotated as the file's display matrix says."""
     picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
     return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture

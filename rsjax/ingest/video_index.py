@@ -1,7 +1,7 @@
 """Opens video files and lists their frames: when each is shown, and where decoding can begin.
 
-The list comes from the packets alone, without decoding, unless the file may lack the times at which frames are shown:
-AVI has none, and a file that was copied from one may have invented ones. Then it is decoded once, in order.
+The list comes from the packets alone, without decoding, unless the file may lack correct presentation times: AVI has
+none, and a file that was copied from an AVI file may have invented ones. Such a file is decoded once, in order.
 """
 
 import contextlib
@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float, Int64
 
 from rsjax.ingest.episode import MAX_PIXELS, EpisodeError, data_file
 
-OPEN_FILES = 8  # decoders that one process keeps; each has a few decoded pictures in memory
-_TRIAL = 64  # frames that are decoded to see whether they come out in the order of their times
+OPEN_FILES = 8  # decoders that one process keeps; each holds a few decoded pictures in memory
+_TRIAL = 64  # frames that are decoded to test whether they come out in the order of their times
 # A playlist that calls itself .mp4 would otherwise make FFmpeg open the files that it names.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 
@@ -31,9 +31,9 @@ class VideoIndex:
 
     Attributes:
         stamps: each frame's presentation time in units of ``time_base``, increasing.
-        labels: the stamp by which each frame is found in the file; the same, unless those are in another order.
+        labels: the stamp by which each frame is found in the file; equal to ``stamps`` unless the order differs.
         keys: whether decoding can begin at the frame.
-        time_base: seconds.
+        time_base: length of a unit in seconds.
     """
 
     stamps: Int64[np.ndarray, " N"]
@@ -47,10 +47,11 @@ class VideoIndex:
 
 
 def scan(path: Path) -> VideoIndex:
-    """Returns the index of a video file, which is kept while the file stays the same.
+    """Returns the index of a video file, from a cache as long as the file stays the same.
 
     Raises:
-        EpisodeError: the file is missing, no video, truncated, or has pictures of an impossible size.
+        EpisodeError: the file is missing, not a video or truncated, has pictures of an impossible size, or has missing
+            or repeated times.
     """
     try:
         status = path.stat()
@@ -61,7 +62,7 @@ def scan(path: Path) -> VideoIndex:
 
 @lru_cache(maxsize=4 * OPEN_FILES)
 def _scan(path: Path, size: int, modified: int) -> VideoIndex:
-    """Scans a file; size and date are there so that a changed file is scanned again."""
+    """Scans a file; ``size`` and ``modified`` make the cache scan a changed file again."""
     with open_container(path) as container:
         stream = container.streams.video[0]
         height, width = stream.codec_context.height, stream.codec_context.width
@@ -78,7 +79,7 @@ def _scan(path: Path, size: int, modified: int) -> VideoIndex:
         raise EpisodeError.at(path, "has frames without a time, so they cannot be found", "rewrite it as MP4")
     present = len(packets)
     if avi:
-        present = max(keys) + 1  # the header counts empty places, too, in which the picture before stays
+        present = max(keys) + 1  # the header also counts empty packets, which repeat the previous picture
     elif present < promised:
         with open_container(path, ignore_editlist="1") as container:  # an edit list may hide frames that are there
             present = len(_packets(path, container))
@@ -88,34 +89,34 @@ def _scan(path: Path, size: int, modified: int) -> VideoIndex:
     stamps = sorted(keys)
     if len(keys) < len(packets):
         raise EpisodeError.at(path, "two frames have the same time", "rewrite the file with increasing times")
-    in_order = list(keys) == stamps  # either no frame waits for a later one, or the stamps do not say so
+    in_order = list(keys) == stamps  # either frames are stored as shown, or the stamps are wrong
     labels = _shown_order(path, stamps, avi) if reorders and in_order else stamps
     return VideoIndex(np.array(stamps), np.array(labels), np.array([keys[label] for label in labels]), time_base)
 
 
 def decoded(container: Any) -> Iterator[Any]:
-    """Yields the frames of a file, or those from where it was sought, in the order in which they are shown.
+    """Yields the frames of a file from its current position on, in the order in which they are shown.
 
-    Each has as ``pts`` its label in the file's :class:`VideoIndex`.
+    The ``pts`` of each is its label in the file's :class:`VideoIndex`.
     """
     for packet in _demuxed(container):
         yield from packet.decode()
 
 
 def open_decoder(path: Path) -> Any:
-    """Opens a file so that damage is an error, in one thread: many processes decode at once, one a core."""
+    """Opens a file for decoding in one thread (each core has its own process), with damage as an error."""
     container = open_container(path)
     context = container.streams.video[0].codec_context
     context.thread_count = 1
     context.options = {
-        "err_detect": "explode",  # H.264 would paint over damage and say nothing
-        "max_pixels": str(MAX_PIXELS),  # pictures may be of another size than the header says
+        "err_detect": "explode",  # otherwise H.264 conceals damage silently
+        "max_pixels": str(MAX_PIXELS),  # pictures may be larger than the header says
     }
     return container
 
 
 def open_container(path: Path, **options: str) -> Any:
-    """Opens a file; one that is named like a protocol of FFmpeg's is still only that file."""
+    """Opens a file, even if its name looks like one of FFmpeg's protocols."""
     try:
         with data_file(path).open("rb"):
             container = av.open(
@@ -136,12 +137,12 @@ def _is_avi(container: Any) -> bool:
 
 
 def _demuxed(container: Any) -> Iterator[Any]:
-    """Yields the packets of the pictures. Those of AVI get their place in the file as a label, as FFmpeg guesses."""
+    """Yields the packets of the pictures, labelled in AVI by their place in the file: FFmpeg only guesses their times."""
     avi = _is_avi(container)
     for packet in container.demux(container.streams.video[0]):
         if avi and packet.dts is not None:
             if not packet.size:
-                continue  # the picture before stays; FFmpeg would take it for the end
+                continue  # repeats the previous picture; FFmpeg would take it for the end
             packet.pts = packet.dts
         yield packet
 
@@ -156,14 +157,14 @@ def _packets(path: Path, container: Any) -> list[tuple[int | None, bool]]:
 
 
 def _shown_order(path: Path, labels: list[int], avi: bool) -> list[int]:
-    """Returns the labels of all frames in the order in which they are shown, which decoding tells.
+    """Returns the labels of all frames in the order in which they are shown, found by decoding.
 
     Args:
-        labels: in the order of the file.
-        avi: whether their order says nothing; otherwise it counts if the first frames come out in it.
+        labels: labels in the order of the file.
+        avi: whether the file's order means nothing; otherwise it is trusted if the first frames come out in it.
 
     Raises:
-        EpisodeError: the order cannot be known, as not all frames can be decoded.
+        EpisodeError: the order cannot be found, because not all frames can be decoded.
     """
     if not avi and (shown := _decoded_labels(path, labels[:_TRIAL])) == sorted(shown):
         return labels

@@ -1,8 +1,8 @@
 """Windows: fixed numbers of frames at a fixed rate, as an index into an episode, and which of them become clips.
 
-Windows overlap: a minute at 30 fps has about a hundred of 16 frames at 2 Hz, each spanning 226 recorded frames. So
-depth and tracks are made once per episode, and a window is no more than the numbers of its frames. These are chosen by
-their time stamps, as not every camera keeps its rate.
+Windows overlap: a minute at 30 fps has about a hundred windows of 16 frames at 2 Hz, each spanning 226 recorded frames.
+So depth and tracks are made once per episode, and a window is only the list of its frame numbers. Frames are chosen by
+their time stamps, because not every camera keeps its rate.
 
 Axes: N recorded frames, T frames of a window, W windows, S spans.
 """
@@ -19,7 +19,7 @@ from rsjax.config import require
 from rsjax.ingest.episode import EpisodeError, Segment
 
 MAX_STEP = 2**20  # recorded frames from one frame of a window to the next
-_TIE = 1e-6  # of the time between two frames: what rounding may take from the later one of two that are equally near
+_TIE = 1e-6  # share of a frame interval: two frames count as equally near up to this rounding error
 Span = tuple[int, int]  # first frame, and the one after the last
 
 
@@ -32,12 +32,12 @@ class WindowConfig:
 
     frames: int = 16
     rate: float = 2.0  # frames per second of a window, by the time stamps; 0: each recorded frame
-    hop: int = 1  # frames of the window between one window's start and the next one's
+    hop: int = 1  # distance between the starts of successive windows, in frames of the window
     within_segments: bool = False  # each window in one segment of the data set; else only cuts between shots bound it
-    least_motion: float = 0.0  # mean over the window's frames; below, nothing happens
-    most_motion: float = float("inf")  # above, the camera shakes or the picture is broken
+    least_motion: float = 0.0  # mean over the window's frames; below it, nothing happens
+    most_motion: float = float("inf")  # above it, the camera shakes or the picture is broken
     key_frame: bool = False  # keep only windows with a key frame
-    most_gap: float = 1.5  # of the time between two frames of a window, relative to 1 / rate; a recording may stop
+    most_gap: float = 1.5  # longest time between two frames of a window, relative to 1 / rate; a recording may stop
 
     def __post_init__(self) -> None:
         require(2 <= self.frames <= 4096, f"windows.frames is {self.frames}; a clip has 2 to 4096 frames")
@@ -67,10 +67,10 @@ class WindowIndex:
 
 
 def check_rate(fps: float, config: WindowConfig) -> float:
-    """Returns how many recorded frames lie between two frames of a window, 1 or more.
+    """Returns the distance between two frames of a window in recorded frames, 1 or more.
 
     Raises:
-        EpisodeError: it was recorded at a lower rate than windows take, or at one that no camera has.
+        EpisodeError: the recording has a lower rate than windows need, or a rate that no camera has.
     """
     step = fps / config.rate if config.rate else 1.0
     if not step < MAX_STEP:
@@ -89,8 +89,8 @@ def index_windows(
     Args:
         timestamps: seconds of the recorded frames, increasing.
         fps: recorded frames per second.
-        spans: in order, without overlap.
-        config: how long windows are and how far apart.
+        spans: the spans of the episode, in order, without overlap.
+        config: how long windows are and how far apart they start.
 
     Raises:
         EpisodeError: as :func:`check_rate`.
@@ -105,12 +105,12 @@ def index_windows(
 
 
 def _windows_of(times: Float[np.ndarray, " n"], fps: float, config: WindowConfig) -> Int[np.ndarray, "W T"]:
-    """Returns the windows of one span, in frames from its first on."""
+    """Returns the windows of one span, as frame numbers counted from the span's first frame."""
     count, rate, clock = len(times), config.rate, times
     if not rate:  # as recorded
         rate, clock = 1.0, np.arange(count, dtype=np.float64)
-    clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # what is nearest to this is too late
-    # A start for each even step that is the nearest to some frame: a recording that stops for years has few of them.
+    clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # a step nearest to this end is too late
+    # Only even steps that are nearest to some frame start a window: a recording that stops for years has few of them.
     numbers = np.unique(np.floor((clock - clock[0]) * rate / config.hop + 0.5 + _TIE))
     starts = np.unique(_nearest(clock, clock[0] + numbers * config.hop / rate))
     frames = _nearest(clock, clock[starts, None] + np.arange(config.frames) / rate)
@@ -118,22 +118,22 @@ def _windows_of(times: Float[np.ndarray, " n"], fps: float, config: WindowConfig
 
 
 def _nearest(times: Float[np.ndarray, " n"], wanted: Float[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
-    """Returns the place of the nearest of increasing times, the later one of two; there are at least two."""
+    """Returns the index of the nearest of increasing times, the later one if two are; there must be at least two."""
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     share = (wanted - times[after - 1]) / (times[after] - times[after - 1])
     return after - (share < 0.5 - _TIE)
 
 
 def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], config: WindowConfig) -> list[Span]:
-    """Returns the spans that bound windows: the shots, or their parts in one segment where the config asks for it.
+    """Returns the spans that bound windows: the shots, or their parts within one segment if ``config`` asks for it.
 
     Args:
-        count: recorded frames; shots are cut off there.
+        count: number of recorded frames; shots are cut off there.
         shots: in order, without overlap; none: the episode is one shot.
-        segments: the data set's own.
+        segments: the data set's own segments.
 
     Raises:
-        EpisodeError: segments within which windows are to lie overlap.
+        EpisodeError: windows have to lie within segments, but segments overlap.
     """
     spans = [(max(0, first), min(end, count)) for first, end in shots or [(0, count)]]
     if config.within_segments and segments:
@@ -147,7 +147,7 @@ def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], co
 
 
 def segment_at(segments: Sequence[Segment], frames: Int[np.ndarray, " T"]) -> Segment | None:
-    """Returns the segment with most of a window's frames, the earlier one of two; None where none has any."""
+    """Returns the segment with most of a window's frames, the earlier one of two; None if no segment has any."""
     shares = [int(((frames >= segment.start) & (frames < segment.end)).sum()) for segment in segments]
     return segments[int(np.argmax(shares))] if any(shares) else None
 
@@ -159,13 +159,13 @@ def judge(
     key_frames: Sequence[int],
     config: WindowConfig,
 ) -> list[str]:
-    """Returns why each window is left out, "" where it is kept.
+    """Returns the reason why each window is left out; "" if it is kept.
 
     Args:
         index: the windows.
         timestamps: seconds of the recorded frames.
-        motion: of each frame against the one before, in pixels per second of a 256-pixel-wide picture; None where it
-            was not measured, then no window is left out for it.
+        motion: motion of each frame against the previous one, in pixels per second of a 256-pixel-wide picture; None if
+            it was not measured, then no window is left out for it.
         key_frames: recorded frames at which something decisive happens.
 
     Returns:
@@ -174,7 +174,7 @@ def judge(
     frames = index.frames
     recorded = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
     numbers, seconds = np.diff(frames, axis=1), np.diff(timestamps[frames], axis=1)
-    # Rounding to recorded frames makes some steps longer than 1 / rate where nothing is missing.
+    # Rounding to recorded frames makes some steps longer than 1 / rate although no frame is missing.
     steps = np.maximum(numbers * recorded, 1 / config.rate if config.rate else 0.0)
     torn = ((seconds > config.most_gap * steps) | (numbers < 1)).any(1)
     means = np.full(len(index), np.nan) if motion is None else _window_means(motion, index)  # nan passes both bounds
@@ -190,7 +190,7 @@ def judge(
 
 
 def tally(reasons: Sequence[str]) -> dict[str, int]:
-    """Counts the windows by reason; ``kept`` is the rest. The numbers add up to all windows."""
+    """Counts the windows by reason; ``kept`` counts those without one. The numbers add up to all windows."""
     counts = Counter(reasons)
     return {"kept": counts.pop("", 0), **dict(sorted(counts.items()))}
 
@@ -205,7 +205,7 @@ def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, li
 
 
 def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:
-    """Returns the mean motion between a window's first frame and its last; that of the first frame lies before it."""
+    """Returns the mean motion after each window's first frame up to its last; the first frame's own lies before it."""
     sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
     first, last = index.frames[:, 0], index.frames[:, -1]
     return (sums[last + 1] - sums[first + 1]) / np.maximum(last - first, 1)

@@ -1,8 +1,9 @@
 """Work items: a work item is one step on one episode. It writes its own output, and a mark that says what made it.
 
 Its key is a hash of all that its output depends on: what the episode was read from and how, the step's version and
-parameters, and the keys of the steps whose output it reads. Output and mark are named by the key and appear whole, the
-mark last, so a mark always stands for a whole output, whatever was killed. Outputs of other parameters stay beside it.
+parameters, and the keys of the steps whose output it reads. Output and mark are named by the key and appear complete,
+the mark last, so a mark always stands for a complete output, even if a process is killed. Outputs of other parameters
+stay beside it.
 """
 
 import contextlib
@@ -38,15 +39,15 @@ class Step:
     """One step on every episode, such as depth or tracks. Picklable.
 
     Attributes:
-        name: a file name.
+        name: its name, usable as a file name.
         work: returns an episode's records, one at a time, and a summary at the end.
         params: a hash of all parameters that the output depends on.
         needs: the earlier steps whose output it reads.
-        version: raised when the same parameters give another output.
-        prepare: loads what is heavy, once in each worker. A :class:`UserError` from it (a package, weights) ends the
-            ingest, as no episode could be worked on.
-        cpus: of one worker, fractions allowed; a Ray cluster schedules by it.
-        gpus: likewise.
+        version: to be raised when the same parameters give another output.
+        prepare: loads heavy objects, once in each worker. A :class:`UserError` from it (a missing package, missing
+            weights) ends the ingest, because no episode could be processed.
+        cpus: CPUs of one worker, fractions allowed; a Ray cluster schedules by them.
+        gpus: GPUs of one worker, likewise.
     """
 
     name: str
@@ -67,7 +68,7 @@ class IngestPlan:
         source: the episodes.
         steps: in order, each after those that it needs; the last one cuts the clips.
         out: the store.
-        test_share: of the episodes; all clips of an episode are in one split.
+        test_share: share of the episodes; all clips of an episode are in one split.
         reading: a hash of how episodes are read, as far as their fingerprints do not cover it.
         meta: further entries of the store's manifest.
     """
@@ -81,12 +82,12 @@ class IngestPlan:
 
     @property
     def folder(self) -> Path:
-        """Outputs and marks. It stays beside the store, so that an ingest with other parameters reuses what it can."""
+        """The folder of outputs and marks. It is kept, so that an ingest with other parameters reuses what it can."""
         return self.out.with_name(f"{self.out.name}.work")
 
     @property
     def items(self) -> Path:
-        """The part of the folder in which work items leave their outputs and marks."""
+        """The part of the folder in which work items store their outputs and marks."""
         return self.folder / "units"
 
     def keys(self, ref: EpisodeRef) -> dict[str, str]:
@@ -106,12 +107,12 @@ class EpisodeWork:
         self.plan, self.ref, self.keys = plan, ref, plan.keys(ref)
 
     def output(self, step: str) -> Path:
-        """A work item's output. An episode's name never leads out of the folder."""
+        """Returns the path of a work item's output. An episode's name never leads out of the folder."""
         key = self.keys[step]
         return self.plan.items / step / key[:2] / f"{safe_id(self.ref.id)}-{key}.array_record"
 
     def mark(self, step: str) -> Mark | None:
-        """Reads a work item's mark; None where it was not run, or its output is missing or truncated."""
+        """Reads a work item's mark; None if it was not run, or its output is missing or truncated."""
         output = self.output(step)
         try:
             mark = parse_json(mark_path(output).read_bytes())
@@ -127,7 +128,7 @@ class EpisodeWork:
         return mark if sound and whole else None
 
     def done(self, step: str) -> Mark | None:
-        """Reads the mark of a work item that succeeded; None where it did not, or was not run."""
+        """Reads the mark of a work item that succeeded; None if it failed or was not run."""
         mark = self.mark(step)
         return mark if mark is not None and mark["status"] == "done" else None
 
@@ -137,7 +138,7 @@ class EpisodeWork:
         return Source(output.parent, step, [(output.name, count)] if count else [])
 
     def fail(self, step: str, error: BaseException, seconds: float = 0.0, cpu_seconds: float = 0.0) -> Mark:
-        """Leaves the mark of a failed work item, a row of the quarantine table."""
+        """Writes the mark of a failed work item, a row of the quarantine table."""
         message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         row = {
             "error": " ".join(message.split()),
@@ -157,7 +158,7 @@ class EpisodeWork:
 
 
 def mark_path(output: Path) -> Path:
-    """Returns where a work item's mark is, beside its output."""
+    """Returns the path of a work item's mark, beside its output."""
     return output.with_suffix(".json")
 
 
@@ -165,13 +166,13 @@ def run_episode(plan: IngestPlan, ref: EpisodeRef, prepared: set[str]) -> tuple[
     """Runs the steps of an episode that have no mark, up to the first that fails.
 
     Args:
-        prepared: the steps that this worker has prepared so far; more are added.
+        prepared: the names of the steps that this worker has prepared; newly prepared ones are added.
 
     Returns:
         How many work items were run, and how many clips they made.
 
     Raises:
-        UserError: no work item could be run here: a full disk, a missing package.
+        UserError: no work item could be run here, for example because the disk is full or a package is missing.
     """
     work, ran, clips = EpisodeWork(plan, ref), 0, 0
     for step in plan.steps:
@@ -190,7 +191,7 @@ class _WorkError(Exception):
 
 
 def run_item(work: EpisodeWork, step: Step, prepared: set[str]) -> Mark:
-    """Does a work item's work and leaves its output and mark; an error of the work becomes a failed mark.
+    """Runs a work item and writes its output and mark; an error of the work becomes a failed mark.
 
     Raises:
         UserError: the step cannot be prepared, or the output cannot be written; no other work item could be run either.
@@ -224,7 +225,7 @@ def _records(work: EpisodeWork, step: Step) -> Records:
         inputs[name] = work.records(name, mark["records"])
     episode = work.plan.source.read(work.ref)
     origin = {name: value for name, value in work.ref.location.items() if isinstance(value, str | int)}
-    # Names of files need not be text, which records have to be.
+    # File names need not be valid text, but records must be.
     named = {k: v if isinstance(v, int) else v.encode(errors="backslashreplace").decode() for k, v in origin.items()}
     return (yield from step.work(replace(episode, meta=episode.meta | {"origin": named}), inputs))
 
@@ -240,7 +241,7 @@ def _write(path: Path, records: Records) -> tuple[int, Summary]:
                 return count, stop.value
             except Exception as error:
                 if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
-                    raise  # the other work items would fail alike
+                    raise  # the other work items would fail in the same way
                 raise _WorkError from error
             writer.write(encode(record))
             count += 1
