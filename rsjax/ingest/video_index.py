@@ -137,7 +137,7 @@ def _is_avi(container: Any) -> bool:
 
 
 def _demuxed(container: Any) -> Iterator[Any]:
-    """Yields the packets of the pictures, labelled in AVI by their place in the file: FFmpeg only guesses their times."""
+    """Yields the packets of the pictures. In AVI their label is their place in the file: FFmpeg guesses their times."""
     avi = _is_avi(container)
     for packet in container.demux(container.streams.video[0]):
         if avi and packet.dts is not None:
