@@ -130,7 +130,7 @@ def content_hash(path: Path, pattern: str = "*") -> str:
 
 
 def placeholder(content: Path | bytes) -> str:
-    """Says what stands in place of a data file, such as a Git-LFS pointer, and the cure; "" if it is no known one.
+    """Says what stands in place of a data file, such as a Git-LFS pointer, and the cure; "" if nothing known does.
 
     Args:
         content: the file, or its content. For a file that cannot be read, "" is returned.

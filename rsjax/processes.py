@@ -1,8 +1,8 @@
 """Worker processes on this machine: the one way in which rsjax spreads work over cores.
 
 A worker does one item at a time. If a worker is killed, most often by the kernel for lack of memory, the others carry
-on, and one of them tries its item once more. Workers end with the process that started them, even if that one is ended
-by SIGKILL.
+on, and one of them tries its item once more. Workers end with the process that started them, even if SIGKILL ends that
+process.
 """
 
 import ctypes

@@ -1,4 +1,4 @@
-"""Settings of the process that must be made before JAX is imported, and the signals that stop the process."""
+"""Sets up the process before JAX is imported, and handles the signals that stop it."""
 
 import faulthandler
 import hashlib
@@ -21,7 +21,7 @@ from rsjax.errors import Preempted
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 STOP_SECONDS = 20.0  # for this long SIGTERM may go unanswered; Kubernetes and Slurm kill after 30
-REPEAT_SECONDS = 0.5  # two Ctrl-C within this time are one: wrappers such as make repeat the one from the terminal
+REPEAT_SECONDS = 0.5  # two Ctrl-C within this time count as one: wrappers such as make repeat the terminal's
 INTERRUPTED = "interrupted; the same command resumes"
 TERMINATED = "stopped by SIGTERM; the same command resumes"
 ANSWERS = {signal.SIGINT: (INTERRUPTED, 130), signal.SIGTERM: (TERMINATED, os.EX_TEMPFAIL)}

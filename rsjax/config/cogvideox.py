@@ -55,7 +55,7 @@ class CausalVAEConfig:
 
 
 def padded_frames(frames: int) -> int:
-    """Returns the smallest 8k + 1 that is at least ``frames``: a length of which the autoencoder loses no frame."""
+    """Returns the smallest 8k + 1 that is at least ``frames``: a length at which the autoencoder loses no frame."""
     return 1 - (1 - frames) // ENCODED * ENCODED
 
 

@@ -75,14 +75,14 @@ def fitting_sizes(size: int, unit: int, least: int = 1, most: int | None = None)
 
 
 def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
-    """Checks that every number of a dataclass is finite and every seed has 32 bits, also in nested dataclasses.
+    """Checks that every number of a dataclass is finite and every seed fits in 32 bits, also in nested dataclasses.
 
     Args:
         prefix: precedes the fields' names in the error.
         dash: whether to write the names as flags of a command line.
 
     Raises:
-        ConfigError: a number is not finite, or a seed does not have 32 bits.
+        ConfigError: a number is not finite, or a seed does not fit in 32 bits.
     """
     for f in dataclasses.fields(settings):
         name = prefix + (f.name.replace("_", "-") if dash else f.name)

@@ -37,9 +37,9 @@ class ModelConfig:
 
     @property
     def own_autoencoder(self) -> Any:
-        """Settings of the family's own autoencoder, a frozen dataclass, in place of ``Config.tokenizer``; None: none.
+        """Settings of the family's own autoencoder, in place of ``Config.tokenizer``; None if it has none.
 
-        :mod:`rsjax.tokenizers.autoencoder` says how a family defines one.
+        They are a frozen dataclass; :mod:`rsjax.tokenizers.autoencoder` says how a family defines one.
         """
         return None
 

@@ -19,7 +19,7 @@ class EvalConfig:
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
     repetitions: int = added(1)  # how often each clip is generated, with different random draws
-    loss_clips: int = 1000  # clips of the validation loss during training, spread alike
+    loss_clips: int = 1000  # clips of the validation loss during training, spread in the same way
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst

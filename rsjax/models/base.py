@@ -213,7 +213,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         raise UserError(f"{type(self).__name__} cannot generate frame by frame, so it cannot be an environment")
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> Branching:
-        """Returns a generator of clips that can branch at any frame.
+        """Returns an object that generates clips which can branch at any frame.
 
         Args:
             has_depth: whether first frames have depth.
@@ -257,7 +257,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         return saved
 
     def cache_shapes(self, frames: int) -> Any:
-        """Returns the shapes of keys and values that a rollout of a clip of ``frames`` keeps; {} if it has no cache."""
+        """Returns the shapes of keys and values that a rollout of ``frames`` frames keeps; {} if it has no cache."""
         return {}
 
     def flops(self, frames: int) -> dict[str, int]:

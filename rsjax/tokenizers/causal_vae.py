@@ -74,7 +74,7 @@ class CellNorm(nn.Module):
 
 
 def spread(cells: Video, like: Video) -> Video:
-    """Repeats cells to the frames, rows and columns of another video; of an odd number of frames, all but the first."""
+    """Repeats cells to the frames, rows and columns of another video; in time as :func:`_repeat` does."""
     frames, times, alone = like.shape[1], like.shape[2] // cells.shape[2], cells.shape[1] % 2
     if cells.shape[1] != frames:
         cells = _repeat(cells, (frames - alone) // (cells.shape[1] - alone))

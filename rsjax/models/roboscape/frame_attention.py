@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from rsjax.matmul import bf16_pays, transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
-SCORES = 2**24  # at most so many in all frames that run at the same time: 64 MiB
+SCORES = 2**24  # the most in all frames that run at the same time: 64 MiB
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
