@@ -1,4 +1,4 @@
-"""Trains the judge of a run, validates it on held-out clips, and saves both beside the run."""
+"""Trains the judge of a run, validates it on held-out clips, and saves both in the run directory."""
 
 import math
 from collections.abc import Sequence
