@@ -40,7 +40,7 @@ RECIPE = 1  # increase it when the same configuration gives new results
 
 
 class RunError(UserError):
-    """A run directory that belongs to another configuration, or that another process is working in."""
+    """A run directory belongs to another configuration, or another process is working in it."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def _section(config: Config, part: str) -> tuple[Any, str]:
 
 
 def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Yields the fields that decide results, by dotted name such as ``train.curriculum.0.epochs``."""
+    """Yields the fields that affect results, by dotted name such as ``train.curriculum.0.epochs``."""
     if isinstance(value, tuple) and any(map(is_dataclass, value)):
         for i, item in enumerate(value):
             yield from _deciding(item, f"{name}.{i}")
