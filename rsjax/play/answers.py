@@ -1,4 +1,4 @@
-"""What each message of a page does: one function for each type, which returns the final answer."""
+"""Answers a page's messages: one function for each type does what the message asks, and returns the final answer."""
 
 import asyncio
 import time
@@ -18,13 +18,13 @@ Message = dict[str, Any]
 Answer = Callable[[Viewer, Message], Awaitable[Message]]
 
 ANSWERS: dict[str, Answer] = {}
-MOST_NUMBER = 2**16 - 1  # of a branch
-MOST_FRAMES = 64  # of a message "frames"
+MOST_NUMBER = 2**16 - 1  # the greatest number of a branch
+MOST_FRAMES = 64  # in a message "frames"
 MOST_PANES = 6
 
 
 def answers(kind: str) -> Callable[[Answer], Answer]:
-    """Registers a function as the answer to a type of messages."""
+    """Registers a function as the answer to one type of message."""
 
     def register(function: Answer) -> Answer:
         ANSWERS[kind] = function
@@ -34,7 +34,7 @@ def answers(kind: str) -> Callable[[Answer], Answer]:
 
 
 async def answer(viewer: Viewer, message: Message) -> Message:
-    """Does what a message asks for and returns the final answer, with its id."""
+    """Does what a message asks for and returns the final answer, with the message's id."""
     own = message["id"] if type(message.get("id")) is int and 0 < message["id"] <= MOST_ID else 0
     try:
         whole(message, "id", 1, MOST_ID)
@@ -46,12 +46,12 @@ async def answer(viewer: Viewer, message: Message) -> Message:
 
 
 def refusal(number: int, error: Refused) -> Message:
-    """Returns the answer to what cannot be done."""
+    """Returns the answer to a message that cannot be done."""
     return {"type": "error", "id": number, "error": error.code, "message": error.message}
 
 
 async def upload(viewer: Viewer, payload: bytes) -> Message:
-    """Keeps an uploaded picture for a start."""
+    """Keeps an uploaded picture, from which a session can start."""
     try:
         size = viewer.session.run.data.config.clips.image_size
         viewer.session.upload = made = await asyncio.to_thread(read_picture, payload, size)
@@ -182,7 +182,7 @@ async def _load(viewer: Viewer, message: Message) -> Message:
 
 
 async def _grow(viewer: Viewer, saved: Saved, answered: int) -> None:
-    """Makes a saved session's branches again."""
+    """Generates a saved session's branches again."""
     session, done, total = viewer.session, 0, sum(len(branch.steps) for branch in saved.branches)
     for place, branch in enumerate(saved.branches):
         if branch.parent is not None:

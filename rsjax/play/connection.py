@@ -1,4 +1,4 @@
-"""One page's connection: reads its messages, does them one after another, and sends what comes of them."""
+"""One page's connection: reads its messages, answers them one after another, and sends the results."""
 
 import asyncio
 import json
@@ -17,19 +17,19 @@ from rsjax.play.messages import UPLOAD_BYTES, parse
 from rsjax.play.outbox import Outbox
 from rsjax.play.viewer import Viewer
 
-RATE, BURST = 120.0, 240.0  # messages a second, and at once
-STRIKES = 20  # messages too many, or without sense, after which a page is sent away
-QUEUE = 64  # messages that wait
+RATE, BURST = 120.0, 240.0  # messages per second, and at once
+STRIKES = 20  # excess or invalid messages after which a page is disconnected
+QUEUE = 64  # waiting messages, at most
 
 
 class Bucket:
-    """Counts messages: a bucket that fills at a rate, from which each takes one."""
+    """Limits the rate of messages: a bucket that fills at a constant rate, from which each message takes one unit."""
 
     def __init__(self) -> None:
         self._level, self._then = BURST, time.monotonic()
 
     def take(self) -> bool:
-        """Returns whether there is one to take."""
+        """Takes one unit, and returns whether there was one."""
         now = time.monotonic()
         self._level, self._then = min(BURST, self._level + RATE * (now - self._then)), now
         if self._level < 1:
@@ -49,7 +49,7 @@ class Connection:
         self._over: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
 
     async def serve(self, name: str | None) -> None:
-        """Serves the page until it goes, or is sent away. The socket is accepted."""
+        """Serves the page until it leaves or is disconnected. The socket must be accepted already."""
         try:
             seat, returned = self._hub.open(name, self.end)
         except Refused as error:
@@ -73,7 +73,7 @@ class Connection:
             await _closed(self._socket, code, reason)
 
     def end(self, code: int, reason: str) -> None:
-        """Ends the connection; code 0: the page is gone."""
+        """Ends the connection; code 0 means that the page has left."""
         if not self._over.done():
             self._over.set_result((code, reason))
 
@@ -100,7 +100,7 @@ class Connection:
         self.end(0, "")
 
     def _take(self, raw: Message) -> None:
-        """Puts a message where it waits for its turn."""
+        """Puts a message into the queue."""
         if raw.get("bytes") is not None:
             if len(raw["bytes"]) > UPLOAD_BYTES:
                 raise Refused("too_large", f"a picture can have {UPLOAD_BYTES // 2**20} MiB")
@@ -150,7 +150,7 @@ class Connection:
 
 
 def error_id(text: str | None) -> int:
-    """Returns the id of a message that is refused, as far as it has one."""
+    """Returns the id of a refused message, or 0 if it has none."""
     try:
         number = json.loads(text or "null")["id"]
     except (ValueError, TypeError, KeyError, RecursionError):

@@ -1,4 +1,4 @@
-"""What a person can move: the numbers of a control, their names and limits.
+"""The controls that a person can move: the numbers of a control, with names and limits.
 
 Axes: D numbers of a control, k controls of a frame's action, A = k·D numbers.
 """
@@ -22,10 +22,10 @@ class Control:
     """One number of a control.
 
     Attributes:
-        low, high: limits, in the recording's unit; what is beyond is clipped.
-        rest: the value at which nothing is asked for.
-        kind: an axis returns to rest, a toggle has two values that stay.
-        unit, scale: what 1 means for each control step, None if nobody knows.
+        low, high: limits, in the recording's unit; numbers out of range are clipped.
+        rest: the value that asks for no motion.
+        kind: an axis returns to rest; a toggle stays at one of two values.
+        unit, scale: the meaning of 1 in each control step; None if it is unknown.
     """
 
     name: str
@@ -40,25 +40,25 @@ class Control:
 
 @dataclass(frozen=True)
 class Controls:
-    """The D numbers of a control, and how many controls a frame's action repeats it for."""
+    """The D numbers of a control, and how many times a frame's action repeats the control."""
 
     each: tuple[Control, ...]
     repeat: int
 
     @property
     def width(self) -> int:
-        """A, numbers of an action."""
+        """A, the numbers of an action."""
         return len(self.each) * self.repeat
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of them."""
+        """Returns the description of the controls for a page."""
         return {"controls": [asdict(each) for each in self.each], "repeat": self.repeat, "action_dim": self.width}
 
     def action(self, numbers: Any) -> tuple[Float32[np.ndarray, " A"], int]:
-        """Returns the action of D or A numbers, within limits, and how many numbers were clipped.
+        """Returns the action that D or A numbers stand for, within limits, and how many numbers were clipped.
 
         Raises:
-            Refused: they are of another count, or not finite numbers.
+            Refused: their count is neither D nor A, or they are not finite numbers.
         """
         if not isinstance(numbers, list | np.ndarray) or len(numbers) not in (len(self.each), self.width):
             counts = " or ".join(map(str, dict.fromkeys((len(self.each), self.width))))
@@ -81,7 +81,7 @@ class Controls:
         return np.tile(ends[:, 0], self.repeat), np.tile(ends[:, 1], self.repeat)
 
     def random(self, rng: np.random.Generator) -> Float[np.ndarray, " A"]:
-        """Returns one control, uniform within the limits, for a whole frame."""
+        """Returns the action of one random control: axes are uniform within the limits, toggles take either value."""
         numbers = [
             float(rng.choice([each.low, each.high])) if each.kind == "toggle" else rng.uniform(each.low, each.high)
             for each in self.each
@@ -93,7 +93,7 @@ def controls_of_run(config: Config, normalization: Normalization, names: Sequenc
     """Returns the controls of a run: those of its simulator, or the dimensions of a recording's actions.
 
     Args:
-        names: of the dimensions of a recording, as "gripper (held)"; "(held)" where nobody named it.
+        names: names of a recording's dimensions, such as "gripper (held)"; "(held)" for a dimension without a name.
     """
     if not config.data.key:
         return Controls(_LIFT if config.sim.env == "lift" else _METAWORLD, config.sim.control_steps)

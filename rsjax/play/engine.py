@@ -1,4 +1,4 @@
-"""One thread that generates the frames of all sessions, several in one pass where their settings agree."""
+"""One thread that generates the frames of all sessions, several in one pass if their settings agree."""
 
 import threading
 import time
@@ -23,9 +23,9 @@ class Work:
     """One frame to generate.
 
     Attributes:
-        moment: the frame before; its memory is used up.
-        has_depth: whether its clip has depth.
-        say: told when a program is compiled for it, in the engine's thread.
+        moment: the frame before; generating the next frame uses up its memory.
+        has_depth: whether the clip has depth.
+        say: called, in the engine's thread, when a program is compiled for this frame.
     """
 
     moment: Moment
@@ -37,19 +37,19 @@ class Work:
 
     @property
     def key(self) -> tuple[bool, tuple[int, int, bool]]:
-        """What frames of one pass have in common."""
+        """The settings that frames generated in one pass have in common."""
         return self.has_depth, self.decoding.program
 
 
 class Engine:
-    """Generates frames, in the order in which they are asked for.
+    """Generates frames, in the order of the requests.
 
     Args:
-        model: of a family that implements ``branching``.
-        lanes: frames of one pass, at most. Other numbers give other last bits.
+        model: a model whose family implements ``branching``.
+        lanes: frames in one pass, at most. Results for different values differ in their last bits.
 
     Attributes:
-        frames: generated so far.
+        frames: number of frames generated so far.
 
     Raises:
         UserError: the family cannot generate frame by frame.
@@ -67,7 +67,7 @@ class Engine:
         self._thread.start()
 
     def branching(self, has_depth: bool) -> Branching:
-        """Returns what generates clips with depth, or without."""
+        """Returns the generator of clips with or without depth."""
         with self._wake:
             if has_depth not in self._branching:
                 inputs = (self._model.params, self._model.assets, has_depth, self.lanes)
@@ -79,7 +79,7 @@ class Engine:
         return self.branching(first.depth is not None).begin(first)
 
     def submit(self, work: Work) -> "Future[Moment]":
-        """Asks for a frame."""
+        """Requests a frame."""
         with self._wake:
             if self._closed:
                 raise RuntimeError("the engine is closed")
@@ -88,7 +88,7 @@ class Engine:
         return work.done
 
     def close(self) -> None:
-        """Ends the thread; frames that wait are cancelled."""
+        """Ends the thread and cancels waiting frames."""
         with self._wake:
             self._closed = True
             waiting = list(self._waiting)
@@ -105,7 +105,7 @@ class Engine:
                 continue
             try:
                 moments = self._advance(works)
-            except Exception as error:  # a bug, or out of memory: the sessions of this pass hear of it, others go on
+            except Exception as error:  # a bug, or out of memory: only the sessions of this pass fail
                 for work in works:
                     work.done.set_exception(error)
                 continue
@@ -114,7 +114,7 @@ class Engine:
                 work.done.set_result(moment)
 
     def _next(self) -> list[Work]:
-        """Waits for work and returns that of the next pass; nothing once the engine is closed."""
+        """Waits for work and returns the work of the next pass; an empty list once the engine is closed."""
         with self._wake:
             self._wake.wait_for(lambda: self._waiting or self._closed)
             if self._closed:
@@ -139,7 +139,7 @@ class Engine:
 
 
 def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> float:
-    """Compiles the program of these settings and returns the seconds that a frame takes then."""
+    """Compiles the program for these settings and returns the seconds that a frame takes afterwards."""
     moment, seconds = engine.begin(first), 0.0
     for _ in range(2):
         began = time.monotonic()
@@ -150,7 +150,7 @@ def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> flo
 
 def _tell(works: list[Work], text: str, busy: bool) -> None:
     for work in works:
-        with suppress(RuntimeError):  # its server has stopped
+        with suppress(RuntimeError):  # the server has stopped
             work.say(text, busy)
 
 

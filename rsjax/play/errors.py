@@ -1,8 +1,8 @@
-"""What a page asked for and cannot have."""
+"""The error for a page's message that cannot be done."""
 
 
 class Refused(Exception):
-    """A message of a page cannot be done; the session goes on.
+    """A message of a page cannot be done; the session continues.
 
     Attributes:
         code: a short word for the page, one of those in docs/play_protocol.md.

@@ -1,4 +1,4 @@
-"""Binary messages: a small header, then a picture."""
+"""Makes binary messages: a small header, then a picture."""
 
 import io
 import struct
@@ -12,11 +12,11 @@ HEADER = struct.Struct("<BBHIIBBHHHf")  # version, kind, branch, frame, id, form
 VERSION = 1
 RAW, WEBP = 0, 2
 KINDS = {"rgb": 1, "depth": 2, "truth": 3, "truth_depth": 4, "uncertainty": 5}
-LOSSLESS = 128  # pixels a side up to which pictures are sent without loss
+LOSSLESS = 128  # pixels per side, up to which pictures are sent without loss
 
 
 class Place(NamedTuple):
-    """Which frame a picture is of, and the message that it answers (0: none)."""
+    """The frame that a picture shows, and the id of the message that it answers (0: none)."""
 
     branch: int
     frame: int
@@ -24,19 +24,19 @@ class Place(NamedTuple):
 
 
 def picture(kind: str, place: Place, rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """Returns the message of an RGB picture as WebP, lossless if it is small."""
+    """Returns the message with an RGB picture as WebP, lossless if it is small."""
     return _message(kind, place, WEBP, rgb.shape, webp(rgb), 0.0)
 
 
 def depth_picture(kind: str, place: Place, depth: Float32[np.ndarray, "H W"], near: float, far: float) -> bytes:
-    """Returns the message of a depth map as a grey picture: 0 is ``near``, 255 is ``far``, linear in metres."""
+    """Returns the message with a depth map as a grey picture: 0 is ``near``, 255 is ``far``, linear in metres."""
     share = np.clip((np.nan_to_num(depth, nan=far) - near) / (far - near), 0, 1)
     grey = np.round(255 * share).astype(np.uint8)
     return _message(kind, place, WEBP, grey.shape, webp(np.repeat(grey[..., None], 3, -1)), far)
 
 
 def uncertainty(place: Place, entropy: Float[np.ndarray, " S"], bits: int) -> bytes:
-    """Returns the message of tokens' entropies (nats), as bytes: 255 means ``bits``, the most that a token can have."""
+    """Returns the message with tokens' entropies (nats) as bytes: 255 means ``bits``, the maximum for a token."""
     side = int(np.sqrt(len(entropy)))
     share = np.clip(entropy / np.log(2) / bits, 0, 1)
     return _message("uncertainty", place, RAW, (side, side), np.round(255 * share).astype(np.uint8).tobytes(), bits)

@@ -1,4 +1,4 @@
-"""Who may come in: the addresses that a browser may use, and the token."""
+"""Decides which requests are allowed: by the addresses that a browser may use, and by the token."""
 
 import ipaddress
 import secrets
@@ -21,7 +21,7 @@ HEADERS = {
 
 
 def is_loopback(host: str) -> bool:
-    """Returns whether a host's name or address is this machine alone."""
+    """Returns whether a host's name or address can only mean this machine."""
     if host.lower() == "localhost":
         return True
     try:
@@ -32,19 +32,19 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True)
 class Guard:
-    """Says who may come in.
+    """Decides which requests are allowed.
 
     Attributes:
-        token: what a page must know; "" for a server that only this machine reaches.
+        token: the secret that a page must know; "" for a server that only this machine can reach.
     """
 
     token: str
 
     def wrong_host(self, headers: Headers) -> str:
-        """Returns why a request's Host is refused, "" if it is not.
+        """Returns why a request's Host is refused, or "".
 
-        Without a token, it must be a name of this machine: a page of another site, whose name was made to point here,
-        sends its own.
+        Without a token, the Host must be a name of this machine. This stops DNS rebinding: a page of another site whose
+        name was made to point to this machine sends that name as the Host.
         """
         host = headers.get("host", "")
         if not self.token and not is_loopback(_name(host)):
@@ -52,20 +52,20 @@ class Guard:
         return ""
 
     def wrong_origin(self, headers: Headers) -> str:
-        """Returns why a socket's Origin is refused, "" if it is not; programs that are no browsers send none."""
+        """Returns why a socket's Origin is refused, or ""; programs that are not browsers send none."""
         origin, host = headers.get("origin"), headers.get("host", "").lower()
         if origin is None or origin.lower() in (f"http://{host}", f"https://{host}"):
             return ""
         return f"pages of {origin!r:.80} cannot connect"
 
     def knows(self, query: QueryParams) -> bool:
-        """Returns whether a request has the token."""
+        """Returns whether a request contains the token."""
         given = query.get("token", "")
         return not self.token or secrets.compare_digest(given.encode(), self.token.encode())
 
 
 class Guarded:
-    """Refuses requests to other hosts, and adds headers to every answer."""
+    """Refuses requests for other hosts, and adds headers to every response."""
 
     def __init__(self, app: App, guard: Guard) -> None:
         self._app, self._guard = app, guard

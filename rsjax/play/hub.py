@@ -1,4 +1,4 @@
-"""The sessions of a server: at most so many, freed when nobody uses them."""
+"""Manages the sessions of a server: limits their number, and frees those that nobody uses."""
 
 import time
 from collections.abc import Callable
@@ -18,17 +18,17 @@ from rsjax.play.truth import Truths
 from rsjax.play.viewer import Viewer
 
 VERSION = 1  # of the protocol
-IN_FLIGHT = 4  # steps of a session that are not answered
+IN_FLIGHT = 4  # unanswered steps of a session, at most
 GRACE = 20.0
 
 
 @dataclass(eq=False)
 class Seat:
-    """A session's place.
+    """One of the places for sessions, and the session in it.
 
     Attributes:
         close: ends the connection with a code and a reason; None while no page is connected.
-        left: when the page went, in seconds of :func:`time.monotonic`.
+        left: when the page left, in seconds of :func:`time.monotonic`.
     """
 
     viewer: Viewer
@@ -40,11 +40,11 @@ class Hub:
     """All sessions of one run.
 
     Args:
-        run: what is played.
-        engine: generates the frames of all.
+        run: the run to play.
+        engine: generates the frames of all sessions.
         most: sessions at a time.
         idle: seconds without a message or a new frame after which a session is freed.
-        grace: seconds for which one whose page is gone keeps its place when all are taken.
+        grace: seconds for which a session whose page has left keeps its place when all places are taken.
         truths: the simulators; by default those of the run's clips.
     """
 
@@ -60,10 +60,10 @@ class Hub:
         return len(self._seats)
 
     def open(self, name: str | None, close: Callable[[int, str], None]) -> tuple[Seat, bool]:
-        """Returns a seat and whether it is one that its viewer returns to.
+        """Returns a seat, and whether it is one that the viewer had before.
 
         Args:
-            name: of the session to return to; a new one is made if it is not there any more.
+            name: name of the session to return to; if it no longer exists, a new one is made.
             close: ends the connection.
 
         Raises:
@@ -82,14 +82,14 @@ class Hub:
         return seat, False
 
     def leave(self, seat: Seat, close: Callable[[int, str], None]) -> None:
-        """Says that a page is gone; its session stays for a while."""
+        """Notes that a page has left; its session stays for a while."""
         if seat.close == close:  # otherwise another page has taken the session over
             seat.close, seat.left = None, time.monotonic()
             seat.viewer.session.out = None
             seat.viewer.rest()
 
     def sweep(self) -> None:
-        """Frees the sessions that nobody used for long."""
+        """Frees the sessions that nobody has used for ``idle`` seconds."""
         now = time.monotonic()
         for seat in list(self._seats.values()):
             if now - seat.viewer.session.used > self.idle:
@@ -98,7 +98,7 @@ class Hub:
                 self._free(seat)
 
     def close(self) -> None:
-        """Frees all."""
+        """Frees all sessions."""
         for seat in list(self._seats.values()):
             self._free(seat)
         self._side.pool.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Keeps what was played: videos of branches, and branches as clips of a store.
+"""Saves what was played: branches as videos, or as clips of a store.
 
 Axes: T frames, S×S pixels.
 """
@@ -24,18 +24,18 @@ from rsjax.policies.demos import controls_of
 from rsjax.report.depth_view import depth_to_colors
 from rsjax.report.video import write_gif, write_mp4
 
-MOST_BYTES = 2**29  # of a video's pictures before they are encoded
+MOST_BYTES = 2**29  # of a video's pictures before encoding
 MOST_GIF = 600  # frames
-MOST_FILES = 256  # that can still be fetched
+MOST_FILES = 256  # files that can be fetched
 GAP = 2  # pixels between panes
 TYPES = {".mp4": "video/mp4", ".gif": "image/gif", ".zip": "application/zip"}
 
 
 class Files:
-    """Files that sessions made, which a page fetches by a number that nobody can guess.
+    """The files that sessions made, which a page fetches by a number that nobody can guess.
 
     Args:
-        folder: where they lie.
+        folder: the folder of the files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,13 +46,13 @@ class Files:
         return self._paths.get(number)
 
     def place(self, session: Session, what: str) -> Path:
-        """Returns a path for a new file; its name comes from the server alone."""
+        """Returns a path for a new file; only the server chooses its name."""
         start = session.start
         begun = "picture" if start is None or start.number is None else f"clip{start.number}"
         return self.folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{begun}-{secrets.token_hex(3)}{what}"
 
     def add(self, path: Path) -> dict[str, Any]:
-        """Adds a file and returns what a page needs to know of it."""
+        """Adds a file and returns its description for a page."""
         number = secrets.token_urlsafe(16)
         self._paths[number] = path
         while len(self._paths) > MOST_FILES:
@@ -68,7 +68,7 @@ def record(session: Session, path: Path, number: int, panes: list[str], fps: flo
         panes: "rgb", "depth", "truth", or "branch:N", another branch's frames.
 
     Raises:
-        Refused: there is no such pane, it is too large, or the disk refuses.
+        Refused: there is no such pane, the video is too large, or it cannot be written to the disk.
     """
     nodes, side = session.grown.branch(number).nodes, session.run.data.config.clips.image_size
     most = MOST_GIF if path.suffix == ".gif" else MOST_BYTES
@@ -82,7 +82,7 @@ def record(session: Session, path: Path, number: int, panes: list[str], fps: flo
 
 
 def pane_frames(session: Session, nodes: list[Node], pane: str) -> UInt8[np.ndarray, "T S S 3"]:
-    """Returns a pane's pictures beside these frames; the last one stays where it has fewer, grey where it has none."""
+    """Returns a pane's pictures for these frames; a shorter branch holds its last frame, a missing truth is grey."""
     own = [node.moment.rgb for node in nodes]
     if pane == "rgb":
         return np.stack(own)
@@ -101,12 +101,12 @@ def pane_frames(session: Session, nodes: list[Node], pane: str) -> UInt8[np.ndar
 
 
 def export(session: Session, path: Path, numbers: list[int]) -> Path:
-    """Writes branches as clips of a store, and returns the path of the store as a zip file beside it.
+    """Writes branches as clips of a store, and returns the path of a zip file of the store, which is beside it.
 
-    A clip has as many frames as those of the run; what is left at a branch's end is left out.
+    A clip has as many frames as the run's clips; remaining frames at a branch's end are left out.
 
     Raises:
-        Refused: no branch is long enough, or the disk refuses.
+        Refused: no branch is long enough, or the store cannot be written to the disk.
     """
     branches, length = [session.grown.branch(number) for number in numbers], session.run.data.config.clips.frames
     if not any(True for branch in branches for _ in _windows(branch, length)):
@@ -119,7 +119,7 @@ def export(session: Session, path: Path, numbers: list[int]) -> Path:
 
 
 def _windows(branch: Branch, length: int) -> Iterator[int]:
-    """Yields the first frames of a branch's clips; a clip that is all its parent's is the parent's."""
+    """Yields the first frame of each clip of a branch, except clips that are entirely shared with the parent."""
     for first in range(0, len(branch.nodes) - length + 1, length):
         if branch.fork is None or first + length - 1 > branch.fork:
             yield first
@@ -164,7 +164,7 @@ def _depth(session: Session, node: Node) -> np.ndarray:
 
 @contextmanager
 def _writing() -> Iterator[None]:
-    """Refuses by name what a disk refuses."""
+    """Turns errors of the disk into :class:`Refused`."""
     try:
         yield
     except UserError as error:

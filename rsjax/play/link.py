@@ -1,4 +1,4 @@
-"""A session as text, from which it is made again bit for bit: first frame, seed, settings, actions of branches."""
+"""Writes a session as text, from which it can be restored bit for bit: start, seed, settings, actions of branches."""
 
 import base64
 import binascii
@@ -22,7 +22,7 @@ from rsjax.play.settings import MOST_SEED, Settings
 from rsjax.play.tree import Branch
 
 VERSION = 1
-MOST_TEXT = TEXT_BYTES - 1024  # characters, as a link comes back in one message
+MOST_TEXT = TEXT_BYTES - 1024  # characters, because a link must fit into one message
 MOST_JSON = 32 * 2**20  # bytes, unpacked
 
 
@@ -31,7 +31,7 @@ class SavedBranch:
     """A branch of a saved session.
 
     Attributes:
-        parent: its place among the saved branches; None for the first.
+        parent: the parent's index among the saved branches; None for the first branch.
         steps: actions and decodings of the frames after the fork.
     """
 
@@ -43,7 +43,7 @@ class SavedBranch:
 
 @dataclass(frozen=True)
 class Saved:
-    """A saved session; ``lanes`` are those of the server that it was saved at."""
+    """A saved session; ``lanes`` is the setting of the server that saved it."""
 
     start: Start
     seed: int
@@ -56,7 +56,7 @@ def state_of(session: Session) -> str:
     """Returns a session as text for a link.
 
     Raises:
-        Refused: it has no start, or is too long.
+        Refused: the session has no start, or is too long.
     """
     tree, start = session.grown, session.start
     assert start is not None
@@ -81,10 +81,10 @@ def state_of(session: Session) -> str:
 
 
 def read_state(session: Session, text: object) -> Saved:
-    """Reads what :func:`state_of` returned, of any session of the same run.
+    """Reads the text that :func:`state_of` returned for any session of the same run.
 
     Raises:
-        Refused: it is damaged, of another run or another version, or beyond what a session can have.
+        Refused: the text is damaged, of another run or another version, or exceeds the limits of a session.
     """
     values = _unpacked(text)
     try:
@@ -146,7 +146,7 @@ def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:
 
 
 def _read_actions(session: Session, row: dict[str, Any]) -> Float32[np.ndarray, "T A"]:
-    """Returns a branch's actions as they were sent, without a check of their numbers."""
+    """Returns a branch's actions as they were sent, without checking their numbers."""
     plain = base64.b64decode(row["actions"], validate=True)
     return np.frombuffer(plain, "<f4").reshape(-1, session.run.controls.width)
 

@@ -1,4 +1,4 @@
-"""Bounds what the frames of all sessions keep to go on from."""
+"""Bounds the memory that the frames of all sessions keep so that generation can continue from them."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -10,11 +10,11 @@ BYTES = 2**30
 
 
 class Memories:
-    """The frames with a large memory, of which those that were made longest ago lose it.
+    """The frames with a large memory; when there is too much, the oldest frames lose theirs.
 
     Args:
-        least: frames that keep theirs whatever its size: as many as there are sessions.
-        most: bytes.
+        least: frames that keep their memory whatever its size: as many as there are sessions.
+        most: bytes of memory that all frames together may keep.
     """
 
     def __init__(self, least: int, most: int = BYTES) -> None:
@@ -22,7 +22,7 @@ class Memories:
         self._nodes: OrderedDict[int, tuple[Node, int, Callable[[Moment], Moment]]] = OrderedDict()
 
     def note(self, node: Node, lighten: Callable[[Moment], Moment]) -> None:
-        """Says that a frame has a large memory, and how it loses it."""
+        """Notes that a frame has a large memory, and how to remove it."""
         self._nodes[id(node)] = node, node.moment.size, lighten
         self._bytes += node.moment.size
         while self._bytes > self._most and len(self._nodes) > self._least:
@@ -31,7 +31,7 @@ class Memories:
             oldest.moment = lighter(oldest.moment)
 
     def forget(self, node: Node) -> None:
-        """Says that a frame has none any more."""
+        """Notes that a frame no longer has a large memory."""
         found = self._nodes.pop(id(node), None)
         if found is not None:
             self._bytes -= found[1]

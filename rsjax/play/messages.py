@@ -1,4 +1,4 @@
-"""Reads the fields of a page's messages; whatever is wrong is refused with one line."""
+"""Reads the fields of a page's messages; refuses wrong ones with a message of one line."""
 
 import json
 import math
@@ -13,10 +13,10 @@ MOST_ID = 2**32 - 1
 
 
 def parse(text: str) -> dict[str, Any]:
-    """Returns a message.
+    """Parses a message.
 
     Raises:
-        Refused: it is too large, or no JSON object with a type and an id.
+        Refused: the text is too large, or is not a JSON object with a type and an id.
     """
     if len(text) > TEXT_BYTES:
         raise Refused("too_large", f"a message can have {TEXT_BYTES} characters")
@@ -47,7 +47,7 @@ def number(message: dict[str, Any], name: str, low: float, high: float, default:
 
 
 def choice(message: dict[str, Any], name: str, choices: Sequence[str], default: str | None = None) -> str:
-    """Returns a field that is one of some words."""
+    """Returns a field that is one of ``choices``."""
     value = message.get(name, default)
     if value not in choices or not isinstance(value, str):
         raise Refused("bad_message", f"{name} is {_short(value)}; it is one of {', '.join(choices)}")
@@ -55,7 +55,7 @@ def choice(message: dict[str, Any], name: str, choices: Sequence[str], default: 
 
 
 def words(message: dict[str, Any], name: str, most: int) -> list[str]:
-    """Returns a field that is a list of at most so many words."""
+    """Returns a field that is a list of at most ``most`` words."""
     value = message.get(name)
     if not isinstance(value, list) or len(value) > most or not all(isinstance(word, str) for word in value):
         raise Refused("bad_message", f"{name} is {_short(value)}; it is a list of words")
@@ -63,7 +63,7 @@ def words(message: dict[str, Any], name: str, most: int) -> list[str]:
 
 
 def kinds(message: dict[str, Any], known: Sequence[str]) -> list[str]:
-    """Returns the field "kinds", each of which is known."""
+    """Returns the field "kinds", a list of words from ``known``."""
     chosen = words(message, "kinds", 16)
     for kind in chosen:
         if kind not in known:

@@ -1,15 +1,15 @@
-"""What is to be sent to one page; a slow one loses pictures that it can ask for again, in the end its connection."""
+"""Queues messages for one page. A slow page loses pictures, which it can request again, and finally its connection."""
 
 import asyncio
 from collections import deque
 from typing import Any
 
-UNSENT = 32  # messages from which on what can be asked for again is dropped
-MOST = 256  # messages with which a page is too slow to be served
+UNSENT = 32  # unsent messages from which on droppable messages are dropped
+MOST = 256  # unsent messages at which a page counts as too slow to be served
 
 
 class Outbox:
-    """Messages in their order, from any coroutine to the one that sends them."""
+    """A queue of messages, from any coroutine to the one that sends them."""
 
     def __init__(self) -> None:
         self._items: deque[bytes | dict[str, Any]] = deque()
@@ -17,7 +17,7 @@ class Outbox:
         self.overflowed = False
 
     def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None:
-        """Adds a message, or drops it."""
+        """Adds a message, or drops it if it is droppable and too many are unsent."""
         if droppable and len(self._items) >= UNSENT:
             return
         self.overflowed |= len(self._items) >= MOST

@@ -1,4 +1,4 @@
-"""A first frame from an uploaded picture."""
+"""Makes a first frame from an uploaded picture."""
 
 import io
 import warnings
@@ -21,9 +21,9 @@ class Upload:
     """A picture as a first frame.
 
     Attributes:
-        rgb: as the model takes it.
-        size: of the picture, width and height.
-        square: side of its middle square, which was scaled.
+        rgb: the frame, in the model's size.
+        size: width and height of the picture.
+        square: side of the square that was cut from the middle of the picture and scaled.
     """
 
     rgb: UInt8[np.ndarray, "S S 3"]
@@ -31,12 +31,12 @@ class Upload:
     square: int
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of it."""
+        """Returns the description of the picture for a page."""
         return {"from": list(self.size), "cropped": [self.square, self.square], "to": len(self.rgb)}
 
     @property
     def message(self) -> str:
-        """What was done to the picture, in words."""
+        """Says in words what was done to the picture."""
         width, height = self.size
         cut = "" if width == height else f"cut to its middle {self.square} × {self.square}, "
         side = len(self.rgb)
@@ -47,7 +47,7 @@ def read_picture(payload: bytes, side: int) -> Upload:
     """Decodes a PNG, JPEG or WebP picture, and cuts and scales it to a square.
 
     Raises:
-        Refused: it is none, is damaged, too large or too small.
+        Refused: the payload is no such picture, or the picture is damaged, too large or too small.
     """
     try:
         with warnings.catch_warnings():
@@ -57,7 +57,7 @@ def read_picture(payload: bytes, side: int) -> Upload:
                 upright = ImageOps.exif_transpose(image).convert("RGB")
     except Refused:
         raise
-    except Exception as error:  # decoders raise anything for damaged files
+    except Exception as error:  # decoders raise all kinds of exceptions for damaged files
         raise Refused("bad_image", "this is no PNG, JPEG or WebP picture that can be read") from error
     square = min(upright.size)
     middle = ImageOps.fit(upright, (square, square))

@@ -1,4 +1,4 @@
-"""Keypoints of what was played: those of the first frame, followed from frame to frame by Lucas–Kanade.
+"""Finds keypoints of played frames: follows those of the first frame from frame to frame by Lucas–Kanade.
 
 Axes: K keypoints.
 """
@@ -11,17 +11,17 @@ from rsjax.models.roboscape.keypoints import motion_magnitude
 from rsjax.play.session import Session, Start
 from rsjax.play.tree import Node
 
-GRID = 6  # points a side, of a first frame without tracks
-MOST = 32  # of a family that does not say how many keypoints it learns from
+GRID = 6  # points per side, for a first frame without tracks
+MOST = 32  # for a family that does not say how many keypoints it learns from
 
 Points = Float32[np.ndarray, "K 3"]  # x and y from 0 to 1, and whether the point is seen
 
 
 def points_of(session: Session, nodes: list[Node], pane: str) -> Points:
-    """Returns the keypoints of the last of these frames, from a branch's first on; what is known is kept with each.
+    """Returns the keypoints of the last of these frames, which begin with a branch's first; each frame keeps its own.
 
     Args:
-        pane: "rgb", the model's frames, or "truth", the simulator's, which all of these have.
+        pane: "rgb", the model's frames, or "truth", the simulator's, which all these frames must have.
     """
     known = len(nodes) - 1
     while known and pane not in nodes[known].points:
@@ -37,7 +37,7 @@ def points_of(session: Session, nodes: list[Node], pane: str) -> Points:
 
 
 def first_points(start: Start, count: int) -> Points:
-    """Returns those tracks of a clip that move most, where they begin; points of a grid if there are none."""
+    """Returns the first positions of the ``count`` tracks that move most; without tracks, points of a grid."""
     clip = start.clip
     if clip is None or not clip["visible"][:, 0].any():
         places = grid_points(GRID, np.zeros((0, 2), np.float32))
@@ -48,7 +48,7 @@ def first_points(start: Start, count: int) -> Points:
 
 
 def _followed(before: UInt8[np.ndarray, "S S 3"], after: UInt8[np.ndarray, "S S 3"], points: Points) -> Points:
-    """Follows points from one picture to the next; one that is lost stays lost."""
+    """Follows points from one picture to the next; a lost point stays lost."""
     tracks, visible = LucasKanade().follow(np.stack([before, after]), points[:, :2].copy())
     seen = visible[:, 1] & (points[:, 2] > 0)
     places = np.where(seen[:, None], tracks[:, 1], points[:, :2])

@@ -1,4 +1,4 @@
-"""A run that is played: its model, clips, controls and simulator."""
+"""The run that sessions play: its model, clips, controls and simulator."""
 
 import hashlib
 import math
@@ -23,19 +23,19 @@ from rsjax.play.errors import Refused
 from rsjax.policies.policy import Policy
 from rsjax.policies.run_data import RunData
 
-SIMULATED = ("robosuite/Lift", "metaworld/")  # sources of clips whose simulator we have
-FPS = 5.0  # of runs whose clips do not say
+SIMULATED = ("robosuite/Lift", "metaworld/")  # sources of clips whose simulator is available here
+FPS = 5.0  # for runs whose clips have no frame rate
 
 
 @dataclass(frozen=True)
 class PlayRun:
-    """What all sessions share.
+    """The data that all sessions share.
 
     Attributes:
         data: the run and where its clips are.
         split: the clips to begin with.
-        policy: one that can act, or None.
-        out: the directory of what viewers keep.
+        policy: a policy that can act, or None.
+        out: the directory of the files that viewers save.
     """
 
     data: RunData
@@ -49,7 +49,7 @@ class PlayRun:
 
     @cached_property
     def store(self) -> Store | None:
-        """The run's clips; None where they are missing, as only uploaded pictures can be begun with then."""
+        """The run's clips; None if they are missing, so that sessions can begin only with uploaded pictures."""
         try:
             store = self.data.clips
             return store if self.split in store.splits else None
@@ -58,7 +58,7 @@ class PlayRun:
 
     @cached_property
     def missing(self) -> str:
-        """Why there are no clips; "" if there are."""
+        """Why there are no clips; "" if there are some."""
         try:
             store = self.data.clips
         except UserError as error:
@@ -75,7 +75,7 @@ class PlayRun:
         return 0 if self.source is None else len(self.source)
 
     def clip(self, number: int) -> Record:
-        """Returns a clip; :class:`Refused` if there is none of this number, or it is damaged."""
+        """Returns a clip; raises :class:`Refused` if there is no clip with this number, or it is damaged."""
         if self.source is None or not 0 <= number < self.clips:
             has = f"has 0 to {self.clips - 1}" if self.clips else f"is missing: {self.missing}"
             raise Refused("no_clip", f"there is no clip {number}; the {self.split} split {has}")
@@ -102,9 +102,9 @@ class PlayRun:
 
     @property
     def fps(self) -> float:
-        """Frames per second of the clips, as the first one says."""
+        """Frames per second of the clips, from the first clip."""
         if self.store is not None:
-            with suppress(Refused):  # it is damaged
+            with suppress(Refused):  # the clip is damaged
                 return frame_rate(self.clip(0), self.store.manifest) or FPS
         return FPS
 
@@ -118,7 +118,7 @@ class PlayRun:
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that follow from the weights: a link is good for runs with the same."""
+        """A hash of the weights, 16 hexadecimal digits: a link works for runs with the same fingerprint."""
         digest = hashlib.sha256(repr(self.trained.config.model).encode())
         for leaf in jax.tree.leaves((self.trained.params, self.trained.assets.tokenizer)):
             digest.update(np.ascontiguousarray(leaf).tobytes())
@@ -130,7 +130,7 @@ class PlayRun:
         return int(self.trained.config.tokenizer.code_bits)
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of the run."""
+        """Returns the description of the run for a page."""
         config, model = self.data.config, self.trained
         near_far = model.assets.normalization.depth_range if self.has_depth else None
         return {

@@ -1,4 +1,4 @@
-"""Starts the server of a run and says where it is."""
+"""Starts the server of a run and prints its address."""
 
 import os
 import secrets
@@ -36,11 +36,11 @@ class ServeSettings:
 
     Attributes:
         host: the address to listen at.
-        port: 0: a free one.
+        port: the port; 0: a free one.
         sessions: viewers at a time.
-        idle_minutes: without a message or a new frame, after which a session is freed.
+        idle_minutes: minutes without a message or a new frame after which a session is freed.
         lanes: frames that one pass generates.
-        browser: whether the address is opened in a browser.
+        browser: whether to open the address in a browser.
     """
 
     host: str = "127.0.0.1"
@@ -93,7 +93,7 @@ def listen(host: str, port: int) -> socket.socket:
     """Returns a socket that listens.
 
     Raises:
-        UserError: the address is taken, or none of this machine.
+        UserError: the address is taken, or is not an address of this machine.
     """
     try:
         family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -105,7 +105,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def _prepare(run: PlayRun, engine: Engine) -> None:
-    """Compiles what the first frame needs, so that nobody waits for it later."""
+    """Compiles the programs for the first frame, so that nobody waits for them later."""
     note("compiling (seconds, or minutes for a large model the first time) …")
     first, size = Video(_grey(run)), run.controls.width
     with suppress(Refused):
@@ -128,5 +128,5 @@ def _address(listener: socket.socket, host: str, guard: Guard) -> str:
 
 
 def _has_display() -> bool:
-    """Returns whether a browser can show itself, and not in this terminal."""
+    """Returns whether a browser can open outside this terminal."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

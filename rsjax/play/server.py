@@ -21,7 +21,7 @@ from rsjax.play.hub import Hub
 from rsjax.play.keep import TYPES as FILE_TYPES
 
 PAGE = Path(__file__).parent / "page"
-PLAYER = Path(__file__).parents[1] / "report" / "player"  # modules that the page shares with the report, at page/player
+PLAYER = Path(__file__).parents[1] / "report" / "player"  # shared with the report, at page/player
 TYPES = {
     ".html": "text/html",
     ".css": "text/css",
@@ -33,12 +33,12 @@ TYPES = {
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }
-SWEEP = 5.0  # seconds between two looks for idle sessions
-MOST_CLIPS = 100  # of an answer
+SWEEP = 5.0  # seconds between two searches for idle sessions
+MOST_CLIPS = 100  # in one answer
 
 
 def make_app(hub: Hub, guard: Guard, sweep: float = SWEEP) -> App:
-    """Returns the server's application. It closes the hub and its engine when it ends."""
+    """Returns the server's application, which closes the hub and its engine when it ends."""
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -75,7 +75,7 @@ async def _sweep(hub: Hub, seconds: float) -> None:
 
 
 class Routes:
-    """What the server answers. No path comes from a request: names are looked up in a list made at the start."""
+    """The server's routes. No path comes from a request: names are looked up in a list that is made at the start."""
 
     def __init__(self, hub: Hub, guard: Guard) -> None:
         self._hub, self._guard = hub, guard
@@ -151,7 +151,7 @@ class Routes:
         return FileResponse(path, media_type=TYPES[path.suffix])
 
     def _known(self, request: Request) -> Response | None:
-        """Returns the answer to a request without the token; None for one that has it."""
+        """Returns the response to a request without the token; None if the request has it."""
         if self._guard.knows(request.query_params):
             return None
         return _refused(401, "token", "the address lacks the token that the server printed")

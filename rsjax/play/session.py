@@ -22,11 +22,11 @@ from rsjax.play.tree import Branch, Node, Tree
 
 MOST_BRANCHES = 32
 MOST_FRAMES = 4096
-FRAME_BYTES = 256 * 2**20  # of a session's pictures, which may leave fewer frames
+FRAME_BYTES = 256 * 2**20  # of a session's pictures; for large pictures this lowers the number of frames
 
 
 class Outbox(Protocol):
-    """Where a session's messages go."""
+    """The destination of a session's messages."""
 
     def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None: ...
     async def room(self) -> None: ...
@@ -34,10 +34,10 @@ class Outbox(Protocol):
 
 @dataclass(frozen=True)
 class Start:
-    """What a session's branches begin with: a clip of the run, or an uploaded picture.
+    """The beginning of a session's branches: a clip of the run, or an uploaded picture.
 
     Attributes:
-        number: the clip's.
+        number: the clip's number.
         clip: the clip.
     """
 
@@ -46,7 +46,7 @@ class Start:
     upload: Upload | None
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of it."""
+        """Returns the description of the start for a page."""
         if self.clip is None:
             assert self.upload is not None
             return {"start": {"upload": self.upload.describe()}, "task": "", "clip_frames": None}
@@ -58,14 +58,14 @@ class Session:
     """One viewer's session. Its coroutines run one after another, in the order of the viewer's messages.
 
     Args:
-        run: what is played.
-        engine: generates its frames.
-        memories: of all sessions.
+        run: the run to play.
+        engine: generates the session's frames.
+        memories: the memories of all sessions.
 
     Attributes:
-        name: nobody can guess it.
-        out: where messages go; None while no page is connected.
-        watched: kinds that are pushed with each new frame.
+        name: a name that nobody can guess.
+        out: the destination of messages; None while no page is connected.
+        watched: kinds of pictures that are sent with each new frame.
         used: when the last message came or the last frame was made, in seconds of :func:`time.monotonic`.
     """
 
@@ -82,25 +82,25 @@ class Session:
 
     @property
     def limits(self) -> dict[str, Any]:
-        """What a session can have at most."""
+        """The limits of a session."""
         frame = 3 * self.run.data.config.clips.image_size**2
         most = {"frames": min(MOST_FRAMES, FRAME_BYTES // frame), "branches": MOST_BRANCHES}
         return settings_limits(self.run.data.config) | most
 
     @property
     def grown(self) -> Tree:
-        """The tree; :class:`Refused` before the first start."""
+        """The tree; raises :class:`Refused` before the first start."""
         if self.tree is None:
             raise Refused("no_start", "begin with a clip or a picture first")
         return self.tree
 
     @property
     def has_depth(self) -> bool:
-        """Whether its frames have depth."""
+        """Whether the session's frames have depth."""
         return self.tree is not None and "depth" in self.grown.node(0, 0).moment.tokens
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of a session that has a start."""
+        """Returns the description of a session that has a start, for a page."""
         assert self.start is not None
         facts = self.start.describe() | {"seed": self.seed, "settings": self.settings.describe()}
         branches = [branch.describe() for branch in self.grown.branches.values()]
@@ -134,17 +134,17 @@ class Session:
         return Start(None, None, self.upload)
 
     def fork(self, number: int, frame: int, fresh: bool) -> Branch:
-        """Makes a branch, with draws of its own if it is to be fresh."""
+        """Makes a branch; if ``fresh``, it has its own random draws."""
         if len(self.grown.branches) >= MOST_BRANCHES:
             raise Refused("full", f"a session can have {MOST_BRANCHES} branches; drop one")
         draw = secrets.randbelow(MOST_SEED) if fresh else None
         return self.grown.fork(number, frame, draw)
 
     def drop(self, number: int) -> None:
-        """Removes a branch from which none forks."""
+        """Removes a branch from which no other branch forks."""
         branch = self.grown.branch(number)
         self.grown.drop(number)
-        if len(branch.nodes) - 1 > int(branch.fork or 0):  # otherwise its last frame is its parent's
+        if len(branch.nodes) - 1 > int(branch.fork or 0):  # otherwise the parent has its last frame
             self._memories.forget(branch.nodes[-1])
             branch.nodes[-1].moment = self._lighten(branch.nodes[-1].moment)
 
@@ -152,8 +152,8 @@ class Session:
         """Generates a branch's next frame and returns its number.
 
         Args:
-            action: within limits.
-            decoding: None: as the session's settings say.
+            action: the action, within limits.
+            decoding: None: according to the session's settings.
         """
         tree = self.grown
         branch = tree.branch(number)
@@ -167,7 +167,7 @@ class Session:
         return tree.append(number, node)
 
     def forget(self) -> None:
-        """Frees what the tree needs to go on."""
+        """Forgets the start and the tree, and frees its memory."""
         if self.tree is not None:
             for branch in self.tree.branches.values():
                 for node in branch.nodes:
@@ -175,7 +175,7 @@ class Session:
         self.tree = self.start = None
 
     async def _recall(self, nodes: list[Node]) -> None:
-        """Makes the last of these frames one that can go on, by generating it again from the nearest that can."""
+        """Restores the last frame's memory, by generating the frames again from the nearest one that has its memory."""
         known = len(nodes) - 1
         while nodes[known].moment.memory is None:
             known -= 1

@@ -1,4 +1,4 @@
-"""How a session's frames are decoded, and within which limits."""
+"""Settings for decoding a session's frames, and their limits."""
 
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -24,7 +24,7 @@ class Settings:
     top_k: int
 
     def describe(self) -> dict[str, Any]:
-        """Returns them for a page."""
+        """Returns the settings for a page."""
         return asdict(self)
 
     def decoding(self, seed: int, draw: int) -> Decoding:
@@ -32,10 +32,10 @@ class Settings:
         return Decoding(self.steps, self.temperature, self.guidance, self.top_k, seed, draw)
 
     def changed(self, message: dict[str, Any], limits: dict[str, Any]) -> "Settings":
-        """Returns them with the fields that a message has.
+        """Returns the settings with the fields that a message changes.
 
         Raises:
-            Refused: one is out of the run's limits.
+            Refused: a field is outside the run's limits.
         """
         try:
             low, high = limits["guidance"]

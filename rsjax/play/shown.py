@@ -1,4 +1,4 @@
-"""Sends what a page wants to see of a frame beside the frame itself: depth, uncertainty, the simulator's, keypoints."""
+"""Sends a frame, and what else a page wants to see of it: depth, uncertainty, the simulator's frame, keypoints."""
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
@@ -14,18 +14,18 @@ from rsjax.play.session import Session
 from rsjax.play.tree import Node
 
 KINDS = ("depth", "uncertainty", "truth", "truth_depth", "points")
-BACKLOG = 8  # frames whose depth waits; of more, the newest ones go without, and a page may ask for them later
+BACKLOG = 8  # frames whose depth may wait; beyond that, new frames get no depth, but a page may ask for it later
 
 
 @dataclass
 class Side:
-    """The thread of what is not on the way from an action to its frame."""
+    """The thread for work that an action's frame does not wait for."""
 
     pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "play-side"))
     waiting: int = 0
 
     async def run(self, work: Any, *inputs: Any) -> Any:
-        """Does work in the thread."""
+        """Runs a function in the thread."""
         self.waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self.pool, work, *inputs)
@@ -34,7 +34,7 @@ class Side:
 
 
 def send_rgb(session: Session, place: Place, node: Node) -> None:
-    """Sends a frame."""
+    """Sends a frame's picture."""
     session.send(frames.picture("rgb", place, node.moment.rgb))
 
 
@@ -58,7 +58,7 @@ def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
 
 
 def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mean: float | None) -> None:
-    """Sends the simulator's frame, if there is one, and how near the model's is."""
+    """Sends the simulator's frame, if there is one, and the PSNR of the model's frame."""
     truth = node.truth
     if truth is None:
         return
@@ -72,7 +72,7 @@ def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mea
 
 
 async def send_points(session: Session, side: Side, place: Place, nodes: list[Node], pane: str) -> None:
-    """Finds and sends the keypoints of the last of a branch's frames."""
+    """Finds and sends the keypoints of the last of these frames of a branch."""
     points = await side.run(points_of, session, nodes, pane)
     rounded = [[round(float(x), 4), round(float(y), 4), int(seen)] for x, y, seen in points]
     facts = {"branch": place.branch, "frame": place.frame, "pane": pane, "points": rounded}
@@ -80,6 +80,6 @@ async def send_points(session: Session, side: Side, place: Place, nodes: list[No
 
 
 def mean_psnr(nodes: list[Node]) -> float | None:
-    """Returns the mean over those of these frames (the first one excepted) that have one; None if none has."""
+    """Returns the mean PSNR over the frames after the first that have one; None if none has."""
     known = [node.truth.psnr for node in nodes[1:] if node.truth is not None and node.truth.psnr is not None]
     return float(np.mean(known)) if known else None

@@ -1,4 +1,4 @@
-"""What runs in a simulator's process, which loads neither jax nor the model."""
+"""The code of a simulator's process, which loads neither jax nor the model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rsjax.sim.episode import Simulators
 
 @dataclass(frozen=True)
 class Job:
-    """What a simulator does: begins an episode if ``seed`` is set, or takes a frame's action; then renders or not."""
+    """One job of a simulator: begins an episode if ``seed`` is set, or takes a frame's action; then perhaps renders."""
 
     task: str
     seed: int | None
@@ -33,7 +33,7 @@ Simulate = Callable[[Job], Rendered | None]
 
 
 def simulate(config: SimConfig) -> Simulate:
-    """Returns the function that does jobs, in order. It runs in the process."""
+    """Returns the function that does jobs, in order. It runs in the simulator's process."""
     simulators = Simulators(config)
 
     def work(job: Job) -> Rendered | None:

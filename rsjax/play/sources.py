@@ -1,4 +1,4 @@
-"""Where actions come from that no person steers: clips, chance, a policy, a planner.
+"""Sources of actions other than a person: a clip, random draws, a policy, a planner.
 
 Axes: A action dimensions, S×S pixels.
 """
@@ -26,10 +26,10 @@ Act = Callable[[dict[str, np.ndarray]], Any]
 
 @dataclass
 class Acting:
-    """A policy or planner that acts in a branch, as it remembers the frames before.
+    """A policy or planner that acts in one branch, because it remembers earlier frames.
 
     Attributes:
-        last: the frame that its last action led into; after any other it begins anew.
+        last: the frame that its last action led to; after any other frame, a new policy or planner takes over.
     """
 
     kind: str
@@ -39,16 +39,16 @@ class Acting:
 
 @dataclass
 class Sources:
-    """The ways to act in one session, in which each branch has a policy or planner of its own."""
+    """The sources of actions in one session; each branch has its own policy or planner."""
 
     run: PlayRun
     acting: dict[int, Acting] = field(default_factory=dict)
 
     def action(self, session: Session, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
-        """Returns the action into a branch's next frame. It may take long: a planner tries many.
+        """Returns the action that leads to a branch's next frame. This may be slow: a planner tries many actions.
 
         Raises:
-            Refused: there is no such source, or it has no action for this frame.
+            Refused: the source is missing, or has no action for this frame.
         """
         kind, frame = choice(source, "kind", KINDS), len(branch.nodes)
         if reason := reasons(self.run)[kind]:
@@ -63,7 +63,7 @@ class Sources:
         return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)
 
     def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
-        """Says that an action of this source, None for a person's, led into the branch's last frame."""
+        """Notes that an action of this source (None: a person) led to the branch's last frame."""
         acting = self.acting.get(branch.number)
         if acting is not None and source is not None and source["kind"] == acting.kind:
             acting.last = branch.nodes[-1]
@@ -90,7 +90,7 @@ class Sources:
 
 
 def reasons(run: PlayRun) -> dict[str, str]:
-    """Returns why there is no such source, "" where there is, by kind."""
+    """Returns, for each kind of source, why it is missing; "" if it is there."""
     config = run.data.config
     why = {"stick": "", "clip": run.missing, "random": "", "policy": "", "planner": ""}
     if run.policy is None:
@@ -103,7 +103,7 @@ def reasons(run: PlayRun) -> dict[str, str]:
 
 
 def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
-    """Returns what a policy sees of a frame."""
+    """Returns a policy's observation of a frame."""
     seen = {"rgb": node.moment.rgb}
     if session.has_depth:
         depth = session.engine.branching(True).depth(node.moment)
@@ -112,7 +112,7 @@ def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
 
 
 def check_policy(run: PlayRun) -> None:
-    """Raises :class:`UserError` if the policy's frames or actions are not those of the run."""
+    """Raises :class:`UserError` if the policy's frames or actions differ in size from the run's."""
     if run.policy is None:
         return
     clips = run.data.config.clips

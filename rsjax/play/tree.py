@@ -12,14 +12,14 @@ from rsjax.play.errors import Refused
 
 @dataclass(eq=False)
 class Node:
-    """One frame, and how it came about.
+    """One frame, and how it was made.
 
     Attributes:
-        moment: the frame; what it has to go on from may be used up.
-        action: that led into it, as done; None for a first frame.
-        decoding: how it was decoded; None for a first frame.
+        moment: the frame; its memory may be used up.
+        action: the action that led to the frame, after clipping; None for a first frame.
+        decoding: how the frame was decoded; None for a first frame.
         truth: the simulator's frame after the same actions, once it is there.
-        points: (K, 3) keypoints, x and y in 0–1 and whether they are seen, by pane; filled when asked for.
+        points: (K, 3) keypoints, x and y in 0–1 and whether they are seen, by pane; computed on request.
     """
 
     moment: Moment
@@ -36,16 +36,16 @@ class Truth:
     rgb: UInt8[np.ndarray, "H W 3"]
     depth: Float32[np.ndarray, "H W"]
     success: bool
-    psnr: float | None  # dB; None if both are identical
+    psnr: float | None  # dB; None if both frames are identical
 
 
 @dataclass
 class Branch:
-    """A video: its frames are nodes, of which branches that fork from it share the first.
+    """A video, whose frames are nodes; a branch shares its first nodes with the branch that it forks from.
 
     Attributes:
         fork: the last frame shared with the parent.
-        draw: decides the draws of the frames to come, with the session's seed.
+        draw: determines, with the session's seed, the draws of the next frames.
     """
 
     number: int
@@ -55,7 +55,7 @@ class Branch:
     nodes: list[Node]
 
     def describe(self) -> dict[str, Any]:
-        """Returns what a page needs to know of the branch."""
+        """Returns the description of the branch for a page."""
         facts = {"branch": self.number, "parent": self.parent, "fork": self.fork}
         return facts | {"length": len(self.nodes), "draw": self.draw}
 
@@ -68,13 +68,13 @@ class Tree:
         self.frames, self._next = 1, 1
 
     def branch(self, number: int) -> Branch:
-        """Returns a branch; :class:`Refused` if there is none of this number."""
+        """Returns a branch; raises :class:`Refused` if there is none with this number."""
         if number not in self.branches:
             raise Refused("no_branch", f"there is no branch {number}")
         return self.branches[number]
 
     def node(self, number: int, frame: int) -> Node:
-        """Returns a branch's frame; :class:`Refused` if there is none."""
+        """Returns a branch's frame; raises :class:`Refused` if there is none."""
         nodes = self.branch(number).nodes
         if not 0 <= frame < len(nodes):
             raise Refused("no_frame", f"branch {number} has frames 0 to {len(nodes) - 1}, not {frame}")
@@ -87,7 +87,7 @@ class Tree:
         return len(self.branches[number].nodes) - 1
 
     def fork(self, number: int, frame: int, draw: int | None) -> Branch:
-        """Makes a branch that shares frames 0 … ``frame`` with another; draw None: the other's."""
+        """Makes a branch that shares frames 0 … ``frame`` with another, and its draw too if ``draw`` is None."""
         self.node(number, frame)
         parent = self.branches[number]
         kept = parent.draw if draw is None else draw
@@ -97,7 +97,7 @@ class Tree:
         return made
 
     def drop(self, number: int) -> None:
-        """Removes a branch from which none forks."""
+        """Removes a branch from which no other branch forks."""
         branch = self.branch(number)
         if number == 0 or any(each.parent == number for each in self.branches.values()):
             raise Refused("no_branch", f"branch {number} cannot go: others fork from it, or it is the first")

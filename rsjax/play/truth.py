@@ -1,6 +1,7 @@
-"""The real simulator beside the dream: the same actions from the same start, in a process of its own.
+"""Runs the simulator beside the generated video: the same actions from the same start, in a separate process.
 
-A simulator's state cannot be kept, so it follows one branch; for another it begins again and runs through its actions.
+A simulator's state cannot be saved, so it follows one branch. For another branch it begins again and repeats that
+branch's actions.
 """
 
 import asyncio
@@ -20,7 +21,7 @@ from rsjax.play.tree import Node, Truth
 from rsjax.policies.simulator import clip_seed
 from rsjax.processes import Helper, WorkerDied
 
-SECONDS = 120.0  # for which a step, or the simulator's start, may take
+SECONDS = 120.0  # time limit for a step or for the simulator's start
 MOST = 2  # simulators of a server
 PEAK = 255.0
 
@@ -29,8 +30,8 @@ class Truths:
     """The simulators of a server.
 
     Args:
-        make: called in a process, as :func:`simulate` with its configuration; None where there is no simulator.
-        most: processes.
+        make: called in a new process, such as :func:`simulate` with its configuration; None without a simulator.
+        most: processes at a time.
     """
 
     def __init__(self, make: Callable[[], Simulate] | None, most: int = MOST) -> None:
@@ -42,7 +43,7 @@ class Truths:
         return cls(None if config is None else functools.partial(simulate, config))
 
     def take(self) -> Callable[[], Simulate]:
-        """Returns what a process is made with; :class:`Refused` if all are in use."""
+        """Reserves a process and returns the function to start in it; raises :class:`Refused` if all are in use."""
         if self.make is None:
             raise Refused("no_truth", "the clips are of no simulator that is here")
         if not self._free:
@@ -51,7 +52,7 @@ class Truths:
         return self.make
 
     def give_back(self) -> None:
-        """Says that a process is gone."""
+        """Notes that a process has ended."""
         self._free += 1
 
 
@@ -59,7 +60,7 @@ class Follower:
     """A simulator that follows one viewer's branches.
 
     Raises:
-        Refused: all are in use.
+        Refused: all simulators are in use.
     """
 
     def __init__(self, truths: Truths, origin: dict[str, Any], task: str) -> None:
@@ -70,10 +71,10 @@ class Follower:
         self._applied: list[Node] = []
 
     async def follow(self, nodes: list[Node]) -> list[int]:
-        """Gives each of a branch's frames its truth, and returns the numbers of those that had none.
+        """Adds the truth to each of a branch's frames, and returns the numbers of the frames that had none.
 
         Raises:
-            Refused: the simulator cannot.
+            Refused: the simulator fails or does not answer.
         """
         return await asyncio.get_running_loop().run_in_executor(self._pool, self._follow, nodes)
 
@@ -91,7 +92,7 @@ class Follower:
             self._helper = None
             self._applied = []
             raise Refused("no_truth", "the simulator does not answer; it begins again with the next frame") from error
-        except Exception as error:  # a simulator's own; the action may have been taken
+        except Exception as error:  # from the simulator; the action may have been taken
             self._applied = []
             raise Refused("no_truth", first_line(error)) from error
 

@@ -1,4 +1,4 @@
-"""A session with what its page sees of it."""
+"""A session together with what its page sees."""
 
 import asyncio
 from typing import Any
@@ -21,24 +21,24 @@ _TRUTHS = {"truth", "truth_depth"}
 
 
 class Viewer:
-    """A session, its ways to act, and the pictures that are on their way to its page.
+    """A session, its sources of actions, and the tasks that send pictures to its page.
 
     Args:
-        side: the thread of what may be late.
-        files: where what is kept goes.
+        side: the thread for work that may be late.
+        files: the files that sessions save.
         truths: the simulators of all viewers.
     """
 
     def __init__(self, session: Session, side: Side, files: Files, truths: Truths) -> None:
         self.session, self.side, self.files, self._truths = session, side, files, truths
         self._follower: Follower | None = None
-        self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator is to reach
-        self._chase: object | None = None  # stands for the task that brings it there; another one after a new start
+        self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator shall reach
+        self._chase: object | None = None  # identifies the task that does this; a new start gets a new one
         self.sources = Sources(session.run)
         self._tasks: set[asyncio.Task[None]] = set()
 
     def describe(self) -> dict[str, Any]:
-        """Returns the session for a page."""
+        """Returns the description of the session for a page."""
         start = self.session.start
         has_truth = not self.no_truth and start is not None and start.clip is not None
         return self.session.describe() | {"has_truth": has_truth}
@@ -49,30 +49,30 @@ class Viewer:
         return "" if self._truths.make else "the clips are of no simulator that is here"
 
     def begun(self) -> None:
-        """Forgets what belonged to the tree before."""
+        """Forgets what belonged to the previous tree."""
         self.sources.acting.clear()
         self.rest()
 
     def rest(self) -> None:
-        """Lets others have the simulator."""
+        """Gives the simulator back, for other viewers."""
         self._wanted = self._chase = None
         if self._follower is not None:
             self._follower.close()
             self._follower = None
 
     def close(self) -> None:
-        """Frees everything; the session is over."""
+        """Frees everything at the end of the session."""
         for task in self._tasks:
             task.cancel()
         self.rest()
         self.session.forget()
 
     async def sourced(self, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
-        """Returns the action of a source into a branch's next frame."""
+        """Returns a source's action that leads to a branch's next frame."""
         return await asyncio.to_thread(self.sources.action, self.session, branch, source)
 
     async def show(self, number: int, frame: int, answered: int) -> None:
-        """Sends a new frame, and begins to make what else the page watches."""
+        """Sends a new frame, and starts to compute what else the page watches."""
         session = self.session
         nodes = session.grown.branch(number).nodes
         place, node = Place(number, frame, answered), nodes[frame]
@@ -87,7 +87,7 @@ class Viewer:
             self._follow(number, frame)
 
     async def again(self, place: Place, nodes: list[Node], kinds: list[str]) -> None:
-        """Sends what there is of an older frame, the last of these."""
+        """Sends the wanted kinds of pictures of an older frame, the last of these nodes."""
         session, node = self.session, nodes[-1]
         if session.out is not None:
             await session.out.room()
@@ -107,7 +107,7 @@ class Viewer:
             shown.send_truth(session, place, node, kinds, shown.mean_psnr(nodes))
 
     def _follow(self, number: int, frame: int) -> None:
-        """Has the simulator come to a frame; one that it has yet to come to is forgotten, as the way there is shown."""
+        """Sends the simulator to a frame, instead of one that it has not reached; frames on the way are shown too."""
         start = self.session.start
         if start is None or start.clip is None or self.no_truth:
             return
@@ -126,7 +126,7 @@ class Viewer:
                     task = str(clip["task"]) if session.run.simulator and session.run.simulator.train_tasks else ""
                     self._follower = Follower(self._truths, clip["provenance"], task)
                 filled = await self._follower.follow(nodes)
-                if self._chase is not chase:  # these are frames of the start before
+                if self._chase is not chase:  # these frames are of an earlier start
                     return
                 for each in filled:
                     place = Place(number, each, 0)
