@@ -1,4 +1,4 @@
-"""Commands: ``python -m experiments.<name>``. Each parses its arguments and calls the library."""
+"""The commands, ``python -m experiments.<name>``: each one parses its arguments and calls the library."""
 
 from rsjax.runtime import answer_while_importing
 

@@ -22,7 +22,7 @@ class Options:
     """Options of this command."""
 
     grid: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """FIELD=VALUE,VALUE…: a field to vary; repeat it for more. Default: depth on/off and keypoints on/off."""
+    """FIELD=VALUE,VALUE…: a field to vary; repeat the option for more. Default: depth on/off, keypoints on/off."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the world model's training (train.seed); every combination runs with each."""
     out: Path | None = None
@@ -34,7 +34,7 @@ class Options:
     skip: tuple[str, ...] = ()
     """Cells to leave out, by name or shell pattern."""
     cell: int | None = None
-    """Run only the cell of this number, counted from 0. Default in a Slurm array job: the task's number."""
+    """Run only the cell with this number, counted from 0. Default in a Slurm array job: the task's number."""
     list: bool = False
     """Print the cells with their numbers and states, and run nothing."""
     table: bool = False
@@ -43,7 +43,7 @@ class Options:
 
 @main_errors()
 def main() -> None:
-    """Runs the cells that are not finished, then prints the table; exits with 1 where a cell failed."""
+    """Runs the cells that are not finished, then prints the table; exits with 1 if a cell failed."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
     out, data = options.out or Path("runs") / f"ablation-{config.name}", options.data_dir
@@ -56,7 +56,7 @@ def main() -> None:
         )
         number = int(task)
     choice = Choice(number, options.only, options.skip)
-    # Loads JAX, so only after the arguments have been checked.
+    # This import loads JAX, so it comes after the arguments have been checked.
     from rsjax.ablation import sweep
 
     if options.table:

@@ -17,15 +17,15 @@ class Options:
     """Options of this command."""
 
     batch: int = 1
-    """Clips per training step, rollout and loader batch; the part feed uses the preset's batch size."""
+    """Clips per training step, rollout and loader batch; the part "feed" uses the preset's batch size."""
     only: str = ""
     """Parts, separated by commas: matmul,train,roofline,sample,tokenizer,environment,loader,feed; default: all."""
     horizons: tuple[int, ...] = ()
-    """Lengths of rollouts in frames, one prompt frame included; default: the clips' length and three times that."""
+    """Lengths of rollouts in frames, including one prompt frame; default: the clips' length and three times that."""
     torch: bool = False
-    """Measure the model in plain PyTorch too (make extras; of RoboScape the RGB branch)."""
+    """Also measure the model in plain PyTorch (needs make extras; for RoboScape only the RGB branch)."""
     json: Path | None = None
-    """Write the numbers to this file, after each part all so far."""
+    """Write the numbers to this file; it is updated after each part."""
 
 
 @main_errors()
@@ -38,7 +38,7 @@ def main() -> None:
 
     from rsjax.bench.run import PARTS, bench, table
 
-    jax.config.update("jax_enable_compilation_cache", False)  # to measure compilation
+    jax.config.update("jax_enable_compilation_cache", False)  # so that compilation itself is measured
     console = Console()
     only = tuple(options.only.split(",")) if options.only else PARTS
     keep = partial(write_json, options.json) if options.json else lambda numbers: None

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
-from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro draws
+from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro prints
 
-from rsjax.command import main_errors as main_errors  # every command imports both from here
+from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
 from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
 from rsjax.config.curriculum import format_stage, parse_stage
@@ -19,7 +19,7 @@ from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
 
-# The fields that ``PRESET --help`` lists; ``--help-all`` lists all. A field that the preset lacks is skipped.
+# The fields that ``PRESET --help`` lists; ``--help-all`` lists all fields. A field that the preset lacks is skipped.
 FIRST_FIELDS = {
     "sim.episodes": "Simulated episodes, those of the test split included.",
     "sim.test-episodes": "Episodes of the test split.",
@@ -71,15 +71,15 @@ def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.Primi
 
 @dataclasses.dataclass(frozen=True)
 class PresetOptions:
-    """Options of every command with a preset. They change the preset before its fields are set."""
+    """Options of every command that takes a preset. They change the preset before its fields are set."""
 
     model: str | None = None
-    """The family of the model (roboscape, genie, ivideogpt, irasim, cogvideox), with the settings that both have."""
+    """The model's family (roboscape, genie, ivideogpt, irasim, cogvideox); settings that both families have stay."""
     store: Path | None = None
     """A store of clips made by experiments.ingest, to train on instead of simulated clips."""
 
     def apply(self, preset: Config) -> Config:
-        """Returns the preset as these options change it."""
+        """Returns the preset changed by these options."""
         if self.model is not None:
             preset = preset.with_family(self.model)
         if self.store is not None:
@@ -103,7 +103,7 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
 
     Raises:
         ConfigError: an unknown preset or field, a value that does not parse, or an impossible combination.
-        SystemExit: status 0, after printing the help that was asked for.
+        SystemExit: with status 0, after printing the requested help.
     """
     usage = f"usage: {prog} PRESET [--section.field VALUE]; presets: {', '.join(presets.PRESETS)}"
     if not argv or argv[0].startswith("-"):
@@ -140,20 +140,20 @@ def parse_options(argv: Sequence[str], prog: str, description: str, options: Opt
 
 
 def part(options: Any, kind: type[Options]) -> Options:
-    """Returns the settings of one class that a command's options inherit from."""
+    """Returns the part of a command's options that they inherit from the class ``kind``."""
     return kind(**{field.name: getattr(options, field.name) for field in dataclasses.fields(kind)})  # type: ignore[arg-type]
 
 
 def _adding(options: Any) -> list[str]:
-    """Returns the names of the options that may be repeated, as their values add up."""
+    """Returns the names of the options that may be repeated, because their values are collected."""
     hints = get_type_hints(type(options), include_extras=True)
     return [name.replace("_", "-") for name, hint in hints.items() if tyro.conf.UseAppendAction in get_args(hint)]
 
 
 def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: str, rest: bool = False) -> Any:
-    """Parses arguments into dataclasses like those of ``parts``; with ``rest``, skips arguments that none has.
+    """Parses arguments into dataclasses like those in ``parts``; with ``rest``, skips arguments that no part has.
 
-    Flags are named after fields, without their part. A boolean of the part "fields" takes a value, False or True.
+    Flags are named after fields, without the part's name. A boolean in the part "fields" takes a value, False or True.
     """
     markers = {name: [tyro.conf.arg(name="")] for name in parts}
     markers.get("fields", []).append(tyro.conf.FlagConversionOff)
@@ -162,7 +162,7 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
 
     def refuse(event: parse_errors.ParseErrorEvent) -> None:
         flags = [name.replace("_", "-") for part in parts.values() for name in leaves(part)]
-        if message := _message(event, flags):  # of an event without a message, tyro prints its own report
+        if message := _message(event, flags):  # for an event without a message, tyro prints its own report
             raise ConfigError(f"{message} (see {prog} --help)")
 
     settings: dict[str, Any] = {"args": argv, "default": default, "prog": prog, "description": description}
@@ -201,7 +201,7 @@ def _name(argument: Any) -> str:
 
 
 def _first_fields(preset: Config) -> Any:
-    """A dataclass of those of FIRST_FIELDS that the preset has, with its values, for ``--help``."""
+    """Returns a dataclass of the FIRST_FIELDS that the preset has, with the preset's values, for ``--help``."""
     kinds: list[Any] = []
     values: dict[str, Any] = {}
     for name, text in FIRST_FIELDS.items():

@@ -17,14 +17,14 @@ PROG = "python -m experiments.compare"
 
 @dataclass(frozen=True)
 class Options:
-    """Puts evaluations side by side: means over seeds, paired intervals, tests, published numbers, film strips."""
+    """Compares evaluations: means over seeds, paired intervals, tests, published numbers, film strips."""
 
     groups: Annotated[Positional[tuple[str, ...]], arg(metavar="RUN|NAME=RUN,RUN …")] = ()
-    """Run directories, or groups of runs that differ in their seed alone; a pattern such as 'a=runs/a/*' is a group."""
+    """Run directories, or groups of runs that differ only in their seed; a pattern such as 'a=runs/a/*' is a group."""
     protocol: str | None = None
     """The evaluation to compare: paper, run (of the evaluation stage), … Default: the one that all runs have."""
     against: str = ""
-    """The group that others are compared with; default: the first."""
+    """The group that the others are compared with; default: the first."""
     only: tuple[str, ...] = ()
     """Metrics to compare, by key or pattern ('psnr*' 'depth_*'); default: those of tables."""
     out: Path | None = None

@@ -14,7 +14,7 @@ class Options:
     """Options of this command."""
 
     json: bool = False
-    """Print the figures as one JSON object instead."""
+    """Print the numbers as one JSON object instead."""
 
 
 @main_errors()

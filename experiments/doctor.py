@@ -1,4 +1,4 @@
-"""Checks a data set and prints what is wrong where. ``python -m experiments.doctor rlds /data/bridge``"""
+"""Checks a data set and prints each problem and its place. ``python -m experiments.doctor rlds /data/bridge``"""
 
 import sys
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ PROG = "python -m experiments.doctor"
 
 @dataclass(frozen=True)
 class Options:
-    """Checks every episode of a data set of any format, or of a store of clips, and prints its findings.
+    """Checks every episode of a data set of any format, or of a store of clips, and prints the findings.
 
-    Exits with 0 where nothing is wrong, with 1 where something is, and with 2 where the data set cannot be listed.
+    Exits with 0 if nothing is wrong, with 1 if something is, and with 2 if the data set cannot be listed.
     """
 
     what: tyro.conf.Positional[str] = tyro.MISSING
@@ -33,24 +33,24 @@ class Options:
     option: tuple[str, ...] = ()
     """The format's own settings, such as keys=bridge or split=train; lists as JSON."""
     frames: int = 5
-    """Pictures of each camera that are decoded, evenly spread over the episode; 0: all."""
+    """Pictures of each camera to decode, spread evenly over the episode; 0: all."""
     gap: float = 1.5
-    """Longest time between two frames, relative to 1 / fps."""
+    """Longest time allowed between two frames, relative to 1 / fps."""
     unusual: float = 20.0
-    """Largest action, or step of the state, relative to the usual."""
+    """Largest action, or step of the state, allowed relative to the usual one."""
     ignore: tuple[str, ...] = ()
     """Kinds of findings to leave out, such as no-task."""
     lines: int = 50
-    """Findings to print; 0: all."""
+    """Number of findings to print; 0: all."""
     workers: int = 1
-    """Processes; -1: one per core."""
+    """Number of processes; -1: one per core."""
     fix: Path | None = None
-    """Writes a list here, for experiments.ingest --selection, that leaves out every episode with a finding."""
+    """Write a list for experiments.ingest --selection to this file; it leaves out every episode with a finding."""
 
 
 @main_errors()
 def main() -> None:
-    """Prints a line per finding and a table of their kinds."""
+    """Prints a line per finding and a table of the kinds of findings."""
     if len(sys.argv) < 2:
         raise ConfigError(
             f"name a store, or a source and its path, first; usage: {PROG} STORE, or {PROG} SOURCE PATH [--fix FILE]; "
@@ -110,7 +110,7 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
 
 
 def _fix(diagnosis: "Diagnosis", path: Path, about: str) -> str:
-    """Writes the list of the episodes without a finding and returns a line that says so."""
+    """Writes the list of the episodes without a finding, and returns a line that reports it."""
     from rsjax.ingest.selection import write_selection
 
     kept, out = write_selection(path, about, diagnosis.refs, diagnosis.reasons())

@@ -27,40 +27,40 @@ Settings.__doc__ = "Settings of the metrics, as of experiments.train; default: t
 
 @dataclass(frozen=True)
 class Options:
-    """Generates from held-out clips by a protocol and scores all metrics, with everything that decides the scores."""
+    """Generates from held-out clips by a protocol and scores all metrics; results record all that affects scores."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN …")] = ()
     """Run directories, made by experiments.train."""
     protocol: str = "paper"
-    """paper, 1xgpt, ivideogpt-bair, horizon48, unseen, or run: as the run's own configuration says."""
+    """paper, 1xgpt, ivideogpt-bair, horizon48, unseen, or run: that of the run's own configuration."""
     data: Path | None = None
     """A store with the clips to score; default: the run's own."""
     split: tuple[str, ...] = ()
-    """Splits to score, each by itself; default: the protocol's. A name may end in *."""
+    """Splits to score, each separately; default: the protocol's. A name may end in *."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
     """The new path of the run's store of ingested clips, if it was moved."""
     overwrite: bool = False
-    """Evaluate again what is up to date."""
+    """Evaluate again even if a result is up to date."""
     second_takes: bool = False
     """Simulate the scored clips once more with slightly jittered actions, for physics_iq_score."""
     prompt_frames: int | None = None
     """Recorded frames that generation starts from. This and the following options change the protocol."""
     horizon: int | None = None
-    """Predicted frames; 0: to the clips' end."""
+    """Predicted frames; 0: up to the end of the clips."""
     resolution: int | None = None
     """Pixels per side of the frames that are scored; 0: those of the clips."""
     steps: int | None = None
     """Decoding steps per frame."""
     temperature: float | None = None
-    """Logits are divided by it; 0 takes the most probable code."""
+    """Logits are divided by the temperature; 0: take the most probable code."""
     samples: int | None = None
     """Videos per clip, for the best of them."""
     clips: int | None = None
     """Clips to score, spread evenly over the split."""
     repetitions: int | None = None
-    """Repetitions with other random draws."""
+    """Repetitions with different random draws."""
     action_draws: int | None = None
     """Random action sequences per clip and kind of ΔPSNR; 0: no ΔPSNR."""
     depth_alignment: Literal["none", "median", "affine_disparity", "l1_scale"] | None = None

@@ -27,7 +27,7 @@ class Options(LeRobotOptions):
 
 @main_errors()
 def main() -> None:
-    """Writes the data set and prints what it has."""
+    """Writes the data set and prints what it contains."""
     word, *argv = sys.argv[1:] or [""]
     if word != "lerobot" and not {"-h", "--help"} & {word}:
         raise ConfigError(f"name a format first; usage: {PROG} lerobot STORE OUT; formats: lerobot")

@@ -31,7 +31,7 @@ class Options:
     actions: Path | None = None
     """Use the actions in this .npy file, float (T, A), in the data's units; row t leads into frame t."""
     frames: int | None = None
-    """Frames per video, perhaps more than in training; shorter actions are repeated."""
+    """Frames per video, possibly more than in training; shorter actions are repeated."""
     out: Path | None = None
     """Directory of the videos; default RUN/generated."""
     format: Literal["mp4", "gif"] = "mp4"
@@ -39,23 +39,24 @@ class Options:
     fps: float = 4.0
     """Frames per second, 0.1 to 240."""
     scale: int = 4
-    """Enlargement of videos that show only the prediction, 1 to 64."""
+    """Factor by which videos that show only the prediction are enlarged, 1 to 64."""
     steps: int | None = None
     """Decoding steps per frame. This and the following options default to the run's settings."""
     temperature: float | None = None
-    """Logits are divided by it; 0 takes the most probable code."""
+    """Logits are divided by the temperature; 0: take the most probable code."""
     unmask: Literal["random", "greedy"] | None = None
-    """Unmask random cells first, or those of highest confidence."""
+    """Unmask random cells first, or those with the highest confidence."""
     top_k: int | None = None
-    """Draw from the k most probable codes of each vocabulary; 0: from all."""
+    """Draw from the k most probable codes of each vocabulary; 0: from all codes."""
     mean_codes: bool | None = None
     """Decode pictures from mean codes instead of the most probable ones; no effect at temperatures above 0."""
     read_means: bool | None = None
     """Let later frames read the mean codes too; no effect without --mean-codes."""
     guidance: float | None = None
-    """Strength of guidance; 1: none. By actions it needs model.action_dropout, by text model.text.dropout or a file."""
+    """Guidance strength; 1: none. Guidance by actions needs model.action_dropout; by text, model.text.dropout or a
+    file."""
     window_stride: int | None = None
-    """Frames by which a full window moves (learned positions); 0: half of the window."""
+    """Frames by which a full window moves on (with learned positions); 0: half of the window."""
     cache_dtype: Literal["float32", "bfloat16"] | None = None
     """Data type of the cache of keys and values."""
     seed: int | None = None

@@ -14,7 +14,7 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options(Improvement, Trials):
-    """Rolls a policy out in a world model, trains it on what the judge calls a success, and repeats that."""
+    """Rolls out a policy in a world model, trains it on the rollouts that the judge calls a success, and repeats."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory on simulated clips, made by experiments.train."""
@@ -23,7 +23,7 @@ class Options(Improvement, Trials):
     judge: Path | None = None
     """Folder of the judge; default: the run's own (experiments.judge)."""
     policy: Path | None = None
-    """Directory of the policy to begin with; default: one is trained on --demos real demonstrations."""
+    """Directory of the policy to start with; default: train one on --demos real demonstrations."""
     demos: int = 50
     """Real demonstrations that the policy was, or is, trained on."""
     size: str = "tiny"
@@ -51,7 +51,7 @@ def main() -> None:
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
     settings, trials = part(options, Improvement), part(options, Trials)
-    config = run.simulator  # before a policy is trained
+    config = run.simulator  # checks the clips before a policy is trained
     model, demos = run.world(trials.together, options.judge), run.demos().first(options.demos)
     if options.policy:
         policy = load_policy(options.policy)

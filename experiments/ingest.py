@@ -17,7 +17,7 @@ each; for sim it is a store of clips."""
 
 @main_errors()
 def main() -> None:
-    """Ingests what is missing, and prints what became of every episode."""
+    """Ingests the missing episodes, and prints the outcome for every episode."""
     argv = sys.argv[1:]
     wants_help = {"-h", "--help"} & {*argv}
     if not wants_help and (len(argv) < 2 or argv[0].startswith("-") or argv[1].startswith("-")):

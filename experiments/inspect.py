@@ -23,10 +23,10 @@ class Options:
     store: Annotated[Positional[Path], arg(metavar="STORE")] = tyro.MISSING
     """A store of clips or of tokens."""
     records: int = 200
-    """How many records to read, spread evenly; counts, tasks and difficulties are of all."""
+    """How many records to read, spread evenly; counts, tasks and difficulties cover all records."""
     sheet: Path | None = None
-    """File for the sheet of pictures, .png, .jpg, .webp or .html. Default: STORE-sheet.png beside the store, or .html
-    where no font of this machine has all letters of the captions."""
+    """File for the sheet of pictures, .png, .jpg, .webp or .html. Default: STORE-sheet.png next to the store, or .html
+    if no font of this machine has all letters of the captions."""
     clips: int = 12
     """How many clips to show on the sheet and in the viewer."""
     rerun: bool = False

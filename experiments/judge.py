@@ -12,7 +12,7 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options:
-    """Trains a classifier of success, fail and uninterpretable on a run's clips, and validates it on held-out video."""
+    """Trains a classifier (success, fail, uninterpretable) on a run's clips, and validates it on held-out video."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
@@ -23,18 +23,18 @@ class Options:
     steps: int = 1000
     """Training steps."""
     clips: int = 1000
-    """Training clips, at most."""
+    """Largest number of training clips."""
     reconstructed: int = 200
-    """Those of them that are also shown as the tokenizer reconstructs them."""
+    """Number of training clips that are also shown as the tokenizer reconstructs them."""
     validation_clips: int = 100
-    """Held-out clips, at most."""
+    """Largest number of held-out clips."""
     seed: int = 0
     """Seed of the training."""
 
 
 @main_errors()
 def main() -> None:
-    """Writes RUN/judge and prints the validation."""
+    """Writes RUN/judge and prints the results of the validation."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.judge", Options.__doc__ or "", Options())
     from rich.console import Console

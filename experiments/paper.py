@@ -1,4 +1,4 @@
-"""Puts the paper's claims to the test in small. ``python -m experiments.paper --budget 3h``"""
+"""Tests the paper's claims at small scale. ``python -m experiments.paper --budget 3h``"""
 
 import shlex
 import sys
@@ -16,9 +16,9 @@ FILES = ("lpips_alex_weights", "lpips_vgg_weights", "fvd_weights", "depth_estima
 
 @dataclass(frozen=True)
 class Options:
-    """Trains and evaluates what the paper's claims need and is not there yet, and judges each claim.
+    """Trains and evaluates what the paper's claims need and does not exist yet, and judges each claim.
 
-    The budget decides how large the trainings are and which of them are made; the same command goes on where it was
+    The budget determines how large the trainings are and which of them run; the same command continues where it was
     stopped. The report is written after each training.
     """
 
@@ -27,33 +27,33 @@ class Options:
     only: tuple[str, ...] = ()
     """Claims to test, by name or shell pattern (table1, departure-*), which share the budget. Default: all."""
     dir: Path = Path("runs/paper")
-    """Directory of trainings and report; those of several budgets can share it."""
+    """Directory of trainings and report; several budgets can share it."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     preset: str = "tiny"
-    """The preset that the trainings are variations of."""
+    """The preset that the trainings vary."""
     seeds: int = 3
     """Trainings of each arm."""
     lpips_alex_weights: str = ""
-    """Weights of LPIPS and of FVD, and an estimator of depth (docs/evaluation.md); scores without are null."""
+    """Weights of LPIPS and of FVD, and a depth estimator (docs/evaluation.md); scores that lack theirs are null."""
     lpips_vgg_weights: str = ""
     fvd_weights: str = ""
     depth_estimator: str = ""
     dry_run: bool = False
     """Print the trainings with their estimated minutes and states, and run nothing."""
     report: bool = False
-    """Write the report of what has finished, and run nothing."""
+    """Write the report on what has finished, and run nothing."""
 
 
 @main_errors()
 def main() -> None:
-    """Runs what has not finished, and prints the report's path; exits with 1 where a training failed."""
+    """Runs what has not finished, and prints the report's path; exits with 1 if a training failed."""
     tune_process()
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     require(options.seeds >= 1, f"--seeds is {options.seeds}; it must be at least 1")
     given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
     preset = with_values(presets.get(options.preset), given)
-    # Loads JAX, so only after the arguments have been parsed.
+    # This import loads JAX, so it comes after the arguments have been parsed.
     from rsjax.paper import run
     from rsjax.paper.budget import parse_duration, scale
     from rsjax.paper.claim import chosen, claims

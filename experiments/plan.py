@@ -13,7 +13,7 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options:
-    """Model-predictive control in a run's world model, closed loop in the simulator, beside random and the expert."""
+    """Controls the simulator by planning in a run's world model (MPC), and compares this with random and the expert."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train on simulated clips."""
@@ -25,21 +25,21 @@ class Options:
     lpips_weights: str = ""
     """Weights for the energy lpips (docs/evaluation.md)."""
     policy: Path | None = None
-    """A policy of experiments.policy_learning to compare with too."""
+    """A policy of experiments.policy_learning to compare with as well."""
     episodes: int = 50
-    """Episodes of every way to act, with equal starts."""
+    """Episodes for each way to act, with equal starts."""
     max_steps: int = 20
-    """Frames of an episode, at most."""
+    """Largest number of frames in an episode."""
     horizon: int = 6
     """Frames that a candidate looks ahead."""
     candidates: int = 32
-    """Action sequences of a round."""
+    """Action sequences per round."""
     rounds: int = 3
-    """Rounds of a decision."""
+    """Rounds per decision."""
     elites: int = 6
-    """Best candidates that cem goes on from."""
+    """Number of best candidates that cem continues from."""
     temperature: float = 0.5
-    """Of mppi, in standard deviations of the energies."""
+    """Temperature of mppi, in standard deviations of the energies."""
     seed: int = 0
     """Seed of the candidates."""
 

@@ -13,7 +13,7 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options:
-    """Opens a page in which a person drives the robot, and the run's model dreams what follows (docs/play.md)."""
+    """Opens a page in which a person steers the robot and the run's model generates what follows (docs/play.md)."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
@@ -22,23 +22,23 @@ class Options:
     store: Path | None = None
     """The new path of the run's store of ingested clips, if it was moved."""
     split: Literal["test", "train"] = "test"
-    """The clips to begin with."""
+    """The split of the clips to start from."""
     policy: Path | None = None
     """A policy that can take over the controls, made by experiments.policy_learning."""
     host: str = "127.0.0.1"
-    """The address to listen at; any but this machine's own demands a token, which is printed with the address."""
+    """The address to listen at; any but this machine's own requires a token, which is printed with the address."""
     port: int = 8642
     """The port; 0: a free one."""
     sessions: int = 8
-    """Viewers at a time."""
+    """Largest number of viewers at a time."""
     idle_minutes: float = 10.0
     """Minutes without a message or a new frame after which a session is freed; a page in view sends messages."""
     lanes: int = 1
-    """Frames of different sessions that one pass generates: more on a GPU. Other numbers give other last bits."""
+    """Frames of different sessions generated in one pass; use more on a GPU. The number affects the last bits."""
     out: Path | None = None
     """Directory of videos and clips that viewers keep; default RUN/play."""
     browser: bool = True
-    """Open the page in a browser, where there is a display."""
+    """Open the page in a browser, if there is a display."""
 
 
 @main_errors()

@@ -15,28 +15,28 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options(Trials):
-    """Rolls policies out from the same first frames in the simulator and in world models, and compares success."""
+    """Rolls out policies from the same first frames in the simulator and in world models, and compares success."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Run directories on the same simulated clips: RoboScape, ablations, baselines."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     judge: Path | None = None
-    """Folder of the judge of all runs; default: the first run's own (experiments.judge)."""
+    """Folder of the judge for all runs; default: the first run's own (experiments.judge)."""
     policies: tuple[Path, ...] = ()
-    """Directories of trained policies to compare; default: stages of one policy's training on real demonstrations."""
+    """Directories of trained policies to compare; default: checkpoints of one policy trained on real demonstrations."""
     checkpoints: int = 8
-    """Stages of that training."""
+    """Number of checkpoints of that policy."""
     demos: int = 200
-    """Its demonstrations."""
+    """Number of demonstrations that it is trained on."""
     size: str = "tiny"
-    """Its size: public, tiny or toy."""
+    """Size of that policy: public, tiny or toy."""
     steps: int = 0
-    """Its training steps; 0: those of its size."""
+    """Training steps of that policy; 0: those of its size."""
     blind: Path | None = None
-    """Instead: write the rollouts that --out has to this new folder, for people to judge, and labels.csv to fill in."""
+    """Instead: write the rollouts in --out to this new folder for people to judge, with a labels.csv to fill in."""
     judge_with: str = ""
-    """Instead: judge those rollouts again, with human:LABELS.csv of --blind or a language model, vlm:DIRECTORY."""
+    """Instead: judge these rollouts again, with human:LABELS.csv of --blind or vlm:DIRECTORY, a language model."""
     out: Path | None = None
     """Directory of policies and results; default RUN/policy_evaluation of the first run."""
 
@@ -65,7 +65,7 @@ def main() -> None:
         place = rejudge(out, *named_judge(options.judge_with))
         print((place / "results.md").read_text(), place, sep="\n")
         return
-    for run in runs.values():  # before hours of training
+    for run in runs.values():  # checked before hours of training
         run.check_world(first)
     first.judge(judge)
     config = first.simulator

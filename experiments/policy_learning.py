@@ -21,13 +21,13 @@ class Options(Learning, Trials):
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     synthetic: Path | None = None
-    """A store of synthetic demonstrations; default: RUN/synthetic/clips, of experiments.synthesize."""
+    """A store of synthetic demonstrations; default: RUN/synthetic/clips, made by experiments.synthesize."""
     size: str = "tiny"
     """Size of the policy: public, tiny or toy."""
     steps: int = 0
     """Training steps of each policy; 0: those of its size."""
     seed: int = 0
-    """Seed of the choice of real demonstrations."""
+    """Seed for choosing real demonstrations."""
     out: Path | None = None
     """Directory of policies and results; default RUN/policy_learning."""
 

@@ -39,7 +39,7 @@ class Split:
     into: Path = Path("parts")
     """Folder for the new stores."""
     by: str = "difficulty"
-    """Column of the labels (task, difficulty, scene, segment, skill); each of its words becomes a store."""
+    """Column of the labels (task, difficulty, scene, segment, skill); each word in it becomes a store."""
     parts: int = 0
     """Split into this many stores of equal size instead."""
 
@@ -69,14 +69,14 @@ def main() -> None:
 
 
 def merge(options: Merge) -> list[Any]:
-    """Returns the merged store."""
+    """Merges the stores, and returns the new store."""
     from rsjax.data.merge import merge
 
     return [merge(options.stores, options.out)]
 
 
 def split(options: Split) -> list[Any]:
-    """Returns the parts."""
+    """Splits the store, and returns the parts."""
     from rsjax.data.merge import by_label, into_parts, split
 
     place, into = options.store, options.into
@@ -87,7 +87,7 @@ def split(options: Split) -> list[Any]:
 
 
 def tokenize(options: Tokenize) -> list[Any]:
-    """Returns the store of tokens, which lies beside the clips."""
+    """Makes the store of tokens next to the clips, and returns it."""
     tune_process()
     from rsjax.data.normalization import Normalization
     from rsjax.data.store import open_store
@@ -95,7 +95,7 @@ def tokenize(options: Tokenize) -> list[Any]:
     from rsjax.pipeline.trained import load_config, load_tokenizer
 
     config, clips = load_config(options.run), open_store(options.store)
-    assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # in the range of these clips
+    assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # normalization of these clips
     prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.train.max_damaged)
     if prepared is None:
         raise ConfigError(f"{options.run}: a model of family {config.model.family!r} has no tokens")

@@ -13,14 +13,14 @@ from rsjax.runtime import tune_process
 
 @dataclass(frozen=True)
 class Options(Synthesis):
-    """Generates videos from the first frames and actions of a data set, as a store and as LeRobotDatasets."""
+    """Generates videos from a data set's first frames and actions; writes them as a store and as LeRobotDatasets."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
     """A run directory, made by experiments.train."""
     data_dir: Path = Path("data")
     """Directory of simulated data sets."""
     store: Path | None = None
-    """A store of clips to begin with; default: the run's own."""
+    """A store of clips to start from; default: the run's own."""
     out: Path | None = None
     """Directory of the demonstrations; default RUN/synthetic."""
     judge: bool = False

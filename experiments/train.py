@@ -27,7 +27,7 @@ class Options:
     wandb: str = ""
     """Log to this Weights & Biases project as well; WANDB_MODE=offline keeps it on disk."""
     profile: int = 0
-    """Number of steps of each training stage to trace, into the stage's directory."""
+    """Number of steps of each training stage to trace; the trace is written into the stage's directory."""
     coordinator: str = ""
     """HOST:PORT of process 0 to train on several hosts; not needed with Slurm, Open MPI or TPU pods."""
     processes: int | None = None
