@@ -27,7 +27,7 @@ from rsjax.progress import Progress, note, stage
 
 @dataclass(frozen=True)
 class Improvement:
-    """How a policy is improved.
+    """The settings for improving a policy.
 
     Attributes:
         rounds: rounds of imagining and fine-tuning.

@@ -29,7 +29,7 @@ FITTED = 10  # every tenth training clip serves to fit the temperature instead
 
 @dataclass(frozen=True)
 class JudgeSettings:
-    """How a judge is trained and validated.
+    """The settings for training and validating a judge.
 
     Attributes:
         steps: training steps.

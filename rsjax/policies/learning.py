@@ -33,7 +33,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Learning:
-    """The comparison.
+    """The settings of a comparison.
 
     Attributes:
         counts: numbers of demonstrations; the paper's are 50, 100, 150, 200.

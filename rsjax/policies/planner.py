@@ -23,7 +23,7 @@ Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """How a planner searches.
+    """The settings of a planner's search.
 
     In each round it draws candidates around a mean, and moves the mean towards the good candidates.
 

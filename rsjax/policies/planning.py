@@ -36,14 +36,14 @@ from rsjax.report.video import write_mp4
 EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
 MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
-FIRST_SEED = 1_000_000  # of episodes
+FIRST_SEED = 1_000_000  # seed of the first episode
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
-VIDEOS = 3  # of each way to act
+VIDEOS = 3  # videos of each way to act
 
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """What is compared.
+    """The settings of a comparison.
 
     Attributes:
         planner: how the planner searches; its ``method`` is replaced by each of ``methods``.

@@ -125,7 +125,7 @@ def common_size(policies: Iterable[Policy]) -> int:
     """Returns the common image size of the policies in a comparison.
 
     Raises:
-        UserError: they differ.
+        UserError: the policies differ in image size.
     """
     sizes = {policy.model.image_size for policy in policies}
     if len(sizes) != 1:

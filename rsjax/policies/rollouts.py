@@ -20,7 +20,7 @@ from rsjax.policies.verdicts import SUCCESS, UNINTERPRETABLE, Judge, last_frames
 from rsjax.progress import note
 
 Acts = Callable[[UInt8[np.ndarray, "B S S 3"]], Float32[np.ndarray, "B A"]]
-FIRST_SEED = 2**31  # of the test episodes; collected data may use any seed, so few of the two coincide
+FIRST_SEED = 2**31  # of the test episodes; collected episodes have seeds from anywhere, so few coincide
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ VERSIONS: tuple[Literal["v3.0", "v2.1"], ...] = ("v3.0", "v2.1")
 
 @dataclass(frozen=True)
 class Synthesis:
-    """Which demonstrations to make.
+    """The settings of the demonstrations to make.
 
     Attributes:
         demos: how many. Beyond the number of clips, clips are used again with new noise and new draws of the model.

@@ -81,7 +81,7 @@ def try_policy(
     """Runs a policy from each start, except those whose result is in ``folder`` already.
 
     Args:
-        folder: where ``success.json``, which grows as episodes end, and a few videos are.
+        folder: the folder of ``success.json``, which grows as episodes end, and of a few videos.
         name: for the progress line.
         see: called with the number of each episode that this call runs, and the episode.
 
