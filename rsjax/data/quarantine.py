@@ -1,4 +1,4 @@
-"""Lists damaged records in one file, over all processes and restarts, and raises if they are too many to train."""
+"""Lists damaged records in one file, over all processes and restarts, and raises if there are too many."""
 
 import contextlib
 import json

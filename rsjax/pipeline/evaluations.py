@@ -38,7 +38,7 @@ NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "loss_clips", "batch_s
 
 @dataclass(frozen=True)
 class Request:
-    """How to evaluate.
+    """The settings of an evaluation.
 
     Attributes:
         protocol: the protocol's name.
