@@ -32,7 +32,7 @@ from rsjax.progress import note
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """How a run is served.
+    """The settings of the server.
 
     Attributes:
         host: the address to listen at.
