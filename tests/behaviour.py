@@ -1,9 +1,9 @@
-"""Whether the code still does bit for bit what it did when ``tests/behaviour.json`` was recorded.
+"""Checks whether the code still does bit for bit what it did when ``tests/behaviour.json`` was recorded.
 
 ``python -m tests.behaviour record`` writes the file, ``python -m tests.behaviour check`` compares with it (four minutes
-on 2 cores). Recorded are the losses of ``tiny`` over 100 steps of both training stages, the metrics of ``debug``, the
-tokens of a greedy rollout, and the bytes of a store that BridgeData was ingested into. Floating-point results differ
-between processors, so a record of another one is refused rather than compared.
+on 2 cores). The file records the losses of ``tiny`` over 100 steps of both training stages, the metrics of ``debug``,
+the tokens of a greedy rollout, and the bytes of a store into which BridgeData was ingested. Floating-point results
+differ between processors, so a record from another processor is refused, not compared.
 """
 
 import hashlib
@@ -21,11 +21,11 @@ import numpy as np
 RECORD = Path(__file__).with_suffix(".json")
 BRIDGE = Path(__file__).parents[2] / "shared" / "data" / "bridge"
 SECTIONS = ("tokenizer-train", "train")
-MEASURED = ("second", "share", "gib")  # parts of the names of scalars that measure the machine
+MEASURED = ("second", "share", "gib")  # words in the names of scalars that measure the machine, not the code's results
 
 
 def main() -> None:
-    """Records or checks."""
+    """Records the behaviour, or checks it against the record."""
     action = sys.argv[1] if len(sys.argv) > 1 else "check"
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(os.environ.get("BEHAVIOUR_DIR") or scratch)
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def machine() -> str:
-    """The processor's name and jax's version."""
+    """Returns the processor's name, its number of cores and jax's version."""
     import jax
 
     lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -57,19 +57,19 @@ def machine() -> str:
 
 
 def compare(name: str, then: Any, now: Any) -> list[str]:
-    """A line for every value that differs."""
+    """Returns a line for every value that differs."""
     if isinstance(then, dict) and isinstance(now, dict):
         return [line for key in sorted({*then, *now}) for line in compare(f"{name}/{key}", then.get(key), now.get(key))]
     return [] if then == now else [f"{name}: {then} then, {now} now"]
 
 
 def run(module: str, *arguments: str) -> None:
-    """One of the commands."""
+    """Runs one of the commands."""
     subprocess.run([sys.executable, "-m", f"experiments.{module}", *arguments], check=True)
 
 
 def curve(directory: Path) -> dict[str, dict[str, float]]:
-    """The logged scalars by step."""
+    """Returns the logged scalars by step, without those that measure the machine."""
     rows = [json.loads(line) for line in (directory / "log.jsonl").read_text().splitlines()]
     return {
         str(row["step"]): {name: value for name, value in row.items() if not any(word in name for word in MEASURED)}
@@ -78,7 +78,7 @@ def curve(directory: Path) -> dict[str, dict[str, float]]:
 
 
 def tiny(place: Path) -> dict[str, Any]:
-    """Both training curves of ``tiny`` over 100 steps, on few episodes."""
+    """Trains ``tiny`` for 100 steps per stage on few episodes, and returns both training curves."""
     short = [f"--{section}.{field}" for section in SECTIONS for field in ("steps=100", "log-every=1")]
     few = ["--sim.episodes=40", "--sim.test-episodes=4", "--eval.clips=2", "--eval.action-draws=1"]
     off = ["--tokenizer-train.eval-every=0", "--train.eval-every=0"]
@@ -87,14 +87,14 @@ def tiny(place: Path) -> dict[str, Any]:
 
 
 def debug(place: Path) -> dict[str, Any]:
-    """The metrics of ``debug``."""
+    """Runs ``debug``, and returns its metrics."""
     run("train", "debug", "--run-dir", f"{place}/debug", "--data-dir", f"{place}/data")
     metrics = json.loads((place / "debug" / "metrics.json").read_text())
     return {name: value for name, value in metrics.items() if "second" not in name}
 
 
 def tokens(place: Path) -> dict[str, str]:
-    """Digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
+    """Returns digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
     from rsjax.data.clips import Clips
     from rsjax.pipeline.run import Run
     from rsjax.pipeline.trained import load
@@ -109,7 +109,7 @@ def tokens(place: Path) -> dict[str, str]:
 
 
 def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
-    """The tokens of the videos under the clips' own actions."""
+    """Returns the tokens of the videos generated under the clips' own actions."""
     import jax
 
     from rsjax.models.roboscape.rollout import rollout
@@ -126,7 +126,7 @@ def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
 
 
 def bridge(place: Path) -> dict[str, str] | None:
-    """Digests of the files of clips that BridgeData is ingested into; None where it is not there."""
+    """Ingests BridgeData, and returns digests of the files of clips; None if the data set is missing."""
     if not BRIDGE.exists():
         return None
     out = place / "bridge"

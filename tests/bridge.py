@@ -1,4 +1,4 @@
-"""Real episodes (25 of BridgeData V2) that lie beside some checkouts."""
+"""The path of real episodes (25 of BridgeData V2), which lie next to some checkouts, and a mark for their tests."""
 
 from pathlib import Path
 

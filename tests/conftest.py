@@ -1,4 +1,4 @@
-"""Settings that have to stand before jax is loaded, here and in the processes that tests start."""
+"""Settings that must be made before jax is loaded, here and in the processes that tests start; shared fixtures."""
 
 import importlib.util
 import os
@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, settings
 
 from rsjax.runtime import set_xla_flags
 
-# The tests compile thousands of small programs and run each a few times: compiling is most of their time. Without
-# LLVM's optimisations it takes half, without the fusion emitters (which write more code) a quarter less again. How fast
-# programs run is for benchmarks.
+# The tests compile thousands of small programs and run each a few times, so most of their time is compilation. Without
+# LLVM's optimisations, compilation takes half the time; without the fusion emitters, which produce more code, it takes
+# another quarter less. The speed of the compiled programs matters only for benchmarks.
 FLAGS = {"--xla_backend_optimization_level": "0", "--xla_cpu_use_fusion_emitters": "false"}
 for flag, value in FLAGS.items():
     if flag not in os.environ.get("XLA_FLAGS", ""):
@@ -24,9 +24,9 @@ for flag, value in FLAGS.items():
 
 set_xla_flags()  # as every command does
 
-# What one process compiles, the others (pytest's workers, the commands that tests start) load. The directory lasts as
-# long as the session: name one in JAX_COMPILATION_CACHE_DIR to keep it. Reading it changes no result: a program is the
-# same whether it was compiled or loaded.
+# Programs that one process compiles are loaded by the others (pytest's workers, the commands that tests start). The
+# directory is deleted at the end of the session; to keep one, name it in JAX_COMPILATION_CACHE_DIR. The cache changes
+# no result: a program is the same whether it was compiled or loaded.
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 made = "" if CACHE in os.environ else tempfile.mkdtemp(prefix="rsjax-tests-")
 os.environ.setdefault(CACHE, made)
@@ -38,21 +38,21 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(made, ignore_errors=True)
 
 
-# A shell's background job ignores Ctrl-C, and so would the commands that tests start and interrupt.
+# A background job of a shell ignores Ctrl-C, and so would the commands that the tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A machine that is busy with something else fails no test.
+# Tests must not fail because the machine is busy with something else.
 settings.register_profile("any-speed", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any-speed")
 
-# Directories whose tests take longest. They come first, so that no worker is left with one of them at the end.
+# Directories whose tests take longest. They run first, so that no worker still has one of them left at the end.
 LONGEST = ("reliability", "pipeline", "ablation", "models", "training")
 
 
 @pytest.fixture
 def bf16_units(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Takes the bf16 products on processors without units for them too."""
+    """Makes processors without bf16 units compute products in bf16 as well."""
     monkeypatch.setattr("rsjax.matmul.has_bf16_units", lambda: True)
 
 
@@ -64,7 +64,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Gives each file to one worker, which then compiles the programs that its tests share once."""
+    """Gives each file to one worker, which then compiles the programs that the file's tests share only once."""
     from xdist.scheduler import LoadFileScheduling
 
     config.option.loadscopereorder = False
@@ -72,10 +72,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def _operators() -> object:
-    """Lets a torchvision that was built for CUDA be imported beside a torch without.
+    """Makes a torchvision that was built for CUDA importable with a torch that was built without it.
 
-    Its compiled part does not load there, and the import then wants these two operators declared. RAFT and image
-    processors are plain Python and call neither. Beside its own torch nothing is needed.
+    With such a torch, torchvision's compiled part does not load, and its import then needs these two operators to be
+    declared. RAFT and the image processors are plain Python and call neither. With a matching torch, nothing is done.
     """
     if not (importlib.util.find_spec("torch") and importlib.util.find_spec("torchvision")):
         return None
@@ -93,12 +93,12 @@ def _operators() -> object:
     return None
 
 
-_OPERATORS = _operators()  # undeclared again when it is deleted
+_OPERATORS = _operators()  # kept, because the operators exist only as long as this object
 
 
 @pytest.fixture(scope="session")
 def gl() -> str:
-    """Skips a test that renders where nothing can."""
+    """Returns the way to render without a screen; skips the test on a machine that cannot render."""
     from rsjax.sim.gl import GLError, choose_gl
 
     try:
@@ -109,9 +109,9 @@ def gl() -> str:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A headless Chromium, steered by Playwright; skips where either is missing (make extras installs both).
+    """Yields a headless Chromium, controlled by Playwright; skips if either is missing (make extras installs both).
 
-    Until it is closed, an event loop runs in this thread, and others (Ray's) cannot.
+    Until the browser is closed, an event loop runs in this thread, so other event loops (Ray's) cannot run.
     """
     api = pytest.importorskip("playwright.sync_api")
     path = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")

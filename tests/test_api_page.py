@@ -1,4 +1,4 @@
-"""The code blocks of docs/api.md run, in order, on an untrained model."""
+"""Runs the code blocks of docs/api.md in order on an untrained model."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Bad input to every command: each ends in one clear line and an exit status, without a traceback."""
+"""Gives bad input to every command: each must end with one clear line and an exit status, without a traceback."""
 
 import importlib
 import json
@@ -32,8 +32,8 @@ Command = Callable[..., Answer]
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs a command's main function as its module would; anything but its end or an exit fails the test."""
-    monkeypatch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # else the process would start over
+    """Returns a function that runs a command's main as its module does; an error that is no exit fails the test."""
+    monkeypatch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # otherwise the process would restart itself
     monkeypatch.setattr("rsjax.pipeline.stages._do", lambda run, name, work: None)  # nothing is trained
 
     def call(line: str, *arguments: object) -> Answer:
@@ -51,17 +51,17 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 def assert_clear(answer: Answer, *words: str) -> None:
-    """The command was refused in one line, which has these words."""
+    """Asserts that the command was refused with one line of error that contains these words."""
     status, _, errors = answer
     assert status == 2, answer
-    (line,) = [line for line in errors.splitlines() if not line.startswith("[")]  # notes of progress have a time
+    (line,) = [line for line in errors.splitlines() if not line.startswith("[")]  # notes of progress begin with a time
     assert line.startswith("error: "), answer
     assert all(word in line for word in words), answer
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a store of clips and a run on it whose stages are all marked as finished."""
+    """Returns a folder with a store of clips and a run on it whose stages are all marked as finished."""
     place = tmp_path_factory.mktemp("whole")
     store = toy.store(place / "store")
     config, _ = parse(["debug", "--store", str(place / "store")], "", "", Options())
@@ -96,7 +96,7 @@ def edit(path: Path, **fields: Any) -> None:
 
 @pytest.fixture
 def place(whole: Path, tmp_path: Path) -> Path:
-    """A copy to damage; its run knows the store by its path in the original."""
+    """Returns a copy that a test can damage; its run refers to the store by the path in the original folder."""
     return shutil.copytree(whole, tmp_path / "copy", symlinks=True)
 
 
@@ -130,7 +130,7 @@ WHOLE_FILES = {
     "UTF-16": b"\xff\xfe{\x00}\x00",
     "a directory": None,
 }
-FILES = {  # of a run and a store: which commands read them, and which of these refuse a damaged one
+FILES = {  # files of a run and a store: the commands that read them, and those of them that refuse a damaged file
     "run/config.json": ("train generate replay", "generate replay"),
     "run/run.json": ("train", "train"),
     "run/tokens/units.json": ("train generate", "generate"),
@@ -171,7 +171,7 @@ def test_a_field_of_another_type_brings_no_traceback(file: str, place: Path, com
             path.write_text(json.dumps(content))
             readers = FILES[file][0].split()
             answer = command(filled(LINES[readers[number % len(readers)]], place))
-            if answer[0] not in (0, 1):  # with 1, inspect and doctor report damage in words of their own
+            if answer[0] not in (0, 1):  # with status 1, inspect and doctor report damage in their own words
                 assert_clear(answer)
 
 
@@ -283,7 +283,7 @@ REFUSED = {
 
 
 def with_variable(line: str, name: str, value: str) -> Answer:
-    """Runs a command in a process of its own, with a variable of the environment."""
+    """Runs a command in a separate process with an environment variable set."""
     command = [sys.executable, "-m", *f"experiments.{line}".split()]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {name: value}, capture_output=True, text=True)
     return done.returncode, done.stdout, done.stderr

@@ -1,4 +1,4 @@
-"""Commands: presets, overrides, options, and one clear line for what cannot run."""
+"""Tests the parsing of commands: presets, overrides, options, and one clear line for what cannot run."""
 
 import dataclasses
 import errno
@@ -43,7 +43,7 @@ def message(*argv: str) -> str:
 
 
 def numbers(part: Any, prefix: str = "--") -> list[tuple[str, str]]:
-    """(flag, value) of each number and truth value within ``part``."""
+    """Returns (flag, value) for each number and truth value within ``part``."""
     flags: list[tuple[str, str]] = []
     for field in dataclasses.fields(part):
         value, flag = getattr(part, field.name), prefix + field.name

@@ -1,4 +1,4 @@
-"""Commands that are stopped: one line and an exit status, whatever the main thread is doing."""
+"""Tests that a stopped command ends with one line and an exit status, whatever the main thread is doing."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from rsjax.command import UNREAD
 from rsjax.runtime import ANSWERS, INTERRUPTED, TERMINATED
 
 ROOT = Path(__file__).parents[1]
-# Prints "ready" and then runs the lines of its argument, within a command.
+# A command that runs the lines of its argument, which print "ready" when the signal may come.
 PROGRAM = """
 import ctypes, os, signal, sys, time
 from rsjax import runtime
@@ -82,7 +82,7 @@ said(wait)
 
 
 def stopped(lines: str, number: int, again: bool = False) -> tuple[int, str]:
-    """Sends a signal to the program, or several until it ends; returns its exit status and last line of errors."""
+    """Sends a signal to the program, once or until it ends; returns its exit status and last line of errors."""
     line = [sys.executable, "-c", PROGRAM, lines]
     with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

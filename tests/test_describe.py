@@ -1,4 +1,4 @@
-"""Figures from shapes are those of arrays."""
+"""Tests that the figures computed from shapes equal those of real arrays."""
 
 import io
 import json
@@ -74,7 +74,7 @@ def test_the_cache_has_the_bytes_of_a_real_one() -> None:
 
 
 def kept_for(clips: int) -> int:
-    """Bytes of all that the loss's backward pass holds on a batch of so many clips."""
+    """Returns the bytes that the loss's backward pass holds for a batch of ``clips`` clips."""
     model, frames = create_model(DEBUG), DEBUG.clips.frames
     tokens = jnp.zeros((clips, frames, DEBUG.grid, DEBUG.grid), jnp.int32)
     tracks = (clips, DEBUG.clips.tracks, frames)

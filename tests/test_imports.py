@@ -1,11 +1,11 @@
-"""Imports point one way along the package's folders, and no module imports itself through others."""
+"""Tests that imports point one way along the package's folders, and that no module imports itself through others."""
 
 import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# A folder or module imports only from those before it, and from its own.
+# A folder or module imports only from itself and from those before it in this list.
 ORDER = [
     "errors",
     "progress",
@@ -45,7 +45,7 @@ def modules() -> dict[str, Path]:
 
 
 def imported(path: Path, known: dict[str, Path]) -> set[str]:
-    """The package's modules that a file imports, anywhere in it."""
+    """Returns the package's modules that a file imports anywhere in its code."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -59,7 +59,7 @@ def imported(path: Path, known: dict[str, Path]) -> set[str]:
 def test_imports_point_one_way_and_never_round() -> None:
     known = modules()
     edges = {name: imported(path, known) - {name} for name, path in known.items() if name != "rsjax"}
-    tuple(TopologicalSorter(edges).static_order())  # raises CycleError, which names the circle
+    tuple(TopologicalSorter(edges).static_order())  # raises CycleError, which names the cycle, if there is one
     wrong = []
     for name, targets in edges.items():
         for target in targets:

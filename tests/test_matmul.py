@@ -16,7 +16,7 @@ def products(x: jax.Array, w: jax.Array, cotangent: jax.Array) -> tuple[jax.Arra
     return out, *pull(cotangent)
 
 
-@pytest.mark.parametrize("widths", [(33, 5), (5, 33)])  # the weight gradient turns the narrower operand
+@pytest.mark.parametrize("widths", [(33, 5), (5, 33)])  # the weight gradient transposes the narrower operand
 def test_products_and_gradients_are_those_of_rounded_operands(widths: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     x, w, cotangent = (rng.normal(size=shape).astype(np.float32) for shape in ((7, widths[0]), widths, (7, widths[1])))

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 
 class Square:
-    """Squares numbers, leaving a line in a log for each; some of them kill or fail their worker."""
+    """Squares numbers, and writes a line to a log for each; some numbers kill their worker or raise an error."""
 
     def __init__(self, log: Path, deadly: tuple[int, ...] = (), once: int = -1, bad: int = -1, wrong: int = -1) -> None:
         self.log, self.deadly, self.once, self.bad, self.wrong = log, deadly, once, bad, wrong
@@ -34,13 +34,13 @@ class Square:
             raise ValueError("no such number")
         if number == self.wrong:
             raise UserError("number 7: too odd; take another")
-        os.kill(os.getpid(), signal.SIGTERM)  # as a scheduler may send to all processes: the parent answers it
+        os.kill(os.getpid(), signal.SIGTERM)  # a scheduler may send it to all processes; only the parent answers it
         os.kill(os.getpid(), signal.SIGINT)
         return number * number
 
 
 class Forking:
-    """Leaves a child behind, which has all that the worker had open, and is killed."""
+    """Starts a child that inherits all that the worker has open, and then kills the worker."""
 
     def __init__(self, pids: Path) -> None:
         self.pids = pids
@@ -64,7 +64,7 @@ def lines(log: Path) -> list[str]:
 def squares(
     log: Path, count: int, workers: int, settled: Callable[[], None] = lambda: None, **options: Any
 ) -> dict[int, int | WorkerDied]:
-    """Squares the numbers below ``count``; ``settled`` is called after each."""
+    """Squares the numbers below ``count``, and calls ``settled`` after each."""
     results: dict[int, int | WorkerDied] = {}
 
     def settle(number: int, square: int | WorkerDied) -> None:
@@ -175,7 +175,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("when", ["starting", "loading", "working"])
 def test_a_killed_parent_takes_its_workers_along(tmp_path: Path, when: str) -> None:
-    """Killed at once, when a worker reads what it is to do, or when it does that."""
+    """The parent is killed at once, while a worker loads its task, or while it works on it."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     line = [sys.executable, str(program), str(tmp_path), when]

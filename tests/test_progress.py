@@ -1,4 +1,4 @@
-"""Progress: how often lines appear, and whether their rates and times left are right."""
+"""Tests how often lines of progress appear, and whether their rates and remaining times are right."""
 
 import io
 
@@ -31,7 +31,7 @@ class Counted:
 def run(
     steps: list[tuple[float, int]], total: int, start: int = 0, terminal: bool = False, settle: int = 0
 ) -> list[str]:
-    """Returns the lines after a series of (seconds since the last, done) updates."""
+    """Returns the lines that appear during a series of updates, each (seconds since the last update, done)."""
     shown, clock = io.StringIO(), Clock()
     console = Console(file=shown, force_terminal=terminal, width=200)
     with Progress("train", total, "steps", start, console, clock, settle=settle) as progress:
@@ -73,7 +73,7 @@ def test_plain_lines_are_at_least_ten_seconds_apart(waits: list[float]) -> None:
         now += wait
         if now - last >= PLAIN_SECONDS:
             due, last = due + 1, now
-    # Sums of floats around the limit may fall either way.
+    # Sums of floats near the limit may fall on either side of it.
     assert abs(len(lines) - 1 - due) <= 1
     assert len(lines) - 1 <= now / PLAIN_SECONDS + 1e-6
 

@@ -9,7 +9,7 @@ from rsjax import runtime
 from rsjax.runtime import HUGE_PAGES, YNNPACK, set_xla_flags, tune_process
 
 ROOT = Path(__file__).parents[1]
-# Prints its tunables and arguments, and appends its process id to a file at each start.
+# A program that prints its tunables and arguments, and appends its process id to a file at each start.
 PROGRAM = """
 import os, sys
 open(sys.argv[1], "a").write(f"{os.getpid()} ")
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="tu
 
 
 def run(starts: Path, tunables: str | None, *arguments: str) -> tuple[list[str], list[str]]:
-    """Returns the lines that the program printed and the process id of each of its starts."""
+    """Runs the program; returns the lines that it printed and the process id of each of its starts."""
     environment = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
     environment |= {"GLIBC_TUNABLES": tunables} if tunables is not None else {}
     line = [sys.executable, "-X", "dev", "-c", PROGRAM, str(starts), *arguments]
@@ -73,7 +73,7 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
         ("flags : fma avx512f", "x86_64", "0.10.2", f"{YNNPACK}=X", f"{YNNPACK}=X"),
         ("flags : fma avx512f avx512_bf16", "x86_64", "0.10.2", "", ""),
         ("Features : asimd", "aarch64", "0.10.2", "", ""),
-        ("flags : fma avx512f", "x86_64", "0.99.0", "", ""),  # which may not know the flag
+        ("flags : fma avx512f", "x86_64", "0.99.0", "", ""),  # a later jaxlib may not know the flag
     ],
     ids=["none", "added", "chosen by the user", "bf16 units", "Arm", "a later jaxlib"],
 )
