@@ -1,1 +1,1 @@
-"""What is computed from recordings: shots, motion, depth, keypoint tracks and semantics."""
+"""Annotators, which compute shots, motion, depth, keypoint tracks and semantics from recordings."""

@@ -6,23 +6,23 @@ from dataclasses import dataclass
 from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError
 
-Table = tuple[tuple[str, str], ...]  # pattern (a shell's, any case) and label; the first match counts
+Table = tuple[tuple[str, str], ...]  # shell pattern (case is ignored) and label; the first match counts
 
 
 @dataclass(frozen=True)
 class CategoryConfig:
-    """The tables. Like the paper, they sort whole tasks into simple and difficult by hand.
+    """The tables of patterns. Difficulty is a label of whole tasks, chosen by hand, as in the paper.
 
     Attributes:
         difficulties: matched against the task's text, then against a segment's text and its skill.
-        scenes: matched against the episode's description of its scene; without a table that is the label itself.
+        scenes: matched against the episode's description of its scene; without a table the description is the label.
     """
 
     difficulties: Table = ()
     scenes: Table = ()
 
     def difficulty(self, task: str, segment: str = "", skill: str = "") -> str:
-        """Returns the label of a clip with this task, in this segment; ``unknown`` where no pattern matches."""
+        """Returns the difficulty of a clip with this task, in this segment; ``unknown`` if no pattern matches."""
         labels = (look_up(self.difficulties, text) for text in (task, segment, skill))
         return next((label for label in labels if label != UNKNOWN), UNKNOWN)
 
@@ -32,7 +32,7 @@ class CategoryConfig:
 
 
 def look_up(table: Table, text: str) -> str:
-    """Returns the label of the first pattern that matches the text in any case; ``unknown`` where none does."""
+    """Returns the label of the first pattern that matches the text, ignoring case; ``unknown`` if none does."""
     matching = (label for pattern, label in table if fnmatch.fnmatchcase(text.lower(), pattern.lower()))
     return next(matching, UNKNOWN)
 
@@ -41,7 +41,7 @@ def parse_table(field: str, rows: tuple[str, ...]) -> Table:
     """Parses rows such as ``pick*=simple``.
 
     Args:
-        field: the option's name, for the message.
+        field: the option's name, for the error message.
 
     Raises:
         ConfigError: a row is not of this form.

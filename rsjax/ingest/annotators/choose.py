@@ -1,4 +1,4 @@
-"""Parses a stage's method from one word of a command line: ``lucas-kanade``, ``lucas-kanade:grid=32``, ``none``.
+"""Parses a step's method from one word of a command line: ``lucas-kanade``, ``lucas-kanade:grid=32``, ``none``.
 
 Networks take the paths of their files: ``bootstapir:checkout=/opt/tapnet,weights=bootstapir_checkpoint_v2.pt``.
 """
@@ -15,7 +15,7 @@ from rsjax.ingest.annotate import Annotators
 from rsjax.ingest.annotators.depth import RecordedDepth
 
 NONE = "none"
-METHODS = {  # module and class in this package, by stage and the method's name
+METHODS = {  # step → method's name → module and class in this package
     "shots": {"hsv-histogram": "shots:HistogramShots", "transnetv2": "networks.shots:TransNetShots"},
     "motion": {"dis": "motion:DISFlow", "raft": "networks.motion:RaftFlow"},
     "depth": {
@@ -33,10 +33,10 @@ METHODS = {  # module and class in this package, by stage and the method's name
 
 
 def choose_annotators(words: dict[str, str]) -> Annotators:
-    """Returns the methods that the words choose, one for each stage.
+    """Returns the methods that the words choose, one for each step.
 
     Raises:
-        ConfigError: no such stage, method or field, or a value that does not fit.
+        ConfigError: there is no such step, method or field, or a value does not fit.
     """
     chosen = {stage: choose(stage, word) for stage, word in words.items()}
     if isinstance(chosen.get("depth"), RecordedDepth):
@@ -45,7 +45,7 @@ def choose_annotators(words: dict[str, str]) -> Annotators:
 
 
 def choose_recorded(word: str) -> RecordedDepth | None:
-    """Returns how recorded depth is read beside this depth method; None where ``none`` turns depth off."""
+    """Returns how recorded depth is read with this depth method; None if ``none`` turns depth off."""
     chosen = choose("depth", word)
     return chosen if chosen is None or isinstance(chosen, RecordedDepth) else RecordedDepth()
 

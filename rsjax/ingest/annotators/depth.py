@@ -1,9 +1,9 @@
-"""Stage "depth": recorded depth with its holes filled, and the form that networks' depth takes.
+"""Step "depth": fills the holes of recorded depth, and converts the depth that networks estimate.
 
 Depth that a network estimates from pictures is mostly relative: 1/depth up to an unknown scale and shift. It is
-stretched per video so that the nearest point is 1 and the farthest ``RELATIVE_FAR``, without a unit. The "inverse"
-colour map over [1, RELATIVE_FAR] then has even steps in the network's output, and ``DepthMaps.extent`` undoes the
-stretching.
+stretched for each video so that the nearest point is 1 and the farthest is ``RELATIVE_FAR``, without a unit. The
+"inverse" colour map over [1, RELATIVE_FAR] then has even steps in the network's output, and ``DepthMaps.extent`` makes
+it possible to undo the stretching.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,10 @@ _NEAR_SHARE = 1 / RELATIVE_FAR  # 1/depth of the farthest point, relative to the
 
 @dataclass(frozen=True)
 class RecordedDepth:
-    """Settings of the episode's own depth, in metres. It needs no stage: clips read it as they are cut.
+    """Settings for an episode's recorded depth, in metres. It needs no step: clips read it when they are cut.
 
     Attributes:
-        most_holes: greatest share of a frame that may be unmeasured.
+        most_holes: largest share of a frame that may be unmeasured.
     """
 
     name: ClassVar[str] = "recorded"
@@ -35,12 +35,12 @@ class RecordedDepth:
 
 @dataclass(frozen=True)
 class FilledDepths:
-    """Recorded depth maps whose holes are filled, from the nearest measured pixel, as they are read.
+    """Recorded depth maps whose holes are filled from the nearest measured pixel when they are read.
 
     Attributes:
         maps: as recorded; 0 or not finite where nothing was measured.
         most_holes: see :class:`RecordedDepth`.
-        where: the maps' name in messages.
+        where: the maps' name in error messages.
     """
 
     maps: Depths
@@ -51,7 +51,7 @@ class FilledDepths:
         return len(self.maps)
 
     def read(self, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:
-        """Reads these maps; raises :class:`EpisodeError` where too much of a frame is unmeasured."""
+        """Reads these maps; raises :class:`EpisodeError` if too much of a frame is unmeasured."""
         maps = self.maps.read(indices)
         holes = ~(np.isfinite(maps) & (maps > 0))
         for index, share in zip(indices, holes.mean((1, 2)), strict=True):
@@ -64,7 +64,7 @@ class FilledDepths:
 
 
 def fill_holes(depth: Float32[np.ndarray, "H W"], holes: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """Fills each hole (``holes`` is True) from the nearest measured pixel; at least one has to be measured."""
+    """Fills each hole (``holes`` is True) from the nearest measured pixel; at least one must be measured."""
     _, nearest = cv2.distanceTransformWithLabels(
         holes.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -76,7 +76,7 @@ def fill_holes(depth: Float32[np.ndarray, "H W"], holes: Bool[np.ndarray, "H W"]
 
 @dataclass(frozen=True)
 class ConvertedDepths:
-    """A network's maps, converted as they are read, so that memory holds the video once."""
+    """A network's maps, converted when they are read, so that memory holds the video only once."""
 
     maps: Float32[np.ndarray, "N H W"]
     convert: Callable[[Float32[np.ndarray, "n H W"]], Float32[np.ndarray, "n H W"]]
@@ -89,7 +89,7 @@ class ConvertedDepths:
 
 
 def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
-    """Stretches a whole video's 1/depth, known up to scale and shift, to :class:`DepthMaps` of unit "relative".
+    """Stretches a whole video's 1/depth, known up to scale and shift, to :class:`DepthMaps` in the unit "relative".
 
     Raises:
         ValueError: a value is not finite.
@@ -115,7 +115,7 @@ def inverse_of(maps: DepthMaps, indices: Sequence[int]) -> Float32[np.ndarray, "
 
 
 def metric_depth(depth: Float32[np.ndarray, "N H W"]) -> DepthMaps:
-    """Wraps a network's depth in metres; values below a millimetre, also behind the camera, become a millimetre.
+    """Wraps a network's depth in metres; values below a millimetre, even negative ones, become a millimetre.
 
     Raises:
         ValueError: a value is not finite.
@@ -127,7 +127,7 @@ def metric_depth(depth: Float32[np.ndarray, "N H W"]) -> DepthMaps:
 
 
 def _extent(maps: Float32[np.ndarray, "N H W"]) -> tuple[float, float]:
-    """Returns the least and greatest value; raises :class:`ValueError` where one is not finite."""
+    """Returns the least and the greatest value; raises :class:`ValueError` if one is not finite."""
     low, high = np.inf, -np.inf
     for start in range(0, len(maps), CHUNK):
         chunk = maps[start : start + CHUNK]

@@ -1,4 +1,4 @@
-"""Stage "motion": how much moves in each frame. Without weights: dense inverse search (DIS) optical flow.
+"""Step "motion": measures the motion in each frame. Without weights: dense inverse search (DIS) optical flow.
 
 The camera's own motion counts too. :mod:`rsjax.ingest.windows` filters by these values.
 """
@@ -15,8 +15,8 @@ from rsjax.config import require
 from rsjax.ingest.annotators.protocols import Annotator, FlowEstimator, Motion, Pictures, in_chunks
 from rsjax.ingest.episode import Frames
 
-WIDTH = 256  # of the picture that motion is scaled to; wider pictures are shrunk before it is measured
-_LEAST = 32  # pixels of a side, below which DIS has no pyramid
+WIDTH = 256  # of the picture that motion is scaled to; wider pictures are shrunk before the measurement
+_LEAST = 32  # pixels per side; for smaller pictures DIS has no pyramid
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
     """Measures the motion that leads into each frame.
 
     Args:
-        frames: of one camera.
+        frames: the frames of one camera.
         timestamps: seconds, increasing; as many as frames.
-        flow: the method.
+        flow: the optical-flow method.
     """
     mean, high = np.zeros((2, len(frames)), np.float32)
     for start, pictures in in_chunks(frames, overlap=1):

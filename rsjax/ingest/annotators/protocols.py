@@ -1,4 +1,4 @@
-"""The interface of the five annotation stages: what their methods take and return, and the base class of all methods.
+"""The interface of the five annotation steps: what their methods take and return, and the base class of all methods.
 
 Axes: N frames of an episode, T frames of a part of it, H×W pixels, P points.
 """
@@ -18,23 +18,23 @@ from rsjax.ingest.episode import Depths, Episode, Frames, fingerprint
 
 DepthUnit = Literal["metres", "relative"]
 Pictures = UInt8[np.ndarray, "T H W 3"]
-CHUNK = 32  # frames in memory at a time, where a stage needs no more
+CHUNK = 32  # frames in memory at a time, unless a step needs more
 
 
 class AnnotationError(UserError):
-    """An annotator cannot run at all, or not on this episode. The message names what is missing and the cure."""
+    """An annotator cannot run, either at all or on this episode. The message names what is missing and the cure."""
 
 
 @dataclass(frozen=True)
 class Annotator:
     """Base class of every method. Its fields are its parameters; whole numbers among them are checked.
 
-    Instances can be pickled: a network loads at its first call, in the process that calls it.
+    Instances can be pickled: a network is loaded at its first call, in the process that calls it.
 
     Attributes:
-        name: the method's, unique and a valid file name.
-        version: rises when the same parameters give another output.
-        least: least value of a whole-number field, where that is not 1.
+        name: the method's name, unique and a valid file name.
+        version: to be raised when the same parameters give another output.
+        least: least value of each whole-number field for which it is not 1.
     """
 
     name: ClassVar[str]
@@ -51,11 +51,11 @@ class Annotator:
         """Loads the network now instead of at the first call; methods without one do nothing.
 
         Raises:
-            AnnotationError: it cannot run here: a package, a file or a device is missing.
+            AnnotationError: the method cannot run here, because a package, a file or a device is missing.
         """
 
     def params(self) -> dict[str, Any]:
-        """Returns all that the output depends on, JSON-ready: files by content, not by path, and no device."""
+        """Returns all that the output depends on, JSON-ready: files by content and not by path; no device."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "device"}
         by_content = {name: _digest(value) if isinstance(value, Path) else value for name, value in values.items()}
         return {"name": self.name, "version": self.version} | by_content
@@ -87,8 +87,8 @@ class Motion:
     """Optical flow in pixels per second, scaled to a picture 256 pixels wide. Row t is from frame t-1; row 0 is 0.
 
     Attributes:
-        mean: over all pixels.
-        high: 95th percentile; a small moving object shows here and hardly in the mean.
+        mean: mean over all pixels.
+        high: 95th percentile; a small moving object shows here, but hardly in the mean.
     """
 
     mean: Float32[np.ndarray, " N"]
@@ -103,7 +103,7 @@ class DepthMaps:
         maps: > 0 along the optical axis; see ``unit``.
         unit: "metres", or "relative": 1 for the video's nearest point and ``depth.RELATIVE_FAR`` for its farthest,
             evenly spaced in 1/depth; correct up to an unknown scale and shift of 1/depth.
-        extent: the video's least and greatest value in the network's own output (metres; 1/depth where relative).
+        extent: the video's least and greatest value in the network's own output (metres; 1/depth if relative).
     """
 
     maps: Depths
@@ -118,7 +118,7 @@ class Semantic:
     Attributes:
         start: first frame.
         end: the frame after the last.
-        text: the action; "" where unknown.
+        text: the action; "" if unknown.
         skill: one word for the kind of action, or "".
         key_frames: frames of the episode in which the action is decided, increasing; may be empty.
         text_by: origin of the text: "segment", "task", "" (none) or the network's name.
@@ -139,9 +139,9 @@ class Semantics:
     """What an episode is about.
 
     Attributes:
-        task: of the whole episode; "" where unknown.
-        scene: description of the place; "" where unknown.
-        parts: in order.
+        task: the task of the whole episode; "" if unknown.
+        scene: description of the place; "" if unknown.
+        parts: the episode's parts, in order.
     """
 
     task: str
@@ -149,25 +149,25 @@ class Semantics:
     parts: tuple[Semantic, ...]
 
 
-# What each stage calls. Any of them raises AnnotationError where it cannot run, and EpisodeError for unreadable frames.
+# What each step calls. Each raises AnnotationError if it cannot run, and EpisodeError for unreadable frames.
 
-# "shots": the first frame of each shot and the one after its last, in order, covering all frames.
+# "shots": returns the first frame of each shot and the one after its last, in order, covering all frames.
 ShotDetector = Callable[[Frames], list[tuple[int, int]]]
-# "motion": how far right and down each pixel of the first pictures has moved in the second ones, in pixels.
+# "motion": returns how far right and down each pixel of the first pictures has moved in the second ones, in pixels.
 FlowEstimator = Callable[[Pictures, Pictures], Float32[np.ndarray, "T H W 2"]]
-# "depth": the depth of an episode's camera, by name.
+# "depth": takes an episode and a camera's name.
 DepthEstimator = Callable[[Episode, str], DepthMaps]
-# "tracks": points all over the frames of one shot, with new ones where none is left; some methods need the depth.
+# "tracks": follows points all over the frames of one shot, with new points where none is left; some need the depth.
 Tracker = Callable[[Frames, Depths | None], Tracked]
-# "semantics": of an episode; a network looks at the camera; key frames use the camera's ``Motion.high``, if measured.
+# "semantics": takes an episode, the camera that a network sees, and its ``Motion.high``, if measured, for key frames.
 SemanticsAnnotator = Callable[[Episode, str, Float[np.ndarray, " N"] | None], Semantics]
 
 
 def in_chunks(frames: Frames, overlap: int = 0, size: int = CHUNK) -> Iterator[tuple[int, Pictures]]:
-    """Yields all frames, a few at a time: the first one's number, and the pictures.
+    """Yields all frames, a few at a time: the number of the first one, and the pictures.
 
     Args:
-        overlap: pictures that each chunk shares with the one before, < ``size``.
+        overlap: pictures that each chunk shares with the previous one, < ``size``.
     """
     for start in range(0, max(len(frames) - overlap, 1), size - overlap):
         indices = range(start, min(start + size, len(frames)))

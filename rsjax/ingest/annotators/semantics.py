@@ -1,7 +1,7 @@
-"""Stage "semantics": the text and key frames of each part. Without weights: the data set's own text.
+"""Step "semantics": the text and key frames of each part. Without weights: the data set's own text.
 
-Key frames are where a gripper opens or closes; without such a change, or without a known gripper, the frame in which
-most moves.
+Key frames are those in which a gripper opens or closes; without such a change or a known gripper, the frame with most
+motion.
 """
 
 from dataclasses import dataclass
@@ -41,11 +41,11 @@ class OwnSemantics(Annotator):
 def key_frames(
     segment: Segment, changes: list[int], motion: Float[np.ndarray, " N"] | None, smooth: int
 ) -> tuple[tuple[int, ...], str]:
-    """Returns a segment's key frames and their origin: "gripper", "motion" or, where nothing moves, "".
+    """Returns a segment's key frames and their origin: "gripper", "motion" or, if nothing moves, "".
 
     Args:
         changes: frames of the episode at which a gripper opens or closes.
-        motion: into each frame of the episode; None where it was not measured.
+        motion: motion into each frame of the episode; None if it was not measured.
         smooth: frames over which motion is averaged.
     """
     if inside := tuple(t for t in changes if segment.start <= t < segment.end):
@@ -60,10 +60,10 @@ def key_frames(
 def gripper_changes(episode: Episode, least: float) -> list[int]:
     """Returns the frames in which a gripper begins to open or close.
 
-    That is where its command passes from the lower third of its range to the upper one, or back.
+    There, its command passes from the lower third of its range to the upper third, or back.
 
     Args:
-        episode: its ``meta["actions"]`` lists the dimensions of grippers' commands; none where it does not.
+        episode: its ``meta["actions"]`` lists the dimensions of gripper commands; without such a list it has none.
         least: a command that moves less than this over the whole episode is ignored.
     """
     changes = set[int]()
@@ -72,7 +72,7 @@ def gripper_changes(episode: Episode, least: float) -> list[int]:
         if not len(command) or np.ptp(command) < least:
             continue
         position = (command - command.min()) / np.ptp(command)
-        sure = np.flatnonzero((position < 1 / 3) | (position > 2 / 3))  # between the thirds the last state holds
+        sure = np.flatnonzero((position < 1 / 3) | (position > 2 / 3))  # between these thirds the last state holds
         closed = position[sure] > 0.5
         changes.update((sure[1:][closed[1:] != closed[:-1]] + 1).tolist())
     return sorted(changes)

@@ -1,6 +1,6 @@
-"""Stage "shots": where a video was cut. Without weights: a jump of the colour histogram.
+"""Step "shots": finds where a video was cut. Without weights: by jumps of the colour histogram.
 
-It detects hard cuts only. A teleoperated episode has none, so a detected cut deserves a look.
+It detects hard cuts only. A teleoperated episode has none, so a detected cut should be inspected.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ _SIDE = 96  # pixels; pictures are shrunk to this longer side for their histogra
 
 @dataclass(frozen=True)
 class HistogramShots(Annotator):
-    """Cuts where the HSV histogram changes by more than ``threshold``, and much more than around it.
+    """Cuts where the HSV histogram changes by more than ``threshold``, and much more than in neighbouring frames.
 
     Attributes:
         threshold: share of the pixels that change their bin, 0–1.
-        prominence: how many times the greatest change of the ``around`` steps on either side it has to be.
-        around: steps.
-        shortest: frames; a cut nearer than this to the previous one is dropped (a flash makes two).
+        prominence: least ratio of a cut's change to the largest change in the ``around`` steps on either side.
+        around: number of steps.
+        shortest: frames; a cut nearer than this to the beginning of its shot is dropped (a flash makes two cuts).
     """
 
     name: ClassVar[str] = "hsv-histogram"
@@ -48,8 +48,8 @@ def spans_between(cuts: list[int], count: int, shortest: int = 1) -> list[tuple[
     """Returns the shots that begin at frame 0 and at each cut.
 
     Args:
-        cuts: increasing, between 1 and ``count`` - 1.
-        count: frames of the video.
+        cuts: first frames of shots after a cut, increasing, between 1 and ``count`` - 1.
+        count: number of frames of the video.
         shortest: frames; a cut nearer than this to the beginning of its shot is dropped.
     """
     starts = [0]

@@ -1,7 +1,8 @@
-"""Stage "tracks": points followed through a shot. Without weights: pyramidal Lucas–Kanade.
+"""Step "tracks": follows points through a shot. Without weights: pyramidal Lucas–Kanade.
 
-Every tracker follows a set of points through a few pictures; :func:`track_in_spans` does the rest: points begin on a
-grid, those that are visible at a span's end go on, and grid cells that lost theirs get new ones.
+Every tracker follows a set of points through a few pictures, a span; :func:`track_in_spans` does the rest. Points begin
+on a grid. Those that are visible at a span's end are followed further, and grid cells that lost their points get new
+ones.
 
 Axes: P points, T frames, H×W pixels.
 """
@@ -30,7 +31,7 @@ class GridTracker(Annotator):
 
     Attributes:
         grid: points begin in the middles of grid × grid cells.
-        span: frames after which cells that lost their points get new ones; a network sees a span at once.
+        span: frames after which cells that lost their points get new ones; a network sees a whole span at once.
         needs_depth: whether :meth:`follow` uses the depth.
     """
 
@@ -44,11 +45,11 @@ class GridTracker(Annotator):
         return track_in_spans(frames, self.follow, self.grid, self.span, depth if self.needs_depth else None)
 
     def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
-        """Follows points of the first picture through the others.
+        """Follows points of the first picture through the other pictures.
 
         Args:
             points: x and y, 0 and 1 at the image's outer edges.
-            depth: the pictures' maps, where the tracker needs them.
+            depth: the pictures' depth maps, if the tracker needs them.
 
         Returns:
             The points in every picture, and whether each is visible in it.
@@ -58,16 +59,16 @@ class GridTracker(Annotator):
 
 @dataclass(frozen=True)
 class LucasKanade(GridTracker):
-    """Pyramidal Lucas–Kanade from picture to picture; a point that does not come back on the way back is lost.
+    """Pyramidal Lucas–Kanade from picture to picture; a point that does not return when followed back is lost.
 
-    Where a patch stays the same, its point stays too, even on a surface without texture: a camera that moves over such
-    a surface goes unnoticed. A lost point reappears only where it was lost, when its patch reappears.
+    Where a patch stays the same, its point stays too, even on a surface without texture: if the camera moves over such
+    a surface, the tracker does not notice. A lost point reappears only where it was lost, when its patch reappears.
 
     Attributes:
         window: side of the patch that is matched, in pixels.
-        levels: of the pyramid, beyond the picture itself.
+        levels: levels of the pyramid, in addition to the picture itself.
         tolerance: how far from its start a point may end when it is followed forward and back, in pixels.
-        likeness: least correlation of a point's patch with that of the previous picture; below it is another surface.
+        likeness: least correlation of a point's patch with that of the previous picture; less means another surface.
         still: grey levels (of 255) by which a pixel of a patch may change while the patch counts as the same.
     """
 
@@ -99,7 +100,7 @@ class LucasKanade(GridTracker):
     def _step(
         self, before: UInt8[np.ndarray, "H W"], after: UInt8[np.ndarray, "H W"], start: Points
     ) -> tuple[Points, Bool[np.ndarray, " P"]]:
-        """Moves points from one picture to the next; those that are lost (False) stay where they are."""
+        """Moves points from one picture to the next; points that are lost (False) stay where they are."""
         if not len(start):
             return start, np.zeros(0, bool)
         options: Any = {"winSize": (self.window, self.window), "maxLevel": self.levels}
@@ -114,7 +115,7 @@ class LucasKanade(GridTracker):
 
 
 def _likeness(before: np.ndarray, after: np.ndarray, start: Points, end: Points, side: int) -> np.ndarray:
-    """Correlates the patches around two sets of points; 1 where both are even."""
+    """Correlates the patches around two sets of points; the result is about 1 where both patches are uniform."""
     left, right = _patches(before, start, side), _patches(after, end, side)
     left, right = left - left.mean(1, keepdims=True), right - right.mean(1, keepdims=True)
     even = np.float32(side * side)  # a variance of one grey level is noise
@@ -137,11 +138,11 @@ def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth
     """Follows points through all frames, ``span`` steps at a time.
 
     Args:
-        frames: at least one.
-        follow: the method.
+        frames: the pictures, at least one.
+        follow: the tracker's method.
         grid: at the start of each span, each of grid × grid cells has at least one point.
         span: steps from the first picture of a span to its last, which is the next span's first.
-        depth: passed on to the method.
+        depth: depth maps to pass on to ``follow``.
     """
     count = len(frames)
     points, visible = np.zeros((0, count, 2), np.float32), np.zeros((0, count), bool)
@@ -161,7 +162,7 @@ def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth
 
 
 def grid_points(grid: int, taken: Float[np.ndarray, "Q 2"]) -> Points:
-    """Returns the middles of those of grid × grid cells that contain none of the points ``taken``."""
+    """Returns the centres of those of grid × grid cells that contain none of the points ``taken``."""
     ticks = (np.arange(grid, dtype=np.float32) + 0.5) / grid
     middles = np.stack(np.meshgrid(ticks, ticks), -1)  # row, column, (x, y)
     column, row = np.clip((taken * grid).astype(int), 0, grid - 1).T
@@ -171,13 +172,14 @@ def grid_points(grid: int, taken: Float[np.ndarray, "Q 2"]) -> Points:
 
 
 def window_tracks(tracked: Tracked, frames: Int[np.ndarray, " T"] | Sequence[int], count: int) -> Tracked:
-    """Returns ``count`` tracks of a window of these frames, as :class:`rsjax.clip.Clip` wants them.
+    """Returns ``count`` tracks of a window of these frames, in the form of :class:`rsjax.clip.Clip`.
 
-    Only points that are visible in the window's first frame count. Of more than ``count``, half are those that move
-    most and the others are spread evenly over the rest; where there are fewer, they are repeated.
+    Only points that are visible in the window's first frame are used. If there are more than ``count``, half of the
+    tracks are the points that move most, and the others are spread evenly over the rest; if there are fewer, points are
+    repeated.
 
     Raises:
-        ValueError: no point is visible in the first frame, which a tracker of one shot rules out.
+        ValueError: no point is visible in the first frame; this cannot happen within one tracked shot.
     """
     frames = np.asarray(frames)
     first = np.flatnonzero(tracked.visible[:, frames[0]])
