@@ -56,7 +56,7 @@ def run_sweep(new: Grid, choice: Choice, out: Path, data: Path, command: str = "
         The state of each chosen cell, by name; "running" if another process runs it.
 
     Raises:
-        ConfigError: ``out`` holds a grid of another configuration, or the choice fits no cell.
+        ConfigError: ``out`` contains a grid of another configuration, or the choice matches no cell.
         Preempted: SIGTERM; the unfinished cell is saved.
     """
     grid, chosen = add_cells(out, new, choice)

@@ -126,7 +126,7 @@ class HeldOut:
         return cls(store, split, protocol, records, clips)
 
     def ids(self) -> list[dict[str, Any]]:
-        """Returns what identifies each clip: its number in the split, its episode, and a hash of its whole content."""
+        """Returns what identifies each clip: its number in the split, its episode, and a hash of frames and actions."""
         return [
             {"number": int(number), "episode": record["provenance"].get("episode"), "sha256": _hash(record)}
             for number, record in zip(self.clips.index, self.records, strict=True)

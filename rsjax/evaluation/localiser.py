@@ -1,4 +1,4 @@
-"""Locates cube and gripper in a frame, and whether the cube is lifted, by a small network trained on true frames.
+"""Reads where cube and gripper are in a frame and whether the cube is lifted, by a network trained on true frames.
 
 The localiser measures what a picture shows: a blurred frame can have everything in its place, and a sharp frame
 nothing. In training, the true frames are moved and blurred, so that the network can also read blurred frames
@@ -100,7 +100,7 @@ class Localiser:
 
 
 def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
-    """Trains a network on the true frames of clips that record places. The result depends on the arguments alone."""
+    """Trains a network on the true frames of clips that record places; the result depends only on the arguments."""
     recorded = recorded_places(clips)
     assert recorded is not None
     frames = np.concatenate([clip["rgb"] for clip in clips])

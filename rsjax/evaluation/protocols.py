@@ -23,8 +23,8 @@ class Protocol:
         resolution: pixels per side of the frames that are scored; 0: those of the run's clips.
         steps, temperature, top_k, unmask, mean_codes, guidance: settings of sampling; None: the run's own.
         samples: videos per clip. The scores are those of the first video. With several, each clip's best score of each
-            pixel metric is added as ``NAME_bestN_incl_ctx``; it covers all frames, the prompt as the model sees it
-            included.
+            pixel metric is added as ``NAME_bestN_incl_ctx``; it covers all frames, including the prompt as the model
+            sees it.
         clips: how many of the split's clips are scored, spread evenly; all if the split has fewer.
         repetitions: evaluations with different random draws; a clip's score is the mean over them.
         action_draws: random action sequences per clip and kind of ΔPSNR; 0: no ΔPSNR.
@@ -148,7 +148,7 @@ def of_run(config: Config) -> Protocol:
 
 
 def find(name: str, config: Config) -> Protocol:
-    """Returns the protocol of a name; its clips and repetitions are raised to the configuration's if these are larger.
+    """Returns the named protocol; its clips and repetitions are raised to the configuration's if these are larger.
 
     A protocol with several samples keeps its own counts, which are part of what was published.
 

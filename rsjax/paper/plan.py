@@ -79,7 +79,7 @@ class Plan:
 def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS) -> Plan:
     """Returns the cells of claims, which share the budget, and the tasks in their order.
 
-    The sizes of the cells depend on the budget alone, not on the claims.
+    The sizes of the cells depend only on the budget, not on the claims.
 
     Args:
         data: the directory of simulated data sets.
