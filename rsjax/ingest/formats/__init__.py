@@ -1,4 +1,4 @@
-"""The formats that people have, one module each, behind :class:`rsjax.ingest.episode.EpisodeSource`.
+"""Readers of common formats, one module each, with the interface :class:`rsjax.ingest.episode.EpisodeSource`.
 
 Each module has ``open_source(path, **options)``. :func:`open_source` imports a format's module, and the libraries that
 it needs, when a data set of that format is opened.

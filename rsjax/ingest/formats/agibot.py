@@ -1,11 +1,11 @@
-"""AgiBot-World Alpha and Beta, unpacked: two arms, 30 fps, and the damage that is known of them.
+"""Reads AgiBot-World Alpha and Beta, unpacked: two arms, 30 fps, and known damage.
 
 ``observations/{task}/{episode}/{videos,depth}``, ``proprio_stats/{task}/{episode}/proprio_stats.h5``,
 ``task_info/task_{task}.json``. An action has 16 dimensions: both hands' positions (6, m), their orientations (8,
 quaternions x y z w) and both grippers (2, 0 open … 1 closed).
 
 An arm's command at frame t leads into frame t+1, unless an episode's commands are a copy of its states: then the pose
-of frame t is what led into it, and rows stay where they are. Gripper commands always lead into the next frame.
+of frame t led into frame t, and rows stay where they are. Gripper commands always lead into the next frame.
 """
 
 import fnmatch
@@ -37,7 +37,7 @@ def open_source(path: Path, *, cameras: Sequence[str] = CAMERAS, tasks: Sequence
 
     Args:
         cameras: names of videos without ``_color.mp4``; an episode needs all of them.
-        tasks: their numbers; none: all.
+        tasks: numbers of the tasks to read; none: all.
     """
     return AgiBot(path, cameras, [str(task) for task in tasks])
 
@@ -51,7 +51,7 @@ class AgiBot:
         self._root, self._cameras, self._only = root, tuple(cameras), tuple(tasks)
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists every episode on disk or in ``task_info``, task by task; what is not on disk cannot be read."""
+        """Lists every episode on disk or in ``task_info``, task by task; an episode not on disk cannot be read."""
         for task in self._tasks():
             path = self._root / "task_info" / f"task_{task}.json"
             entries: dict[str, dict[str, Any]] = {}
@@ -152,7 +152,7 @@ def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
 
 
 def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list[Any]]:
-    """Returns the data set's own segmentation within the episode, and the entries that are no part of it."""
+    """Returns the data set's own segments of the episode, and the entries that are not valid segments."""
     good, bad = [], []
     for entry in entries:
         try:

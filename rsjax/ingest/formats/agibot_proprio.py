@@ -1,4 +1,4 @@
-"""One ``proprio_stats.h5`` of AgiBot-World: states, and commands extended to all frames.
+"""Reads a ``proprio_stats.h5`` of AgiBot-World: states, and commands extended to all frames.
 
 Axes: N frames, M ≤ N commands, D dimensions.
 """
@@ -29,8 +29,8 @@ class Proprio:
     """The arrays of an open file, each flattened to (rows, D).
 
     Attributes:
-        notes: what had to be mended, JSON-ready: fields that are empty, commands that were scattered, quaternions that
-            changed sign.
+        notes: what had to be repaired, JSON-ready: fields that are empty, commands that do not cover all frames,
+            quaternions that changed sign.
     """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
@@ -45,7 +45,7 @@ class Proprio:
         return EpisodeError.at(self._path, problem, LEAVE_OUT)
 
     def seconds(self) -> Float64[np.ndarray, " N"]:
-        """Returns the times from the first frame on; the file has nanoseconds."""
+        """Returns the seconds since the first frame; the file has nanoseconds."""
         whole = self._stamps.dtype.kind in "iu"
         stamps = self._stamps.astype(np.int64) if whole else self._stamps  # differences of unsigned ones wrap around
         return (stamps - stamps[0]).astype(np.float64) / 1e9
@@ -54,7 +54,7 @@ class Proprio:
         """Positions (6, m), orientations (8), grippers (2, mm), joints (14, rad), head (2, rad), waist (2, rad, m)."""
         parts = {name: self._state(name) for name in _WIDTHS}
         parts["end/orientation"] = self.quaternions("state/end/orientation")
-        with np.errstate(over="ignore"):  # what exceeds float32 becomes infinite, which is refused later
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite, which is refused later
             return np.concatenate(list(parts.values()), 1).astype(np.float32)
 
     def quaternions(self, name: str) -> Float64[np.ndarray, "N 8"]:
@@ -67,10 +67,10 @@ class Proprio:
         return mended
 
     def command(self, name: str) -> Float64[np.ndarray, "N D"]:
-        """Returns ``action/name`` at every frame; the state where none was sent, zeros if the field is empty.
+        """Returns ``action/name`` at every frame; the state where no command was sent, zeros if the field is empty.
 
         Raises:
-            EpisodeError: there are more commands than frames, or it is not known at which frames they were sent.
+            EpisodeError: there are more commands than frames, or it is unknown at which frames they were sent.
         """
         commands = self._commands(name)
         if not len(commands):
@@ -80,9 +80,9 @@ class Proprio:
         return extended
 
     def grippers(self) -> Float64[np.ndarray, "N 2"]:
-        """Returns ``action/effector/position`` at every frame: the last one sent, before the first one 0 (open).
+        """Returns ``action/effector/position`` at every frame: the last command sent, and 0 (open) before the first.
 
-        The state cannot stand in, it is in millimetres. Raises as :meth:`command`.
+        The state cannot replace it, because it is in millimetres. Raises as :meth:`command`.
         """
         commands = self._commands("effector/position")
         extended = np.zeros((self._count, 2))
@@ -93,7 +93,7 @@ class Proprio:
         return extended
 
     def copied(self) -> bool:
-        """Whether the hands' commands are the states at the same frames, and so say nothing of the next."""
+        """Returns whether the hands' commands equal the states at the same frames, so that they predict nothing."""
         for name in ("end/position", "end/orientation"):
             commands = self._commands(name)
             if not len(commands):
@@ -140,7 +140,7 @@ class Proprio:
         return rows
 
     def _rows(self, name: str, width: int) -> np.ndarray:
-        """Reads a data set as (rows, width), with no rows if it is missing or empty; float64, times as they are."""
+        """Reads a data set as (rows, width), with no rows if it is missing or empty; float64, but times as stored."""
         data = member(self._file, name, self._path)
         if not isinstance(data, h5py.Dataset) or not data.size:
             return np.zeros((0, width))

@@ -1,8 +1,8 @@
-"""BAIR robot pushing (``softmotion30_44k``): TFRecord files of 256 episodes of 30 steps, pictures as raw bytes.
+"""Reads BAIR robot pushing (``softmotion30_44k``): TFRecord files of 256 episodes of 30 steps, pictures as raw bytes.
 
-``{train,test}/traj_{a}_to_{b}.tfrecords``; of step i ``{i}/image_main/encoded`` and ``{i}/image_aux1/encoded`` (64×64×3
-bytes, RGB), ``{i}/action`` (4) and ``{i}/endeffector_pos`` (3 m). The action of a step was done after its pictures.
-Neither times nor tasks are recorded.
+The files are ``{train,test}/traj_{a}_to_{b}.tfrecords``. Step i has ``{i}/image_main/encoded`` and
+``{i}/image_aux1/encoded`` (64×64×3 bytes, RGB), ``{i}/action`` (4) and ``{i}/endeffector_pos`` (3, m). The action of a
+step was done after its pictures. Neither times nor tasks are recorded.
 """
 
 import re
@@ -50,8 +50,8 @@ class BairSource:
     """See :class:`rsjax.ingest.episode.EpisodeSource`.
 
     Attributes:
-        folder: what the files' names are relative to.
-        files: in the order of their trajectories.
+        folder: the folder to which the files' names are relative.
+        files: the files, in the order of their trajectories.
         fps: steps per second.
     """
 
@@ -61,7 +61,7 @@ class BairSource:
     fps: float
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists every record of every file; one that cannot be read stands for what a damaged file lacks."""
+        """Lists every record of every file; one unreadable entry stands for all that a damaged file lacks."""
         for file in self.files:
             first, last = _trajectories(Path(file).name)
             ids = safe_id(file.removesuffix(".tfrecords").replace("/", "-")) + "-{:03d}"

@@ -1,4 +1,4 @@
-"""What an HDF5 file of robomimic, robosuite or LIBERO says of its simulator, in attributes that are JSON."""
+"""Reads what an HDF5 file of robomimic, robosuite or LIBERO says about its simulator, in attributes that are JSON."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ def settings_of(group: Any, path: Path) -> dict[str, Any]:
     """Returns ``env_args``, ``env_info`` (robosuite's own) and ``problem_info`` of a file.
 
     Args:
-        group: ``data`` of the file.
+        group: the file's group ``data``.
         path: the file.
 
     Raises:
@@ -35,7 +35,7 @@ def fps_of(settings: dict[str, Any], path: Path) -> float:
     """Returns the rate of the simulator; 0 if the file does not say.
 
     Raises:
-        EpisodeError: it is no possible rate.
+        EpisodeError: the rate is impossible.
     """
     arguments = settings.get("env_kwargs")
     fps = arguments.get("control_freq", 0) if isinstance(arguments, dict) else 0
@@ -45,7 +45,7 @@ def fps_of(settings: dict[str, Any], path: Path) -> float:
 
 
 def kind_of(settings: dict[str, Any]) -> Kind:
-    """Returns what the arms' commands are: targets if robosuite's controller says so, by its older or newer name."""
+    """Returns the kind of the arms' commands: targets if robosuite's controller settings, old or new, say so."""
     arguments = settings.get("env_kwargs")
     text = json.dumps(arguments.get("controller_configs") if isinstance(arguments, dict) else None)
     return "absolute" if '"control_delta": false' in text or '"input_type": "absolute"' in text else "delta"

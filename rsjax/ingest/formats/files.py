@@ -17,7 +17,7 @@ from jaxtyping import Float32, Float64, Int64
 from rsjax.files import regular
 from rsjax.ingest.episode import EpisodeError, EpisodeRef, SourceError, data_file, fingerprint, reason
 
-MAX_CELLS = 2**24  # numbers in one episode's table: more is a damaged header
+MAX_CELLS = 2**24  # numbers in one episode's table; more mean a damaged header
 _MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share
 
 
@@ -26,8 +26,8 @@ def reading(path: Path, whole_source: bool = False) -> Iterator[None]:
     """Turns the errors of a missing or damaged file into :class:`EpisodeError`.
 
     Args:
-        path: the file, which messages name.
-        whole_source: whether the data set cannot be read without the file: then it is a :class:`SourceError`.
+        path: the file, which error messages name.
+        whole_source: whether the whole data set is unreadable without the file; the error is then :class:`SourceError`.
     """
     try:
         yield
@@ -47,7 +47,7 @@ def looking(path: Path) -> Iterator[None]:
 
 
 def inside(root: Path, relative: str) -> Path:
-    """Returns a file of the data set; links are followed (model hubs keep files behind links), ``..`` is not.
+    """Returns a file of the data set; links are followed (model hubs keep files behind links), but ``..`` is refused.
 
     Raises:
         EpisodeError: the name leads out of ``root``.
@@ -62,7 +62,7 @@ def fill(template: str, **fields: int | str) -> str:
     """Fills in a path template of a data set's metadata, such as ``chunk-{chunk_index:03d}``.
 
     Raises:
-        EpisodeError: it names other fields, or formats one in another way than with a width of one digit.
+        EpisodeError: the template names other fields, or has a format other than a width of one digit.
     """
     filled = []
     try:
@@ -79,10 +79,10 @@ def fill(template: str, **fields: int | str) -> str:
 
 
 def media(path: Path) -> Path:
-    """Returns the path of a video or picture that is opened later; whether it is there shows then.
+    """Returns the path of a video or picture that is opened later; only opening it shows whether it exists.
 
     Raises:
-        EpisodeError: it is a pipe or a device.
+        EpisodeError: the path is a pipe or a device.
     """
     try:
         return regular(path)
@@ -99,7 +99,7 @@ def read_json(path: Path) -> Any:
 
 
 def json_lines(path: Path) -> Iterator[tuple[int, Any]]:
-    """Yields the number (from 1) and value of each line that is not empty; for a bad line a :class:`ValueError`.
+    """Yields the number (from 1) and the value of each nonempty line; the value of a bad line is a :class:`ValueError`.
 
     Raises:
         SourceError: the file cannot be opened.
@@ -115,10 +115,10 @@ def json_lines(path: Path) -> Iterator[tuple[int, Any]]:
 
 
 def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yields the rows of a Parquet file with those of the columns that it has; a few thousand are in memory at a time.
+    """Yields the rows of a Parquet file, with those of ``columns`` that it has; holds a few thousand rows at a time.
 
     Raises:
-        SourceError: it is missing or damaged.
+        SourceError: the file is missing or damaged.
     """
     with reading(path, whole_source=True), pq.ParquetFile(data_file(path)) as file:
         names = set(file.schema_arrow.names)
@@ -127,16 +127,17 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
 
 
 def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: Any = None) -> pa.Table:
-    """Reads a Parquet file: those of the columns that it has, and the rows that pass ``filters``.
+    """Reads a Parquet file: those of ``columns`` that it has, and the rows that pass ``filters``.
 
     Raises:
-        EpisodeError: it is missing, damaged or too large: one number a thousand million times takes few bytes.
+        EpisodeError: the file is missing, damaged or too large when unpacked: a few bytes can encode a thousand million
+            equal numbers.
     """
     with reading(path):
         with pq.ParquetFile(data_file(path)) as file:
             names = file.schema_arrow.names
             chosen = names if columns is None else [name for name in columns if name in names]
-            # The metadata of column chunks stay unread: if those are damaged, pyarrow ends the process.
+            # The metadata of column chunks is not read: if it is damaged, pyarrow ends the process.
             count = file.metadata.num_rows
             size = sum(file.metadata.row_group(number).total_byte_size for number in range(file.num_row_groups))
             if count > (MAX_CELLS if filters is None else _MOST_ROWS) or size > _MOST_BYTES:
@@ -145,7 +146,7 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
 
 
 def matrix(table: pa.Table, column: str, where: Path | str) -> Float32[np.ndarray, "N A"]:
-    """Returns a column of numbers or of lists of numbers, all of one length; what exceeds float32 becomes infinite.
+    """Returns a column of numbers or of lists of numbers, all of one length; values beyond float32 become infinite.
 
     Raises:
         EpisodeError: there is no such column, or it contains something else.
@@ -155,7 +156,7 @@ def matrix(table: pa.Table, column: str, where: Path | str) -> Float32[np.ndarra
 
 
 def seconds(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndarray, " N"]:
-    """Returns a column of times; those that count from 1970 do not fit into float32. Raises as :func:`matrix`."""
+    """Returns a column of times in float64, since times since 1970 do not fit float32. Raises as :func:`matrix`."""
     values = _numbers(table, column, where)
     if values.shape[1] != 1:
         raise EpisodeError.at(where, f"column {column!r} has {values.shape[1]} numbers a row, should have one")
@@ -192,10 +193,10 @@ def integers(table: pa.Table, column: str, where: Path | str) -> Int64[np.ndarra
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """Reads an array of numbers from a .npy file, checked before memory is taken for it.
+    """Reads an array of numbers from a .npy file, after checking its header and before allocating memory.
 
     Raises:
-        EpisodeError: it is missing, damaged, too large or of another kind.
+        EpisodeError: the file is missing, damaged, too large or of another kind.
     """
     with reading(path):
         mapped = np.load(data_file(path), mmap_mode="r", allow_pickle=False)
@@ -210,20 +211,20 @@ def broken(identity: str, message: str) -> EpisodeRef:
 
 
 def location_of(ref: EpisodeRef) -> dict[str, Any]:
-    """Returns where an episode is; :class:`EpisodeError` with its message for a :func:`broken` one."""
+    """Returns where an episode is; raises :class:`EpisodeError` with its message for a :func:`broken` reference."""
     if "error" in ref.location:
         raise EpisodeError(ref.location["error"])
     return ref.location
 
 
 def exists(path: Path) -> bool:
-    """Whether there is such a file or folder; :class:`SourceError` if a folder on the way to it is closed."""
+    """Returns whether the file or folder exists; raises :class:`SourceError` if a parent folder cannot be entered."""
     with looking(path):
         return path.exists()
 
 
 def subfolders(path: Path) -> list[Path]:
-    """Lists the folders in a folder by name, numbers in their order; links that lead nowhere may have been some.
+    """Lists the folders in a folder by name, numbers in numeric order, including broken links without a suffix.
 
     Raises:
         SourceError: the folder cannot be listed.
@@ -239,5 +240,5 @@ def subfolders(path: Path) -> list[Path]:
 
 
 def near(path: Path, pattern: str) -> list[Path]:
-    """Lists the files of a pattern in a folder and in its folders down to two levels."""
+    """Lists the files that match a pattern in a folder and its subfolders down to two levels."""
     return [file for depth in ("", "*/", "*/*/") for file in path.glob(f"{depth}{pattern}") if file.is_file()]

@@ -1,6 +1,6 @@
-"""A folder of videos with a table of actions, for data of one's own.
+"""Reads a folder of videos with tables of actions, for your own data.
 
-One folder per episode, whose name is the episode's::
+Each episode has a folder, whose name is the episode's id::
 
     PATH/dataset.json             optional: {"task": "fold the towel", "fps": 30, "after": false, "kind": "delta", …}
     PATH/EPISODE/CAMERA.mp4       one per camera; or a folder CAMERA/ of pictures 000000.png …
@@ -11,10 +11,10 @@ One folder per episode, whose name is the episode's::
 or, with one camera, flat: ``PATH/NAME.mp4``, ``PATH/NAME.csv`` and, optionally, ``PATH/NAME.json``.
 
 The columns of a table have names: ``timestamp`` (seconds), ``state…``, and ``action…``; if none begins with ``action``,
-all others are the action, but for those that count rows or time (``time``, ``frame``, ``index`` …). A ``.npy`` array
-(N, A) contains actions alone. ``after`` says whether each frame was recorded after its row's action. Otherwise a row's
-action leads into the next frame, and the last row may be missing.
-``fps`` is needed with pictures and without timestamps; videos know their own.
+all others are the action, except those that count rows or time (``time``, ``frame``, ``index`` …). A ``.npy`` array
+(N, A) contains only actions. ``after`` says whether each frame was recorded after its row's action. Otherwise a row's
+action leads into the next frame, and the last row may be missing. ``fps`` is needed for pictures without timestamps;
+videos have their own rate.
 """
 
 import dataclasses
@@ -48,14 +48,14 @@ from rsjax.ingest.video import VideoFrames, scan
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """What ``dataset.json`` and the options say of all episodes.
+    """What ``dataset.json`` and the options say about all episodes.
 
     Attributes:
-        task: of episodes that name none; None, as null in JSON, names none either.
+        task: the task of episodes that name none; None (null in JSON) means no task.
         fps: frames per second; 0: as the videos or the timestamps say.
         after: whether each frame was recorded after the action of its row.
         action: the columns that are the action, in order; none: by their names.
-        kind: see :class:`rsjax.ingest.actions.Layout`; None: nobody says, so rows of actions are not combined.
+        kind: see :class:`rsjax.ingest.actions.Layout`; None: not declared, so rows of actions are not combined.
         held: likewise.
         quaternions: likewise.
     """
@@ -83,7 +83,7 @@ def open_source(
     """Opens the data set at ``path``; options as in :class:`FolderConfig`, None: as ``dataset.json`` says.
 
     Raises:
-        SourceError: ``dataset.json`` or an option is wrong, or ``path`` is no folder.
+        SourceError: ``dataset.json`` or an option is wrong, or ``path`` is not a folder.
     """
     if not path.is_dir():
         raise SourceError(f"{path}: not a folder; give the one that contains the episodes")
@@ -173,7 +173,7 @@ class Folder:
         return checked(episode, table_path)
 
     def _files(self, name: str, flat: bool) -> list[Path]:
-        """Returns the files of an episode, as far as names tell."""
+        """Returns the files of an episode, judged by their names."""
         try:
             if flat:
                 return sorted(path for path in self._root.iterdir() if path.stem == name and not path.is_dir())
@@ -185,10 +185,10 @@ class Folder:
         sizes = []
         try:
             files = self._files(name, flat) if files is None else files
-            for folder in filter(Path.is_dir, files):  # pictures are too many to look into
+            for folder in filter(Path.is_dir, files):  # pictures are too many to open
                 sizes += sorted((folder.name, path.name, path.stat().st_size) for path in folder.iterdir())
         except (EpisodeError, OSError):
-            files = []  # reading it says why
+            files = []  # reading the episode reports why
         config = dataclasses.asdict(self._config)
         identity = safe_id(f"{name}.flat" if flat and (self._root / name).is_dir() else name)
         return EpisodeRef(identity, fingerprint(files, name, sizes, config), {"name": name, "flat": flat})
@@ -197,7 +197,7 @@ class Folder:
 def _times(
     table: pa.Table, cameras: Mapping[str, Frames], fps: float, count: int, place: Path
 ) -> Float[np.ndarray, " N"]:
-    """Returns the seconds of the table, or those of the given rate, or the videos' own, which must go together."""
+    """Returns times from the table, else by the given rate, else from the videos, whose clocks must agree."""
     if "timestamp" in table.column_names:
         return seconds(table, "timestamp", place)
     if fps:
@@ -215,7 +215,7 @@ def _times(
 
 
 def _actions(rows: Float32[np.ndarray, "N A"], count: int, after: bool, path: Path) -> Float32[np.ndarray, "N A"]:
-    """Aligns the rows of the table; the last may be missing if it leads nowhere."""
+    """Aligns the rows of the table; the last row may be missing if it leads into no frame."""
     if not after and len(rows) == count - 1:
         rows = np.concatenate([rows, rows[-1:]])
     if len(rows) != count:

@@ -1,4 +1,4 @@
-"""The files of one episode in a folder of videos: its cameras, its table and its JSON."""
+"""Reads the files of one episode in a folder of videos: its cameras, its table and its JSON."""
 
 import re
 from collections.abc import Sequence
@@ -31,19 +31,19 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 PICTURES = (".png", ".jpg", ".jpeg")
 TABLES = (".csv", ".parquet", ".npy")
 _DEPTH = ".depth"
-# Columns that count rows or time, also as pandas names those that it adds.
+# Columns that count rows or time, including the names of columns that pandas adds.
 _COUNTING = re.compile(
     r"|unnamed: \d+|((time|frame|row|step|episode|task)[ _]?)?(index|idx|id|number|count)|__index_level_\d+__"
     r"|time([ _]?(stamps?|s|sec|seconds|ms|ns))?|t|frames?|rows?|steps?|seconds|sec|stamps?"
 )
-_MOST_BYTES = 2**28  # of a table that is text
+_MOST_BYTES = 2**28  # largest size of a text table
 
 
 def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment, ...]]:
     """Reads task, rate and segments of an episode's JSON, if there is one; "" and 0 if it does not name them.
 
     Args:
-        count: the episode's frames.
+        count: the episode's number of frames.
 
     Raises:
         EpisodeError: the file is damaged, a field is wrong, or a segment is not within the frames.
@@ -98,7 +98,7 @@ def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], 
 
 
 def find_table(files: Sequence[Path], place: Path) -> Path:
-    """Returns the episode's table; :class:`EpisodeError` if there is none, or more than one."""
+    """Returns the episode's table; raises :class:`EpisodeError` if there is none, or more than one."""
     tables = [path for path in files if path.suffix.lower() in TABLES]
     if len(tables) != 1:
         names = ", ".join(path.name for path in tables) or "none"
@@ -110,7 +110,7 @@ def read_table(path: Path) -> pa.Table:
     """Reads the table; a ``.npy`` becomes a column ``action`` of lists.
 
     Raises:
-        EpisodeError: it is damaged, or its columns have no names.
+        EpisodeError: the table is damaged, or its columns have no names.
     """
     if path.suffix.lower() == ".npy":
         array = load_npy(path)
@@ -124,7 +124,7 @@ def read_table(path: Path) -> pa.Table:
             raise ValueError(f"{size} bytes are more than an episode's table can have")
         with data_file(path).open("rb") as file:
             table = pa_csv.read_csv(file)
-        names = table.column_names  # decoded here, not before
+        names = table.column_names  # names are decoded only here
     except (pa.ArrowException, OSError, ValueError) as error:
         raise EpisodeError.at(path, reason(error), "save it again") from error
     if len(set(names)) < len(names) or all(map(_is_number, names)):
@@ -133,13 +133,13 @@ def read_table(path: Path) -> pa.Table:
 
 
 def choose_columns(table: pa.Table, asked: Sequence[str], path: Path) -> tuple[list[str], list[str]]:
-    """Returns the columns that are the action, and those that only count rows or time and so are taken for none.
+    """Returns the columns that are the action, and those that are not because they only count rows or time.
 
     Args:
         asked: the columns that a user names; none: those that begin with ``action``, or else all that are left.
 
     Raises:
-        EpisodeError: there is none, or not the one that is asked for.
+        EpisodeError: there is no such column.
     """
     there = table.column_names
     if absent := [name for name in asked if name not in there]:
@@ -158,7 +158,7 @@ def choose_columns(table: pa.Table, asked: Sequence[str], path: Path) -> tuple[l
 
 
 def columns(table: pa.Table, names: Sequence[str], path: Path) -> tuple[Float32[np.ndarray, "N A"], list[str]]:
-    """Returns columns side by side, and a name for each dimension; :class:`EpisodeError` if they are not numbers."""
+    """Returns columns side by side and a name per dimension; :class:`EpisodeError` if they are not numbers."""
     parts = {name: matrix(table, name, path) for name in names}
     dimensions: list[str] = []
     for name, part in parts.items():

@@ -13,16 +13,16 @@ from jaxtyping import Float32
 from rsjax.ingest.episode import LEAVE_OUT, MAX_PIXELS, EpisodeError, data_file, reason
 from rsjax.ingest.formats.files import MAX_CELLS
 
-_MOST_CHUNK = 2**30  # bytes that HDF5 unpacks at once, however few of them are read
-Stored = Literal["upright", "bottom first", "half turn"]  # how a file has its pictures
+_MOST_CHUNK = 2**30  # bytes of a chunk, which HDF5 unpacks as a whole however few of them are read
+Stored = Literal["upright", "bottom first", "half turn"]  # how a file stores its pictures
 
 
 @contextmanager
 def open_file(path: Path) -> Iterator[h5py.File]:
-    """Opens a file for reading. A damaged part shows when it is read: that, too, becomes an error of the file.
+    """Opens a file for reading. Damage that shows only when a part is read also becomes an error of the file.
 
     Raises:
-        EpisodeError: it is missing, truncated or no HDF5.
+        EpisodeError: the file is missing, truncated or not HDF5.
     """
     try:
         data_file(path)
@@ -36,10 +36,10 @@ def open_file(path: Path) -> Iterator[h5py.File]:
 
 
 def member(group: Any, key: str, path: Path) -> Any:
-    """Returns the member ``key`` of a group, None if there is none. HDF5 can point into any file: that is refused.
+    """Returns the member ``key`` of a group; None if there is none. HDF5 links into other files are refused.
 
     Raises:
-        EpisodeError: it lies in another file, or its chunks are too large to be unpacked.
+        EpisodeError: the member lies in another file, or its chunks are too large to be unpacked.
     """
     entry = group.get(key)
     if entry is None:
@@ -58,7 +58,7 @@ def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
     """Reads a data set of numbers, one row for each frame.
 
     Raises:
-        EpisodeError: there is none, or it contains something else.
+        EpisodeError: there is no such data set, or it contains something else.
     """
     data = member(group, key, path)
     name = f"{group.name}/{key}"
@@ -66,7 +66,7 @@ def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
         raise EpisodeError.at(path, f"has no {name}", LEAVE_OUT)
     if 0 in data.shape[1:] or data.dtype.kind not in "fiu" or data.ndim not in (1, 2) or data.size > MAX_CELLS:
         raise EpisodeError.at(path, f"{name} is {data.dtype} {data.shape}, should be numbers (N, n)")
-    with np.errstate(over="ignore"):  # what exceeds float32 becomes infinite, which is refused later
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, which is refused later
         values = data[()].astype(np.float32)
     return values[:, None] if values.ndim == 1 else values
 
@@ -76,8 +76,8 @@ class H5Frames:
 
     Args:
         path: the file.
-        key: of the data set: pictures, uint8 [N, H, W, 3]; depth maps, floats [N, H, W] or [N, H, W, 1] in metres.
-        stored: how the file has them: upright, with the bottom row first, or turned by half a turn.
+        key: key of the data set: pictures, uint8 [N, H, W, 3]; depth maps, floats [N, H, W] or [N, H, W, 1] in metres.
+        stored: how the file stores them: upright, with the bottom row first, or rotated by half a turn.
         depth: whether they are depth maps.
 
     Raises:
@@ -104,7 +104,7 @@ class H5Frames:
 
     def read(self, indices: Sequence[int]) -> np.ndarray:
         """Returns these pictures or maps, upright; :class:`EpisodeError` if the file is damaged."""
-        wanted, order = np.unique(np.asarray(indices, np.int64), return_inverse=True)  # h5py wants them increasing
+        wanted, order = np.unique(np.asarray(indices, np.int64), return_inverse=True)  # h5py needs increasing indices
         with open_file(self._path) as file:
             pictures = file[self._key][wanted][order]
         if self._depth:
@@ -116,6 +116,6 @@ class H5Frames:
 
 
 def attribute(group: Any, name: str) -> Any:
-    """Returns an attribute, text decoded; None if there is none."""
+    """Returns an attribute, with text decoded; None if there is none."""
     value = group.attrs.get(name)
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else value

@@ -1,4 +1,4 @@
-"""Key maps: which feature of an RLDS data set is what. Some are named, and users can write their own."""
+"""Key maps, which say what each feature of an RLDS data set is. Some are built in; users can write their own."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -14,21 +14,21 @@ from rsjax.ingest.formats.options import from_json
 
 @dataclass(frozen=True)
 class KeyMap:
-    """Which feature below ``steps/`` is what.
+    """Says what the features below ``steps/`` are.
 
     Attributes:
         cameras: the feature of each camera's pictures, by a name for the camera.
         action: features that make up the action, in order.
         fps: steps per second, > 0; RLDS does not store it.
         state: features that make up the state, in order.
-        task: features of text; the first that is not empty counts.
-        kind: what the numbers of the action are, as in :class:`rsjax.ingest.actions.Layout`; None: nobody says.
+        task: text features; the first that is not empty counts.
+        kind: what the numbers of the action are, as in :class:`rsjax.ingest.actions.Layout`; None: not declared.
         quaternions: likewise.
-        held: likewise; None: nobody says.
-        after: whether a step's observation was recorded after its action, against the convention.
+        held: likewise; None: not declared.
+        after: whether a step's observation was recorded after its action, contrary to the convention.
         depth: the feature of each camera's depth maps, by the camera's name.
-        depth_scale: metres that a depth map of whole numbers counts as 1; floats are metres.
-        names: of the data sets that this map is for.
+        depth_scale: length in metres of one unit of a depth map of whole numbers; floats are metres.
+        names: names of the data sets that this map is for.
     """
 
     cameras: Mapping[str, str]
@@ -45,9 +45,9 @@ class KeyMap:
     names: tuple[str, ...] = field(default=(), compare=False)
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the map as a file has it, without the fields that a file may leave out."""
+        """Returns the map as it is written to a file, without the fields that a file may omit."""
         blank = asdict(KeyMap({}, (), 0.0)) | {"names": self.names}
-        said = ("kind", "held")  # always, so that they are seen; in a file, none means that nobody says
+        said = ("kind", "held")  # always written, so that users see them; in a file, null means not declared
         return {name: value for name, value in asdict(self).items() if name in said or value != blank[name]}
 
 
@@ -58,7 +58,7 @@ def _cameras(*names: str) -> dict[str, str]:
 _OXE_MOVE = ("action/world_vector", "action/rotation_delta")
 _OXE_TASK = ("observation/natural_language_instruction",)
 
-# bridge is tested on real files; the others follow the data sets' documentation and are checked with features.json.
+# bridge is tested on real files; the others follow the data sets' documentation and are checked against features.json.
 MAPS: dict[str, KeyMap] = {
     "bridge": KeyMap(
         _cameras("image_0", "image_1", "image_2", "image_3"),
@@ -114,13 +114,13 @@ MAPS: dict[str, KeyMap] = {
 
 
 def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
-    """Returns the key map that a user names.
+    """Returns the key map that a user chose.
 
     Args:
         keys: one of :data:`MAPS`, or the path of a JSON file with the fields of :class:`KeyMap`; "": the map for the
             data set's name.
-        dataset: that name.
-        folder: of the data set, for messages.
+        dataset: the data set's name.
+        folder: the data set's folder, for error messages.
 
     Raises:
         SourceError: there is no such map, or the file has wrong fields.
@@ -130,7 +130,7 @@ def key_map(keys: str, dataset: str, folder: Path) -> KeyMap:
         return MAPS[keys]
     if keys.endswith(".json"):
         values = read_json(Path(keys))
-        undeclared = {"kind": None, "held": None}  # the defaults are for the maps above, whose actions are known
+        undeclared = {"kind": None, "held": None}  # the defaults are only for the maps above, whose actions are known
         keymap = from_json(KeyMap, undeclared | values if isinstance(values, dict) else values, keys)
         if not 0 < keymap.fps <= MAX_FPS:
             raise SourceError(f"{keys}: fps is {keymap.fps!r}, should be a number above 0 and at most {MAX_FPS:g}")

@@ -1,7 +1,7 @@
-"""LeRobotDataset v2.0, v2.1 and v3.0 without the ``lerobot`` package: pyarrow for the tables, PyAV for the videos.
+"""Reads LeRobotDataset v2.0, v2.1 and v3.0 without the ``lerobot`` package: tables by pyarrow, videos by PyAV.
 
-A row's action is given at that row's frame, so it leads into the next one. v2 has a table and a video per episode and
-camera; in v3 many episodes share a file, and an episode's pictures are looked up by time.
+A row's action is sent at that row's frame, so it leads into the next frame. v2 has a table for each episode, and a
+video for each episode and camera; in v3 many episodes share a file, and an episode's pictures are looked up by time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ from rsjax.ingest.formats.lerobot_info import Info, read_info
 from rsjax.ingest.formats.lerobot_tables import TablePictures, read_rows
 from rsjax.ingest.video import at_times
 
-TOLERANCE = 1e-4  # seconds, LeRobot's own
+TOLERANCE = 1e-4  # seconds, LeRobot's own tolerance
 _PLACES = ("chunk_index", "file_index")
 _BEGINS = "from_timestamp"
 
@@ -63,7 +63,7 @@ def open_source(
         action: the column of actions.
         state: the column of states; if it is missing, episodes have none.
         kind: what the actions are, which the format does not say; see :class:`rsjax.ingest.actions.Layout`. None:
-            absolute, unless the names of the dimensions contain ``delta``; then it has to be given.
+            absolute, unless the names of the dimensions contain ``delta``; then the kind has to be declared.
         held: likewise.
         quaternions: likewise.
 
@@ -144,7 +144,7 @@ class LeRobot:
         return checked(episode, path)
 
     def _entries(self) -> Iterator[tuple[str, Any]]:
-        """Yields each episode's metadata, or why they cannot be read, after the place where they are."""
+        """Yields where each episode's metadata are, and the metadata or the error if they cannot be read."""
         meta = self._root / "meta"
         if not self._info.shared:
             path = meta / "episodes.jsonl"
@@ -159,7 +159,7 @@ class LeRobot:
         for path in files:
             try:
                 yield from ((f"{path}: row {number}", row) for number, row in enumerate(parquet_rows(path, columns)))
-            except SourceError as error:  # the other files' episodes can be read all the same
+            except SourceError as error:  # the episodes of other files can still be read
                 yield str(path.relative_to(meta)), error
 
     def _ref(self, number: int, row: dict[str, Any]) -> EpisodeRef:
@@ -194,7 +194,7 @@ class LeRobot:
         """Raises :class:`EpisodeError` if the rows are not this episode's frames, in order and evenly spaced.
 
         Returns:
-            A note if the metadata have another range of rows, which nothing but this check reads.
+            A note if the metadata state another range of rows; only this check reads that range.
         """
         count, number = len(times), location["episode"]
         if count != location["length"]:
@@ -242,7 +242,7 @@ def _tasks(meta: Path, shared: bool) -> dict[int, str]:
     try:
         if not shared:
             return {int(row["task_index"]): words_of(row["task"]) for _, row in json_lines(meta / "tasks.jsonl")}
-        names = ("task_index", "task", "__index_level_0__")  # where pandas leaves an index of its own
+        names = ("task_index", "task", "__index_level_0__")  # the last is pandas's name for an unnamed index
         rows = parquet_rows(meta / "tasks.parquet", names)
         return {int(row["task_index"]): words_of(row.get("task", row.get("__index_level_0__"))) for row in rows}
     except (KeyError, TypeError, ValueError) as error:
@@ -250,7 +250,7 @@ def _tasks(meta: Path, shared: bool) -> dict[int, str]:
 
 
 def _tolerance(times: Float[np.ndarray, " N"]) -> float:
-    """Returns the seconds that a time may be off: LeRobot's, and what float32, which stores times, rounds away."""
+    """Returns the largest error of a time in seconds: LeRobot's tolerance plus the rounding of float32 times."""
     return TOLERANCE + float(np.spacing(np.float32(np.abs(times).max(initial=0))))
 
 

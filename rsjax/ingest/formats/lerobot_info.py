@@ -1,4 +1,4 @@
-"""The head of a LeRobotDataset, ``meta/info.json``: its version, path templates and columns."""
+"""Reads the head of a LeRobotDataset, ``meta/info.json``: its version, path templates and columns."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +15,11 @@ class Info:
     Attributes:
         shared: whether episodes share files (v3).
         fps: frames per second.
-        chunks_size: episodes to a folder (v2).
+        chunks_size: episodes per folder (v2).
         data_path: template of a table's path.
         video_path: template of a video's path, "" without videos.
         features: column → ``dtype``, ``shape``, ``names``.
-        episodes: how many there should be; 0 if the file does not say.
+        episodes: number of episodes that there should be; 0 if the file does not say.
     """
 
     shared: bool

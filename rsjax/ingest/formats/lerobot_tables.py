@@ -1,4 +1,4 @@
-"""The tables of a LeRobotDataset: the rows of one episode, and pictures that are encoded in them."""
+"""Reads the tables of a LeRobotDataset: the rows of one episode, and pictures that are encoded in them."""
 
 import bisect
 import re
@@ -22,17 +22,18 @@ _ALL = [("episode_index", ">=", 0)]  # a shared file may have more rows than the
 def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequence[str]) -> tuple[Path, pa.Table]:
     """Reads the rows of an episode.
 
-    LeRobot's converter to v3 names the file before for the first episode of every further file, and no file that exists
-    if the very first episode alone exceeds a file's size. So where the file that the metadata name is missing or has no
-    row of the episode, the others are searched, the next one first.
+    LeRobot's converter to v3 writes wrong metadata: for the first episode of every file but the first it names the
+    previous file, and if the very first episode alone exceeds a file's size it names a file that does not exist. So if
+    the file that the metadata name is missing or has no row of the episode, the other files are searched, the next one
+    first.
 
     Args:
-        template: of the tables' paths.
-        location: the episode's.
-        columns: those to read, as far as the table has them.
+        template: template of the tables' paths.
+        location: the episode's location.
+        columns: the columns to read; those that the table lacks are left out.
 
     Returns:
-        The file that has them, and the rows.
+        The file that has the rows, and the rows.
 
     Raises:
         EpisodeError: the named file cannot be read, or no file has a row of the episode.
@@ -54,7 +55,7 @@ def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequ
 
 
 def _others(root: Path, template: str, named: Path, number: int) -> Iterator[Path]:
-    """Yields the other files that have rows of an episode; those that cannot be read cost their own episodes."""
+    """Yields the other files that have rows of an episode; files that cannot be read are skipped."""
     pattern = inside(root, re.sub(r"\{[^{}]*\}", "*", template)).relative_to(root)
     files = sorted(root.glob(str(pattern)))
     after = bisect.bisect_right(files, named)
@@ -69,13 +70,13 @@ def _others(root: Path, template: str, named: Path, number: int) -> Iterator[Pat
 
 @lru_cache(maxsize=4096)
 def _episodes_in(path: Path, size: int, modified: int) -> frozenset[int]:
-    """Returns the episodes of a file; size and date are there so that a changed file is read again."""
+    """Returns the episodes of a file; ``size`` and ``modified`` make the cache read a changed file again."""
     table = parquet_columns(path, ["episode_index"], _ALL)
     return frozenset(np.unique(integers(table, "episode_index", path)).tolist())
 
 
 def _only(location: dict[str, Any]) -> list[tuple[str, str, int]] | None:
-    """Returns the filter that leaves one episode of a shared table; None if the table is the episode's own."""
+    """Returns the filter that selects one episode from a shared table; None if the table holds only this episode."""
     return [("episode_index", "==", location["episode"])] if "rows" in location else None
 
 
@@ -85,8 +86,8 @@ class TablePictures:
 
     Attributes:
         path: the table.
-        column: of ``{bytes, path}``.
-        location: the episode's.
+        column: a column of ``{bytes, path}``.
+        location: the episode's location.
     """
 
     path: Path

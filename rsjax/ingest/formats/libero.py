@@ -1,7 +1,7 @@
-"""LIBERO HDF5 files: robomimic's layout, one file a task, with two traps.
+"""Reads LIBERO HDF5 files: robomimic's layout, one file per task, with two pitfalls.
 
 Pictures are stored bottom row first, as OpenGL renders them, and ``obs[t]`` was recorded *after* ``actions[t]``: that
-action led into it. Tested on files of the documented layout that the tests write.
+action led into it. The reader is tested on files of the documented layout that the tests write.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ def open_source(path: Path, filter: str = "", depth: bool = False, half_turn: bo
         path: as in :func:`rsjax.ingest.formats.robomimic.open_source`, which raises the same errors.
         filter: likewise.
         depth: likewise.
-        half_turn: turn pictures by 180°, which mirrors left and right, as OpenVLA and its successors train on them;
+        half_turn: rotate pictures by 180°, which mirrors left and right, as OpenVLA and its successors train on them;
             otherwise they are flipped upright, as LIBERO's own videos are.
     """
     return open_demos(path, dataclasses.replace(LIBERO, stored="half turn") if half_turn else LIBERO, filter, depth)

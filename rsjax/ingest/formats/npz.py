@@ -1,4 +1,4 @@
-"""A folder of ``.npz`` files, one for each episode, as ``np.savez`` writes them; read without pickle.
+"""Reads a folder of ``.npz`` files, one for each episode, as ``np.savez`` writes them, without pickle.
 
 ==============  =======================  ===============================================================================
 ``frames``      uint8 [T, H, W, 3]       RGB, upright
@@ -40,7 +40,7 @@ from rsjax.ingest.episode import (
 )
 from rsjax.ingest.formats.files import MAX_CELLS, inside, location_of
 
-_MOST_BYTES = 2**31  # of an episode's pictures, which are in memory while they are read
+_MOST_BYTES = 2**31  # largest size of an episode's pictures, which are in memory while they are read
 _SAVE = "save the file again"
 
 
@@ -75,10 +75,10 @@ def open_source(
     Args:
         frames: the name of the array of pictures in the files, such as ``image``.
         actions: the name of the array of actions, such as ``action``.
-        task: of files that name none.
-        fps: of files that have neither ``fps`` nor ``timestamps``.
+        task: the task in files that name none.
+        fps: frames per second in files that have neither ``fps`` nor ``timestamps``.
         after: whether each frame was recorded after the action of its row.
-        kind: of the actions in files that do not say; see :class:`rsjax.ingest.actions.Layout`.
+        kind: kind of the actions in files that do not say; see :class:`rsjax.ingest.actions.Layout`.
         held: likewise.
         quaternions: likewise.
 
@@ -101,8 +101,8 @@ class NpzFolder:
     """See :class:`rsjax.ingest.episode.EpisodeSource`.
 
     Attributes:
-        folder: what the files' names are relative to.
-        files: in order.
+        folder: the folder to which the files' names are relative.
+        files: the files, in order.
         settings: the options.
     """
 
@@ -123,7 +123,7 @@ class NpzFolder:
         frames = NpzFrames(path, how.frames)
         count = len(frames)
         commands = _numbers(path, how.actions)
-        if not how.after and len(commands) == count - 1:  # the last row leads nowhere
+        if not how.after and len(commands) == count - 1:  # only the last row, which leads into no frame, is missing
             commands = np.concatenate([commands, commands[-1:]])
         kind = _text(path, "kind") or how.kind
         if kind not in ("absolute", "delta", ""):
@@ -156,8 +156,8 @@ class NpzFrames:
 
     Args:
         path: the file.
-        name: of the array.
-        depth: whether it has depth maps.
+        name: name of the array.
+        depth: whether it contains depth maps.
 
     Raises:
         EpisodeError: there is no such array, or it has another shape or type.
@@ -191,7 +191,7 @@ class NpzFrames:
         return rows
 
 
-@lru_cache(maxsize=2)  # an episode's pictures and depth: windows overlap, and a compressed array has no places to go to
+@lru_cache(maxsize=2)  # an episode's pictures and depth: windows overlap, and a compressed array has no random access
 def _unpacked(path: Path, name: str, size: int, modified: int) -> np.ndarray:
     array = _array(path, name, _MOST_BYTES)
     if array is None:
@@ -213,7 +213,7 @@ def _header(path: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | No
                 version = np.lib.format.read_magic(file)
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, dtype = read(file)
-    except Exception as error:  # zipfile and numpy report damage as many types
+    except Exception as error:  # zipfile and numpy report damage by many types of error
         raise EpisodeError.at(path, reason(error)) from error
     if dtype.hasobject:
         raise EpisodeError.at(path, f"{name} is of Python objects, which are not read", f"{_SAVE} with numbers or text")
@@ -221,13 +221,13 @@ def _header(path: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | No
 
 
 def _array(path: Path, name: str, most: int = 8 * MAX_CELLS) -> np.ndarray | None:
-    """Reads an array, checked before memory is taken for it; None if there is none.
+    """Reads an array, after checking its size and before allocating memory; None if there is none.
 
     Args:
-        most: bytes that it may have.
+        most: largest size of the array in bytes.
 
     Raises:
-        EpisodeError: as :func:`_header`, or it is larger.
+        EpisodeError: as :func:`_header`, or the array is larger.
     """
     if (header := _header(path, name)) is None:
         return None
@@ -252,7 +252,7 @@ def _numbers(path: Path, name: str) -> np.ndarray:
 
 
 def _times(path: Path, count: int, fps: float) -> np.ndarray:
-    """Returns the seconds of each frame, by the file's ``timestamps``, its ``fps`` or the option."""
+    """Returns the time of each frame in seconds, by the file's ``timestamps``, its ``fps`` or the option."""
     times = _array(path, "timestamps")
     if times is not None:
         if times.shape != (count,) or times.dtype.kind not in "fiu":

@@ -1,4 +1,4 @@
-"""Checks what users write (``--option``, ``dataset.json``, key maps) against the types that the code declares."""
+"""Checks values that users write (``--option``, ``dataset.json``, key maps) against the types declared in the code."""
 
 import dataclasses
 import types
@@ -11,7 +11,7 @@ from rsjax.ingest.episode import SourceError
 
 T = TypeVar("T")
 
-_WORDS = {  # one, several
+_WORDS = {  # words for one value and for several
     bool: ("true or false", "true or false"),
     int: ("a whole number", "whole numbers"),
     float: ("a number", "numbers"),
@@ -25,7 +25,7 @@ def check_options(values: Mapping[str, Any], known: Mapping[str, Any], where: st
     Args:
         values: as a user wrote them.
         known: the type of each name.
-        where: the start of the messages, such as a file or ``lerobot: option``.
+        where: the start of error messages, such as a file or ``lerobot: option``.
         word: what the values are, such as ``option`` or ``field``.
 
     Raises:
@@ -44,7 +44,7 @@ def from_json(kind: type[T], values: Any, where: Path | str) -> T:
     """Builds a dataclass from a JSON object; lists become tuples.
 
     Raises:
-        SourceError: it is no object, or a field is unknown, missing or of another type.
+        SourceError: ``values`` is not an object, or a field is unknown, missing or of another type.
     """
     hints = get_type_hints(kind)
     if not isinstance(values, Mapping):
@@ -60,7 +60,7 @@ def from_json(kind: type[T], values: Any, where: Path | str) -> T:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value that was parsed from JSON is of a type."""
+    """Returns whether a value that was parsed from JSON is of a type."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (types.UnionType, Union):
         return any(_fits(value, one) for one in inner)
@@ -76,7 +76,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _describe(hint: Any, many: bool = False) -> str:
-    """Says in words what a value of a type is."""
+    """Returns a description of a type's values in words."""
     origin, inner = get_origin(hint), [one for one in get_args(hint) if one not in (types.NoneType, ...)]
     if origin in (types.UnionType, Union):
         return " or ".join(_describe(one, many) for one in inner)

@@ -16,9 +16,9 @@ from rsjax.ingest.formats.hdf5 import attribute, rows
 from rsjax.sim.gl import choose_gl
 from rsjax.sim.playback import Playback, PlaybackError, camera_names, local_model
 
-FAR = 10.0  # metres, beyond which a depth map has 0, as a depth camera's has
+FAR = 10.0  # metres; a depth map has 0 beyond it, like that of a depth camera
 CURE = "render the file with robomimic's dataset_states_to_obs.py --camera_names …"
-_MOST_VIEWS = 1024  # kept for the steps of an ingest that read the same episode
+_MOST_VIEWS = 1024  # views kept for the steps of an ingest that read the same episode
 
 Pictures = tuple[dict[str, Frames], dict[str, Depths]]  # each by the camera's name
 View = tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]
@@ -28,12 +28,12 @@ def rendered(group: Any, path: Path, size: int) -> Pictures:
     """Returns the pictures and depth maps of a demo that has ``states`` and a ``model_file``.
 
     Args:
-        group: the demo's, of an HDF5 file.
+        group: the demo's group in an HDF5 file.
         path: the file.
-        size: of the pictures, in pixels along each side.
+        size: pixels along each side of a picture.
 
     Raises:
-        EpisodeError: it lacks one of them, or its model would load what the installed robosuite does not have.
+        EpisodeError: the demo lacks one of them, or its model would load what the installed robosuite does not have.
         GLError: there is no OpenGL library.
     """
     where = f"{path}: {group.name.lstrip('/')}"
@@ -41,7 +41,7 @@ def rendered(group: Any, path: Path, size: int) -> Pictures:
     if not isinstance(model, str) or "states" not in group:
         raise EpisodeError.at(where, "has neither pictures in obs nor states and model_file to render", CURE)
     try:
-        if model.endswith(".xml"):  # older demos keep it in a folder beside the file
+        if model.endswith(".xml"):  # older demos keep the model in a folder beside the file
             model = data_file(inside(path.parent / "models", model)).read_text("utf-8")
         model = local_model(model)
     except PlaybackError as error:
@@ -61,9 +61,9 @@ class RenderedStates:
     Attributes:
         model: MJCF, as :func:`rsjax.sim.playback.local_model` returns it.
         states: as :meth:`rsjax.sim.playback.Playback.render` takes them, a row for each frame.
-        camera: its name in the model.
+        camera: the camera's name in the model.
         size: S, pixels along each side.
-        where: the file and demo that messages name.
+        where: the file and demo that error messages name.
         depth: whether to return depth maps, in metres.
     """
 
@@ -110,11 +110,11 @@ class _Scene:
         self._playback.close()
 
 
-_scenes: list[_Scene] = []  # one of this process; those of the process that it was forked from stay untouched
+_scenes: list[_Scene] = []  # at most one is this process's; scenes from before a fork stay untouched
 
 
 def _scene(frames: RenderedStates) -> _Scene:
-    """Returns the open scene of these pictures, in place of another."""
+    """Returns the open scene of these pictures; opens it and closes any other scene if needed."""
     key = (frames.model, frames.camera, frames.size)
     own = [scene for scene in _scenes if scene.process == os.getpid()]
     if own and own[0].key == key:
@@ -122,12 +122,12 @@ def _scene(frames: RenderedStates) -> _Scene:
     _close()
     _scenes.append(_Scene(key, frames))
     atexit.unregister(_close)
-    atexit.register(_close)  # only now, as what mujoco registered on its import has to run later
+    atexit.register(_close)  # only now, since what mujoco registered on its import must run later
     return _scenes[-1]
 
 
 def _close() -> None:
-    """Frees the renderer: one that is left to the interpreter's exit prints errors."""
+    """Frees the renderer: one that is freed only when the interpreter exits prints errors."""
     for scene in [scene for scene in _scenes if scene.process == os.getpid()]:
         _scenes.remove(scene)
         scene.close()

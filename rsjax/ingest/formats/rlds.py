@@ -1,9 +1,9 @@
-"""RLDS data sets in TFRecord files (Bridge and others of Open X-Embodiment), one episode a record.
+"""Reads RLDS data sets in TFRecord files (Bridge and others of Open X-Embodiment), one episode per record.
 
 A folder contains ``{name}-{split}.tfrecord-00000-of-NNNNN`` and ``features.json``. An episode is flattened:
-``steps/observation/image_0`` is a list of T encoded pictures, ``steps/action`` T·7 numbers one after the other. Which
-feature is what differs from data set to data set: a :class:`KeyMap` says it, and is checked with ``features.json``. In
-RLDS the action of a step was done *after* its observation.
+``steps/observation/image_0`` is a list of T encoded pictures, ``steps/action`` is T·7 numbers one after the other. The
+meaning of the features differs between data sets: a :class:`KeyMap` states it, and is checked against
+``features.json``. In RLDS the action of a step was done *after* its observation.
 """
 
 import json
@@ -55,9 +55,9 @@ def open_source(
         path: the folder with the shards, one of its two parents (``name/1.0.0/``), or a single shard.
         keys: a named key map, the path of one as JSON (the fields of :class:`KeyMap`), or ``auto``: one proposed from
             ``features.json``, which is printed; "": the one for the data set's name.
-        split: the only one to read; "": all.
+        split: the only split to read; "": all.
         fps: steps per second, in place of the key map's; 0: the key map's.
-        kind: of the actions, likewise; None: the key map's.
+        kind: kind of the actions, likewise; None: the key map's.
         held: likewise.
 
     Raises:
@@ -99,10 +99,10 @@ class RldsSource:
 
     Attributes:
         folder: where the shards are.
-        shards: their file names, in order.
-        keys: which feature is what.
-        single: whether the user named one shard, not a folder, so that no others are missing.
-        sides: height and width of depth maps, by their features.
+        shards: the shards' file names, in order.
+        keys: the meaning of the features.
+        single: whether the user named one shard, not a folder, so that no other shards are missing.
+        sides: height and width of depth maps, by feature.
     """
 
     name = "rlds"
@@ -113,7 +113,7 @@ class RldsSource:
     sides: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def episodes(self) -> Iterator[EpisodeRef]:
-        """Lists every record of every shard; one that cannot be read stands for what a damaged shard lacks."""
+        """Lists every record of every shard; one unreadable entry stands for all that a damaged shard lacks."""
         expected = _expected(self.folder)
         for shard in self.shards:
             match = _SHARD.fullmatch(shard)
@@ -125,7 +125,7 @@ class RldsSource:
             yield from self._missing_shards()
 
     def _missing_shards(self) -> Iterator[EpisodeRef]:
-        """Yields a reference for each split of which shards are missing, by the names of the others."""
+        """Yields a reference for each split that lacks shards, judged by the names of its other shards."""
         numbers: dict[tuple[str, str, int], set[int]] = {}
         for match in filter(None, map(_SHARD.fullmatch, self.shards)):
             numbers.setdefault((match["name"], match["split"], int(match["shards"])), set()).add(int(match["number"]))
@@ -137,7 +137,7 @@ class RldsSource:
                 yield broken(safe_id(f"{split}-missing"), message)
 
     def read(self, ref: EpisodeRef) -> Episode:
-        """Reads one record. Cameras with a placeholder of one colour are left out, ``meta["blank"]`` names them."""
+        """Reads one record. Cameras with a placeholder of one colour are left out; ``meta["blank"]`` names them."""
         example = read_record(self.folder, ref)
         cameras, blank = _cameras(example, self.keys)
         if not cameras:
@@ -189,9 +189,9 @@ class RldsSource:
 
 
 def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], list[str]]:
-    """Returns the cameras by name, and the names of the placeholders: all pictures the same, of one colour.
+    """Returns the cameras by name, and the names of placeholders, whose pictures are all the same and of one colour.
 
-    BridgeData has flags for these (``has_image_0``), but files exist in which they are all false.
+    BridgeData has flags for placeholders (``has_image_0``), but files exist in which all flags are false.
     """
     frames = {
         name: EncodedFrames(example.blobs(f"steps/{key}"), f"{example.where}: steps/{key}")
@@ -206,7 +206,7 @@ def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], 
 
 
 def _joined(example: Example, keys: Sequence[str], count: int) -> tuple[Float32[np.ndarray, "N n"], list[str]]:
-    """Returns these features one after the other, and a name for each dimension."""
+    """Returns these features side by side, and a name for each dimension."""
     parts = [example.numbers(f"steps/{key}", count) for key in keys]
     widths = [part.shape[1] for part in parts]
     names = [f"{key}[{n}]" if width > 1 else key for key, width in zip(keys, widths, strict=True) for n in range(width)]
@@ -228,7 +228,7 @@ def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
 
 
 def _metadata(example: Example) -> dict[str, Any]:
-    """Returns the features of the episode itself that are a single text or number."""
+    """Returns those features of the episode itself that are a single text or number."""
     prefix, values = "episode_metadata/", {}
     for name in example.names():
         if name.startswith(prefix) and len(value := example.plain(name)) == 1:

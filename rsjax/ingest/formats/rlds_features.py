@@ -1,4 +1,4 @@
-"""The features of an RLDS data set's steps, by its ``features.json``, and a key map proposed from them."""
+"""Reads the features of an RLDS data set's steps from its ``features.json``, and proposes a key map from them."""
 
 import re
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from rsjax.ingest.formats.keymap import MAPS, KeyMap
 
 _TEXT = re.compile(r"instruction|language|task")
 _STATE = re.compile(r"state|proprio|pose|position|joint|gripper|eef|effector")
-_WIDEST = 64  # numbers of a state: more are an embedding
+_WIDEST = 64  # largest size of a state; more numbers are an embedding
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Feature:
 
     Attributes:
         kind: ``image``, ``text``, ``tensor`` or ``other``.
-        shape: of a step's value, -1 for an open length; None if the file does not say.
+        shape: shape of a step's value, -1 for an open length; None if the file does not say.
         dtype: such as ``uint8``, "" if the file does not say.
     """
 
@@ -31,13 +31,13 @@ class Feature:
 
     @property
     def is_row(self) -> bool:
-        """Whether it is one or a few floats."""
+        """Returns whether it is one or a few floats."""
         few = self.shape is None or (len(self.shape) <= 1 and (self.shape or (1,))[0] <= _WIDEST)
         return self.kind == "tensor" and few and self.dtype in ("", "float32", "float64")
 
     @property
     def is_map(self) -> bool:
-        """Whether it has one channel, as depth maps have."""
+        """Returns whether it has one channel, as depth maps have."""
         if self.kind == "image":
             return self.shape is not None and self.shape[2:] == (1,)
         return (
@@ -49,11 +49,11 @@ def step_features(path: Path, content: Mapping[str, Any]) -> dict[str, Feature]:
     """Returns the features of a step by their keys below ``steps/``; none if the file is empty.
 
     Args:
-        path: of ``features.json``, for messages.
-        content: its content.
+        path: path of ``features.json``, for error messages.
+        content: content of the file.
 
     Raises:
-        SourceError: it is not such as TFDS writes.
+        SourceError: the content is not in the form that TFDS writes.
     """
     try:
         steps = content.get("featuresDict", {}).get("features", {}).get("steps", {})
@@ -78,12 +78,12 @@ def _features(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Feature]:
 
 
 def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
-    """Returns a key map by the features' names, kinds and shapes, which do not say what the actions' numbers are.
+    """Returns a key map by the features' names, kinds and shapes; these do not say what the actions' numbers mean.
 
     Args:
-        path: of ``features.json``, for messages.
-        features: of a step.
-        fps: steps per second, which no file says.
+        path: path of ``features.json``, for error messages.
+        features: the features of a step.
+        fps: steps per second, which no file states.
 
     Raises:
         SourceError: there are no pictures or no actions, or ``fps`` is 0.
@@ -119,7 +119,10 @@ def _name(key: str) -> str:
 
 
 def _pairs(cameras: Mapping[str, str], maps: Mapping[str, str]) -> dict[str, str]:
-    """Returns the depth maps by the camera whose name is the same but for words such as ``depth`` and ``rgb``."""
+    """Returns each camera's depth maps.
+
+    A single camera has the only maps; otherwise the names must match without words such as ``depth`` and ``rgb``.
+    """
 
     def bare(name: str) -> str:
         return "_".join(word for word in name.split("_") if word not in ("depth", "image", "rgb", "color"))
@@ -134,8 +137,8 @@ def check_keys(keys: KeyMap, path: Path, features: Mapping[str, Feature]) -> Non
     """Checks that a data set has each feature of a map.
 
     Args:
-        path: of ``features.json``, for messages.
-        features: of a step; nothing is checked if there are none.
+        path: path of ``features.json``, for error messages.
+        features: the features of a step; nothing is checked if there are none.
 
     Raises:
         SourceError: a feature is missing or of another kind.

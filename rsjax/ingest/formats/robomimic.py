@@ -1,9 +1,9 @@
-"""robomimic HDF5 files: ``data/demo_i`` with ``actions`` and ``obs/<key>``, ``mask/<filter>`` that lists demos.
+"""Reads robomimic HDF5 files: ``data/demo_i`` has ``actions`` and ``obs/<key>``; ``mask/<filter>`` lists demos.
 
 ``obs[t]`` was recorded before ``actions[t]``, which led to ``obs[t + 1]``. robosuite's own demos have no ``obs``, and
-robomimic's downloads have no pictures in it: both are rendered from their simulator states, as far as the installed
-robosuite has the models (:mod:`rsjax.ingest.formats.rendered`). LIBERO's files have the same layout with other
-conventions (:mod:`rsjax.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
+robomimic's downloads have no pictures in it: both are rendered from their simulator states, if the installed robosuite
+has the models (:mod:`rsjax.ingest.formats.rendered`). LIBERO's files have the same layout with other conventions
+(:mod:`rsjax.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
 """
 
 from collections.abc import Iterator
@@ -39,13 +39,13 @@ class Convention:
     """The differences between the data sets of this layout.
 
     Attributes:
-        name: of the format.
-        endings: of the pictures' keys below ``obs``, after the camera's name.
+        name: name of the format.
+        endings: endings of the pictures' keys below ``obs``, after the camera's name.
         states: keys below ``obs`` that make up the state, as far as a file has them.
-        quaternions: those of them that are one; their sign is made continuous.
+        quaternions: those of these keys that are a quaternion, whose sign is made continuous.
         after: whether ``obs[t]`` was recorded after ``actions[t]``.
         stored: as in :class:`rsjax.ingest.formats.hdf5.H5Frames`.
-        fps: if the file does not say.
+        fps: frames per second if the file does not say.
     """
 
     name: str
@@ -69,10 +69,10 @@ def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 1
     """Opens a robomimic data set.
 
     Args:
-        path: an HDF5 file, or a folder of such.
+        path: an HDF5 file, or a folder of HDF5 files.
         filter: read only demos that ``mask/<filter>`` lists, such as ``train``.
-        depth: take ``obs/<camera>_depth`` as metres. Demos that are rendered always have depth.
-        size: side in pixels of pictures that are rendered, 8 to 1024.
+        depth: read ``obs/<camera>_depth`` as metres. Rendered demos always have depth.
+        size: side of rendered pictures in pixels, 8 to 1024.
 
     Raises:
         SourceError: there are no files, none has pictures or can be rendered, or an option is impossible.
@@ -100,12 +100,12 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool, siz
                     _check_pictures(source, content[f"data/{demos[0]}"], file)
             break
         except (EpisodeError, KeyError):
-            continue  # its episodes are listed, and refused one by one
+            continue  # its episodes are still listed, and refused one by one
     return source
 
 
 def _check_pictures(source: "DemoSource", group: Any, path: Path) -> None:
-    """Raises :class:`SourceError` if a demo neither has pictures nor can be rendered."""
+    """Raises :class:`SourceError` if a demo has no pictures and cannot be rendered."""
     if not _picture_keys(group.get("obs", {}), source.convention):
         try:
             source.pictures(group, path)
@@ -118,13 +118,13 @@ class DemoSource:
     """See :class:`rsjax.ingest.episode.EpisodeSource`.
 
     Attributes:
-        folder: what the files' names are relative to.
-        files: in order.
+        folder: the folder to which the files' names are relative.
+        files: the files, in order.
         convention: how to read them.
-        filter: of demos; "": all.
+        filter: name of a filter of demos; "": all.
         depth: whether depth maps are read.
-        name: the convention's.
-        size: side in pixels of pictures that are rendered.
+        name: the convention's name.
+        size: side of rendered pictures in pixels.
     """
 
     folder: Path
@@ -169,7 +169,7 @@ class DemoSource:
         fps = fps_of(settings, path) or how.fps
         states, flipped = _states(group.get("obs", {}), how, path)
         named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
-        width = commands.shape[1]  # a gripper is the last dimension of each arm's seven, of other robots the last alone
+        width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
         grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
         return Episode(
             id=ref.id,
@@ -195,7 +195,7 @@ class DemoSource:
         """Returns the pictures and depth maps of a demo by camera, rendered if it has none.
 
         Raises:
-            EpisodeError: they have another shape or type, or a demo without pictures cannot be rendered.
+            EpisodeError: pictures have another shape or type, or a demo without pictures cannot be rendered.
         """
         observed, stored = group.get("obs", {}), self.convention.stored
         keys = _picture_keys(observed, self.convention)
@@ -213,8 +213,8 @@ class DemoSource:
         """Returns the demos of a file in the order of their numbers.
 
         Raises:
-            SourceError: it has no such filter.
-            EpisodeError: it cannot be read.
+            SourceError: the file has no such filter.
+            EpisodeError: the file cannot be read.
         """
         with open_file(path) as file:
             data = member(file, "data", path)
@@ -244,7 +244,7 @@ def _picture_keys(observed: Any, how: Convention) -> dict[str, str]:
 
 
 def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndarray, "N S"] | None, dict[str, int]]:
-    """Returns what the robot measured, and in how many rows of which field a quaternion's sign was turned back."""
+    """Returns the measured states, and in how many rows of which field the sign of a quaternion was flipped back."""
     parts, flipped = [], {}
     for key in (key for key in how.states if key in observed):
         part = rows(observed, key, path)
@@ -261,6 +261,6 @@ def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndar
 
 
 def _number(demo: str) -> tuple[int, str]:
-    """Sorts ``demo_10`` after ``demo_9``."""
+    """Returns a key by which ``demo_10`` is sorted after ``demo_9``."""
     digits = demo.rpartition("_")[2]
     return (int(digits) if digits.isdecimal() else -1), demo

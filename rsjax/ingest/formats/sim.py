@@ -1,7 +1,7 @@
-"""The project's own simulators: a store of clips that ``rsjax.sim`` collected, each clip an episode.
+"""Reads a store of clips that this project's simulators (``rsjax.sim``) made; each clip is an episode.
 
-A clip's actions, depth (if it is in metres) and task are taken as they are; its exact keypoint tracks stay in the
-store, and ``meta["clip"]`` says where. Any other store of clips is read in the same way for checks.
+A clip's actions, depth (if it is in metres) and task are taken unchanged; its exact keypoint tracks stay in the store,
+and ``meta["clip"]`` says where. Any other store of clips is read in the same way for checks.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ from rsjax.ingest.episode import (
 )
 from rsjax.ingest.pictures import ArrayFrames
 
-FPS = 5.0  # of a clip that does not say how it was made
+FPS = 5.0  # assumed for a clip that does not say how it was made
 _CURE = f"make the store again or {LEAVE_OUT}"
 
 
@@ -38,14 +38,14 @@ def open_source(
     """Opens a store of clips.
 
     Args:
-        path: its directory.
-        split: the only one to read; "": all.
-        kind: of the actions in clips that no simulator of this project made; see
+        path: the store's directory.
+        split: the only split to read; "": all.
+        kind: kind of the actions in clips that no simulator of this project made; see
             :class:`rsjax.ingest.actions.Layout`.
-        held: their dimensions that stay in force, such as a gripper's; None: nobody says.
+        held: dimensions of these actions that stay in force, such as a gripper's; None: not declared.
 
     Raises:
-        SourceError: it is no whole store of clips, or has no such split.
+        SourceError: ``path`` is not a complete store of clips, or has no such split.
     """
     try:
         store = open_store(path)
@@ -63,9 +63,9 @@ class StoreSource:
     """See :class:`rsjax.ingest.episode.EpisodeSource`.
 
     Attributes:
-        store: of clips.
-        splits: those that are read.
-        kind: of undeclared actions; see :func:`open_source`.
+        store: the store of clips.
+        splits: the splits that are read.
+        kind: kind of undeclared actions; see :func:`open_source`.
         held: likewise.
     """
 
@@ -137,7 +137,7 @@ class StoreSource:
 
 
 def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, Float[np.ndarray, " N"]]:
-    """Returns frames per second and the time of each frame, by a simulator's clock or its number in the recording."""
+    """Returns frames per second and each frame's time, by a simulator's clock or by the times in the recording."""
     if "control_hz" in provenance:
         fps = float(provenance["control_hz"]) / steps
     elif count > 1 and len(provenance.get("frames", ())) == count:
@@ -150,7 +150,7 @@ def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, F
 
 
 def _check_arrays(record: Record, where: str) -> None:
-    """Raises :class:`EpisodeError` if a clip's arrays do not have the types and shapes of a clip's."""
+    """Raises :class:`EpisodeError` if a record's arrays do not have the types and shapes of a clip."""
     if not np.isfinite(record.get("tracks", 0.0)).all():
         raise EpisodeError.at(where, "tracks are not all finite", _CURE)
     wanted = {"rgb": (np.uint8, 4), "actions": (np.floating, 2)}

@@ -1,7 +1,7 @@
-"""TFRecord files and the ``tf.train.Example`` messages in them, without TensorFlow.
+"""Reads TFRecord files and the ``tf.train.Example`` messages in them, without TensorFlow.
 
-A record is: its length (uint64), a checksum of that, the payload, a checksum of that; all little-endian. Checksums are
-CRC-32C, rotated and offset ("masked"). The reader that Grain brings checks neither.
+A record has its length (uint64), a checksum of the length, the payload and a checksum of the payload, all
+little-endian. Checksums are CRC-32C, rotated and offset ("masked"). Grain's own reader checks neither of them.
 """
 
 import struct
@@ -50,9 +50,9 @@ message_type {
 
 
 def spans(path: Path) -> Iterator[tuple[int, int, int]]:
-    """Yields each record's offset and payload length, both in bytes, and the masked checksum written behind it.
+    """Yields each record's offset and payload length, both in bytes, and the masked checksum after the payload.
 
-    Only heads and checksums are read.
+    It reads only heads and checksums.
 
     Raises:
         EpisodeError: the file cannot be read, or is damaged after the last record that was yielded.
@@ -77,13 +77,13 @@ def spans(path: Path) -> Iterator[tuple[int, int, int]]:
 
 
 def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], settings: Any) -> Iterator[EpisodeRef]:
-    """Lists the records of a file as episodes; one that cannot be read stands for what a damaged file lacks.
+    """Lists the records of a file as episodes; one unreadable episode stands for all that a damaged file lacks.
 
     Args:
-        root: of the data set.
-        file: relative to ``root``.
-        ids: template of the episodes' ids, in which their number is filled in.
-        expected: how many records there should be, and what says so.
+        root: folder of the data set.
+        file: the file, relative to ``root``.
+        ids: template of the episodes' ids, which their number completes.
+        expected: how many records there should be, and words for what says so.
         settings: what else the episodes depend on, for their fingerprints.
     """
     number = 0
@@ -98,14 +98,14 @@ def record_refs(root: Path, file: str, ids: str, expected: tuple[int, str], sett
 
 
 def read_record(root: Path, ref: EpisodeRef) -> "Example":
-    """Reads the record of a reference that :func:`record_refs` made; :class:`EpisodeError` if it is damaged."""
+    """Reads the record of a reference from :func:`record_refs`; raises :class:`EpisodeError` if it is damaged."""
     location = location_of(ref)
     path = inside(root, location["file"])
     return Example(read_payload(path, location["offset"], location["length"]), f"{path}: record {ref.id}")
 
 
 def read_payload(path: Path, offset: int, length: int) -> bytes:
-    """Returns the payload of a record whose place :func:`spans` gave.
+    """Returns the payload of a record at a place from :func:`spans`.
 
     Raises:
         EpisodeError: the file cannot be read, has changed, or its checksum is wrong.
@@ -122,14 +122,14 @@ def read_payload(path: Path, offset: int, length: int) -> bytes:
 
 
 class Example:
-    """One message: lists of values by the feature's name.
+    """A decoded message: lists of values by the feature's name.
 
     Args:
-        payload: the message.
-        where: the file and record that messages name.
+        payload: the encoded message.
+        where: the file and record that error messages name.
 
     Raises:
-        EpisodeError: it is no ``tf.train.Example``.
+        EpisodeError: the payload is not a ``tf.train.Example``.
     """
 
     def __init__(self, payload: bytes, where: str) -> None:
@@ -146,10 +146,10 @@ class Example:
         return sorted(self._features)
 
     def numbers(self, name: str, rows: int) -> Float32[np.ndarray, "T n"]:
-        """Returns a feature of floats or integers, cut into this many rows.
+        """Returns a feature of floats or integers, split into this many rows.
 
         Raises:
-            EpisodeError: there is no such feature, it has other values, or they do not fill the rows.
+            EpisodeError: there is no such feature, its values are of another type, or they do not fill the rows.
         """
         values = self._values(name, ("float_list", "int64_list"))
         if rows == 0 or not len(values) or len(values) % rows:
@@ -166,11 +166,11 @@ class Example:
         return list(self._values(name, ("bytes_list",)))
 
     def is_bytes(self, name: str) -> bool:
-        """Whether a feature's values are byte strings."""
+        """Returns whether a feature's values are byte strings."""
         return name in self and self._features[name].WhichOneof("kind") == "bytes_list"
 
     def plain(self, name: str) -> list[str | int | float]:
-        """Returns a feature's values of whatever kind, JSON-ready; byte strings as text."""
+        """Returns a feature's values of any kind, JSON-ready; byte strings become text."""
         values = self._values(name, ("bytes_list", "float_list", "int64_list"))
         return [value.decode("utf-8", "replace") if isinstance(value, bytes) else value for value in values]
 
@@ -186,13 +186,13 @@ class Example:
 
 @lru_cache(maxsize=1)
 def message_class() -> Any:
-    """Returns the message class ``tf.train.Example``, of a pool of its own so that TensorFlow can be imported too."""
+    """Returns the message class ``tf.train.Example``, from a separate pool, so that TensorFlow can be imported too."""
     pool = descriptor_pool.DescriptorPool()
     pool.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("tensorflow.Example"))
 
 
 def masked_crc(data: bytes) -> int:
-    """Returns the checksum as TFRecord files store it."""
+    """Returns the masked checksum that TFRecord files store."""
     crc = google_crc32c.value(data)
     return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
