@@ -15,7 +15,7 @@ DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in t
 
 def imagination(trained: TrainedModel, clips: int) -> Imagination:
     """Returns an imagination that generates clips frame by frame, in the family's own way if it has one."""
-    if getattr(type(trained.model), "imagine", None) is WorldModel.imagine:
+    if type(trained.model).imagine is WorldModel.imagine:
         return Continued(trained)
     return trained.model.imagine(trained.params, trained.assets, clips)
 

@@ -96,11 +96,14 @@ def judge(frames: np.ndarray) -> np.ndarray:
 
 def imagined(count: int, pace: float = 1.0, judge: Any = judge) -> Imagined:
     """A world of ``count`` imagined episodes."""
-    imagination = ToyImagination(pace, count)
-    model = SimpleNamespace(imagine=lambda params, assets, count: imagination)
+
+    class Model:
+        def imagine(self, params: Any, assets: Any, count: int) -> ToyImagination:
+            return ToyImagination(pace, count)
+
     config = SimpleNamespace(prompt_frames=1, clips=None, tokenizer=None, model=None)
     assets = SimpleNamespace(normalization=None, tokenizer=None)
-    trained = SimpleNamespace(config=config, model=model, params={"pace": pace}, assets=assets)
+    trained = SimpleNamespace(config=config, model=Model(), params={"pace": pace}, assets=assets)
     low = np.full(CONTROLS * WIDTH, -RANGE, np.float32)
     return Imagined(trained, count, judge, low, -low)
 
