@@ -67,11 +67,12 @@ def tiny() -> Config:
             norm_groups=8,
             local_codes=True,
             vocabularies=6,
+            compute_dtype="bfloat16",  # 0.81 times the time of a step on a CPU with bf16 units
         ),
         # Small batches, since in a few minutes the number of steps matters most. The weights are chosen for PSNR; the
         # reference's entropy weight (0.1) spreads codes further at the cost of reconstruction.
         tokenizer_train=TokenizerTrainConfig(
-            steps=650,
+            steps=1100,
             batch_size=8,
             frames_per_clip=2,
             depth_share=0.2,
@@ -84,7 +85,7 @@ def tiny() -> Config:
             commitment_weight=0.1,
             sharding="jit",
             checkpoint_every=500,
-            eval_every=325,
+            eval_every=550,
         ),
         model=RoboScapeConfig(
             width=128,
