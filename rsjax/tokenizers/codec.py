@@ -118,4 +118,11 @@ def in_chunks(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:
-    return cast(ArrayLike, Tokenizer(config).apply({"params": params}, x, method=method))
+    """Encodes or decodes images: on a single CPU one by one, so that an image's features stay in its cache."""
+
+    def run(images: ArrayLike) -> jax.Array:
+        return cast(jax.Array, Tokenizer(config).apply({"params": params}, images, method=method))
+
+    if jax.default_backend() == "cpu" and jax.local_device_count() == 1:
+        return jax.lax.map(lambda image: run(image[None])[0], x)
+    return run(x)
