@@ -1,5 +1,7 @@
 """Computes one batch on all of this process's devices: parameters on each, the batch's rows divided among them."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -34,3 +36,28 @@ def divide(batch: Tree, params: Any) -> Tree:
         return jax.device_put(x, NamedSharding(place.mesh, P() if np.shape(x)[0] % place.mesh.size else P(_ROWS)))
 
     return jax.tree.map(put, batch)
+
+
+def map_rows(run: Callable[[Any, Any], Any], params: Any, batch: Any, mesh: Mesh | None) -> Any:
+    """Returns the results of ``run(params, row)`` for all rows of a batch; each device runs its own rows one by one.
+
+    Args:
+        mesh: of a batch that is divided among devices, from :func:`mesh_of`; None: of any other.
+    """
+
+    def on_device(params: Any, rows: Any) -> Any:
+        return jax.lax.map(partial(run, params), rows)
+
+    if mesh is None:
+        return on_device(params, batch)
+    return jax.shard_map(on_device, mesh=mesh, in_specs=(P(), P(_ROWS)), out_specs=P(_ROWS), check_vma=False)(
+        params, batch
+    )
+
+
+def mesh_of(batch: Any) -> Mesh | None:
+    """Returns the mesh of an array whose rows :func:`divide` divided among devices; None for any other array."""
+    place = getattr(batch, "sharding", None)
+    if isinstance(place, NamedSharding) and isinstance(place.mesh, Mesh) and place.spec == P(_ROWS):
+        return place.mesh
+    return None

@@ -20,7 +20,8 @@ from rsjax.tokenizers.flops import tokenizer_flops
 EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations per second for the rest
-TOKENIZER_RATE = 4.1e10  # operations per second of the tokenizer's training, with Muon
+# Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
+TOKENIZER_RATE = 4.6e10
 # Seconds per step of autoencoder and of model in each family's small preset, on the same machine while it was idle.
 # 1.02 and 0.74 are estimates: 1.33 and 0.87 were measured with a slower attention, and are scaled by the speed-ups
 # that a busy machine measured (docs/performance.md).

@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias, cast
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
@@ -14,7 +15,7 @@ from rsjax.clip import Video
 from rsjax.config import TokenizerConfig
 from rsjax.data.depth_color import color_to_depth, depth_to_color
 from rsjax.data.normalization import Normalization
-from rsjax.devices import divide
+from rsjax.devices import divide, map_rows, mesh_of
 from rsjax.errors import UserError
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -116,13 +117,17 @@ def in_chunks(
     return joined.reshape(*lead, *joined.shape[1:])
 
 
-@partial(jax.jit, static_argnums=(0, 1))
 def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:
-    """Encodes or decodes images: on a single CPU one by one, so that an image's features stay in its cache."""
+    return _run(config, method, mesh_of(x), params, x)
 
-    def run(images: ArrayLike) -> jax.Array:
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _run(config: TokenizerConfig, method: str, mesh: Mesh | None, params: Params, x: ArrayLike) -> ArrayLike:
+    """Encodes or decodes images: on a CPU one by one, so that an image's features stay in the processor's cache."""
+
+    def run(params: Params, images: ArrayLike) -> jax.Array:
         return cast(jax.Array, Tokenizer(config).apply({"params": params}, images, method=method))
 
-    if jax.default_backend() == "cpu" and jax.local_device_count() == 1:
-        return jax.lax.map(lambda image: run(image[None])[0], x)
-    return run(x)
+    if jax.default_backend() == "cpu":
+        return map_rows(lambda params, image: run(params, image[None])[0], params, x, mesh)
+    return run(params, x)
