@@ -56,7 +56,7 @@ def tiny() -> Config:
         name="tiny",
         sim=SimConfig(episodes=800, test_episodes=100, camera="near"),
         # Six vocabularies of 8 codes: many codes of a validation clip never occur in the training clips, but their
-        # sub-tokens do (20.4 dB on validation clips after 600 steps, against 20.0 with two vocabularies of 512).
+        # sub-tokens do. Chosen on an earlier model; two vocabularies of 512 do as well now (docs/results/paper.md).
         tokenizer=TokenizerConfig(
             # Patches of 4 pixels: a step takes two thirds of the time that it takes with patches of 2, half of the
             # channels and a third level (docs/results/miniature.md). The model, which limits quality, gets that time.
