@@ -6,12 +6,13 @@ from pathlib import Path
 
 import tyro
 
-from experiments.cli import main_errors, parse_options
+from experiments.cli import main_errors, parse_options, part
+from rsjax.policies.judging import JudgeSettings
 from rsjax.runtime import tune_process
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(JudgeSettings):
     """Trains a classifier (success, fail, uninterpretable) on a run's clips, and validates it on held-out video."""
 
     run: tyro.conf.Positional[Path] = tyro.MISSING
@@ -20,16 +21,6 @@ class Options:
     """Directory of simulated data sets."""
     store: Path | None = None
     """The new path of the run's store of ingested clips, if it was moved."""
-    steps: int = 1000
-    """Training steps."""
-    clips: int = 1000
-    """Largest number of training clips."""
-    reconstructed: int = 200
-    """Number of training clips that are also shown as the tokenizer reconstructs them."""
-    validation_clips: int = 100
-    """Largest number of held-out clips."""
-    seed: int = 0
-    """Seed of the training."""
 
 
 @main_errors()
@@ -40,12 +31,9 @@ def main() -> None:
     from rich.console import Console
 
     from rsjax.policies.judge_validation import table
-    from rsjax.policies.judging import JudgeSettings, make_judge
+    from rsjax.policies.judging import make_judge
 
-    settings = JudgeSettings(
-        options.steps, options.clips, options.reconstructed, options.validation_clips, options.seed
-    )
-    result = make_judge(options.run, options.data_dir, options.store, settings)
+    result = make_judge(options.run, options.data_dir, options.store, part(options, JudgeSettings))
     Console().print(table(result))
     print(options.run / "judge")
 

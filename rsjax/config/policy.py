@@ -44,7 +44,6 @@ class PolicyConfig:
     pool: bool = True  # whether the ResNet's stem halves the picture a second time
     keypoints: int = 32  # of the spatial softmax
     features: int = 64  # of each frame
-    compute_dtype: str = runtime("float32")
     train: LoopConfig = LoopConfig(
         steps=100_000, batch_size=64, optimizer=PUBLIC_OPTIMIZER, ema=0.9999, checkpoint_every=1000, log_every=100
     )
@@ -70,6 +69,12 @@ class PolicyConfig:
             0 < self.sample_steps <= self.noise_steps and self.noise_steps % self.sample_steps == 0,
             f"policy.sample_steps is {self.sample_steps}; it divides policy.noise_steps = {self.noise_steps}",
         )
+
+    def fitted(self, controls: int) -> "PolicyConfig":
+        """Returns the same settings, with plans and their executed part rounded up to whole frames of ``controls``."""
+        size = math.lcm(controls, 2 ** (len(self.channels) - 1))
+        horizon, execute = -(-self.horizon // size) * size, -(-self.execute // controls) * controls
+        return replace(self, horizon=horizon, execute=execute)
 
 
 def public() -> PolicyConfig:

@@ -1,6 +1,6 @@
 """Checks that a world model takes actions, and that the actions a policy sends to an environment are valid."""
 
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -13,6 +13,12 @@ OutOfRange: TypeAlias = Literal["clip", "refuse"]
 
 class ActionError(UserError):
     """An action of the wrong shape, with a value that is not finite, or out of range. The message says which."""
+
+
+def check_out_of_range(value: str) -> None:
+    """Raises :class:`UserError` unless the value is one of ``OutOfRange``."""
+    if value not in get_args(OutOfRange):
+        raise UserError(f"out_of_range is {value!r}; it is clip or refuse")
 
 
 def check_takes_actions(model: ModelConfig, name: str = "the model") -> None:

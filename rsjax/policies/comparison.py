@@ -25,8 +25,13 @@ from rsjax.report.video import write_mp4
 
 SHARES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75)  # of the training after which policies are saved, before its end
 
-NUMBERS = {"r2_line": "R² of the line", "r2_identity": "R² of y = x", "r2_prediction": "R² of y for x"}
-NUMBERS |= {"spearman": "Spearman", "mmrv": "MMRV"}
+NUMBERS = {
+    "r2_line": "R² of the line",
+    "r2_identity": "R² of y = x",
+    "r2_prediction": "R² of y for x",
+    "spearman": "Spearman",
+    "mmrv": "MMRV",
+}
 FORMULAS = (
     "x: success in the simulator, y: in the world model. R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²; R² of y for x, a "
     "prediction of x, is 1 - Σ(y - x)² / Σ(x - x̄)². Where y spreads more than x, the first is higher; signs may differ."

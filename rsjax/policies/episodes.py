@@ -18,7 +18,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.pipeline.trained import load
-from rsjax.policies.actions import OutOfRange, check_takes_actions, checked_actions
+from rsjax.policies.actions import OutOfRange, check_out_of_range, check_takes_actions, checked_actions
 from rsjax.policies.judging import judge_of
 from rsjax.policies.simulator import FAR, STEPS, UNIT, Observation
 from rsjax.policies.starts import Starts
@@ -47,6 +47,11 @@ class Settings:
     max_steps: int = STEPS
     judge: Judge | Path | str | None = "run"
     out_of_range: OutOfRange = "clip"
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1:
+            raise UserError(f"max_steps is {self.max_steps}; an episode has at least 1 step")
+        check_out_of_range(self.out_of_range)
 
 
 @dataclass(frozen=True)
@@ -84,8 +89,6 @@ class Episodes:
     """
 
     def __init__(self, run: Path | str | TrainedModel, count: int | None, settings: Settings) -> None:
-        if settings.max_steps < 1:
-            raise UserError(f"max_steps is {settings.max_steps}; an episode has at least 1 step")
         self._lead = () if count is None else (count,)
         count = count or 1
         trained = run if isinstance(run, TrainedModel) else load(run)

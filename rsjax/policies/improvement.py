@@ -1,5 +1,6 @@
 """Improves a policy in imagination: it acts in the world model, and learns from what the judge calls a success."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ class Improvement:
         max_steps: steps of an episode, at most.
         steps: fine-tuning steps in each round.
         share: share of old demonstrations in the data for fine-tuning, at least 0 and below 1.
-        learning_rate: of fine-tuning, as a share of the training's learning rate.
+        learning_rate: learning rate of fine-tuning, as a share of the training's.
     """
 
     rounds: int = 2
@@ -49,6 +50,8 @@ class Improvement:
         for name in ("rounds", "imagined", "max_steps", "steps"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        if not 0 < self.learning_rate < math.inf:
+            raise UserError(f"--learning-rate is {self.learning_rate}; it is a share of the training's, above 0")
         if not 0 <= self.share < 1:
             raise UserError(f"--share is {self.share}; it is a share of old demonstrations, 0 to below 1")
 
@@ -140,11 +143,7 @@ def imagine(
             if not file.exists():
                 actor = policy.actor(begins + first)
                 episodes = run_together(model, actor, group, settings.max_steps)
-                good = [
-                    {"rgb": one.rgb, "actions": one.actions}
-                    for one in episodes
-                    if one.success.any() and len(one.rgb) > 1
-                ]
+                good = [{"rgb": one.rgb, "actions": one.actions} for one in episodes if one.success.any()]
                 done = {name: int(sum(getattr(one, name) for one in episodes)) for name in counts}
                 write_file(file, encode({"clips": [encode(one) for one in good], **done}))
             kept = decode(file.read_bytes())

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import linen as nn
-from flax.errors import ScopeParamShapeError
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -57,11 +56,13 @@ class TrainedJudge:
     """A trained network and the temperature that calibrates it; a :class:`rsjax.policies.verdicts.Judge`.
 
     Attributes:
+        side: of the frames that it was trained on, pixels.
         validation: the content of its ``validation.json``, if it was validated.
     """
 
     params: Any
     temperature: float
+    side: int
     validation: dict[str, Any] | None = None
 
     @cached_property
@@ -78,7 +79,7 @@ class TrainedJudge:
     def save(self, folder: Path) -> None:
         """Writes what :func:`load_judge` reads, atomically."""
         arrays = {"/".join(path): np.asarray(x) for path, x in flatten_dict(self.params).items()}
-        write_file(folder / FILE, encode(arrays | {"temperature": self.temperature}))
+        write_file(folder / FILE, encode(arrays | {"temperature": self.temperature, "side": self.side}))
 
 
 def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
@@ -93,20 +94,18 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     path, report = folder / FILE, folder / VALIDATION
     try:
         record = decode(path.read_bytes())
-        temperature = float(record.pop("temperature"))
+        temperature, trained_on = float(record.pop("temperature")), int(record.pop("side"))
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{path}: damaged ({error}); train it again with python -m experiments.judge RUN") from error
-    judge = TrainedJudge(unflatten_dict({tuple(name.split("/")): x for name, x in record.items()}), temperature)
-    if side is not None:
-        try:
-            jax.eval_shape(_logits, judge.params, np.zeros((1, HISTORY, side, side, 3), np.uint8))
-        except ScopeParamShapeError as error:
-            raise UserError(
-                f"{path}: was trained on frames of another size, these have {side} × {side} pixels; train one on such "
-                f"with python -m experiments.judge RUN"
-            ) from error
+    if side not in (None, trained_on):
+        raise UserError(
+            f"{path}: was trained on frames of {trained_on} × {trained_on} pixels, these have {side} × {side}; train "
+            f"one on such frames with python -m experiments.judge RUN"
+        )
+    params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
+    judge = TrainedJudge(params, temperature, trained_on)
     found = read_json(report, cure="train the judge again") if report.exists() else None
     # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
     return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge
@@ -155,7 +154,7 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
         for number in range(steps):
             params, state = step(params, state, *_batch(footage, found, rng))
             progress.update(number + 1)
-    return TrainedJudge(params, _temperature(params, held, rng))
+    return TrainedJudge(params, _temperature(params, held, rng), height)
 
 
 def spoilt(
@@ -166,7 +165,7 @@ def spoilt(
     If the side is not a multiple of 8, shuffled blocks and blur leave a border unchanged.
 
     Args:
-        others: histories of other videos, one of which may be put on top.
+        others: histories of other videos, which may be put on top.
     """
     edge = frames.shape[2] // 8
     size, lead = 8 * edge, frames.shape[:2]
@@ -190,7 +189,8 @@ def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) 
     frames = _altered(footage.histories(*chosen.T), rng)
     labels = np.repeat([SUCCESS, FAIL], half)
     rows = rng.permutation(BATCH)[:SPOILT]
-    frames[rows] = spoilt(frames[rows], frames[rng.permutation(BATCH)[:SPOILT]], rng)
+    others = (rows + rng.integers(1, BATCH, SPOILT)) % BATCH  # never the same history
+    frames[rows] = spoilt(frames[rows], frames[others], rng)
     labels[rows] = UNINTERPRETABLE
     return frames, labels
 

@@ -36,7 +36,7 @@ def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False
         probabilities.append(judge(history))
         labels.append(truth[rows])
         if spoil:
-            probabilities.append(judge(spoilt(history, history[rng.permutation(len(history))], rng)))
+            probabilities.append(judge(spoilt(history, np.roll(history, len(history) // 2, axis=0), rng)))
             labels.append(np.full(len(history), UNINTERPRETABLE))
     return scores(np.concatenate(probabilities), np.concatenate(labels))
 

@@ -6,6 +6,7 @@ of the scripted expert's episode from the same start; the planner does not see h
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -28,15 +29,15 @@ from rsjax.policies.judging import FOLDER
 from rsjax.policies.keys import judge_key, model_key
 from rsjax.policies.planner import Planner, PlannerConfig
 from rsjax.policies.policy import Policy
+from rsjax.policies.rollouts import FIRST_SEED
 from rsjax.policies.simulator import Actor, Episode, LiftEnv, Observation, run_episode, skilled_expert
 from rsjax.policies.trials import FPS
-from rsjax.progress import Progress
+from rsjax.progress import Progress, note
 from rsjax.report.video import write_mp4
 
 EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
 MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
 MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
-FIRST_SEED = 1_000_000  # seed of the first episode
 HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
 VIDEOS = 3  # videos of each way to act
 
@@ -119,9 +120,7 @@ def actors(
 
     def random(seed: int, goal: np.ndarray) -> Actor:
         rng = np.random.default_rng(seed)
-        return lambda frame: np.tile(
-            rng.uniform(-1, 1, len(high) // config.sim.control_steps), config.sim.control_steps
-        )
+        return lambda frame: np.tile(rng.uniform(-1, 1, len(high) // controls), controls)
 
     def planning(method: str) -> MakeActor:
         search = PlannerConfig(**asdict(settings.planner) | {"method": method, "hold": controls})
@@ -180,28 +179,24 @@ def compare(
     policies = policies or {}
     others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
     ways = actors(trained, run, settings, others)
-    score_of(
-        trained, run, settings, np.zeros((config.sim.image_size,) * 2 + (3,), np.uint8)
-    )  # fails before episodes do
+    score_of(trained, run, settings, np.zeros((config.sim.image_size, config.sim.image_size, 3), np.uint8))  # may raise
     judge = load_judge(run / FOLDER) if settings.energy == "judge" else None
     lpips = content_hash(Path(settings.lpips_weights)) if settings.energy == "lpips" else ""
     used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
     key = content_key("plan", replace(settings, lpips_weights=lpips), config.sim, tuple(ways), used)
     place, validation = folder(run, key), judge.validation if judge else None
     done = _kept(place / "result.json", key)
-    env = LiftEnv(config.sim, settings.max_steps)
     total = settings.episodes * len(ways)
-    with Progress("episodes", total, "episodes") as progress:
+    with closing(LiftEnv(config.sim, settings.max_steps)) as env, Progress("episodes", total, "episodes") as progress:
         for number in range(settings.episodes):
             seed, goal = FIRST_SEED + number, None
             for name, make in ways.items():
                 if not any(row["way"] == name and row["seed"] == seed for row in done):
                     goal = _goal(env, seed) if goal is None else goal
                     video = place / f"{name.replace('/', '-')}-{number:02d}.mp4" if number < VIDEOS else None
-                    done.append(_row(env, name, make(seed, goal), seed, video))
+                    done.append(_row(env, name, make(seed, goal), seed, video, settings.max_steps))
                     write_json(place / "result.json", _summary(done, settings, key, validation))
                 progress.update(len(done))
-    env.close()
     result = _summary(done, settings, key, validation)
     write_file(place / "results.md", _markdown(result).encode())
     return result
@@ -251,14 +246,17 @@ def _goal(env: LiftEnv, seed: int) -> UInt8[np.ndarray, "S S 3"]:
     return last
 
 
-def _row(env: LiftEnv, name: str, act: Actor, seed: int, video: Path | None) -> dict[str, Any]:
-    episode: Episode = run_episode(env, act, seed)
+def _row(env: LiftEnv, name: str, act: Actor, seed: int, video: Path | None, max_steps: int) -> dict[str, Any]:
+    row: dict[str, Any] = {"way": name, "seed": seed}
+    try:
+        episode: Episode = run_episode(env, act, seed)
+    except ArithmeticError as error:
+        note(f"{name}, seed {seed}: {error}; the episode does not succeed")
+        return row | {"success": False, "steps": max_steps, "clipped": 0, "seconds_per_decision": None}
     if video:
         write_mp4(video, episode.rgb, FPS, 4)
     seconds = act.seconds[1:] or act.seconds if isinstance(act, PlanningActor) else []  # the first one compiles
-    return {
-        "way": name,
-        "seed": seed,
+    return row | {
         "success": bool(episode.success.any()),
         "steps": len(episode.rgb) - 1,
         "clipped": episode.clipped,

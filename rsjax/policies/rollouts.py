@@ -4,7 +4,7 @@ Axes: B episodes, T frames, S×S pixels, A action dimensions.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -181,9 +181,8 @@ def run_together(world: World, act: Acts, starts: Sequence[Any], steps: int) -> 
         ActionError: the policy returns actions of the wrong shape, or a value that is not finite.
     """
     seen = world.restart(starts)
-    over, history, ends = np.zeros(len(starts), bool), [seen], np.full(len(starts), steps)
-    over |= seen.success
-    ends[over] = 0
+    over, ends = np.zeros(len(starts), bool), np.full(len(starts), steps)
+    history = [replace(seen, success=over)]  # the policy has done nothing yet, whatever a judge says of the first frame
     for step in range(1, steps + 1):
         if over.all():
             break

@@ -11,7 +11,6 @@ from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
-from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load, load_config
 from rsjax.policies.actions import check_takes_actions
@@ -22,6 +21,8 @@ from rsjax.policies.judging import FOLDER
 from rsjax.policies.rollouts import FirstFrame, Imagined
 from rsjax.policies.verdicts import Judge
 
+TAKEN = {"policy", "simulator", "videos"}  # folders beside those of the runs, in the results of policy_evaluation
+
 
 @dataclass(frozen=True)
 class RunData:
@@ -30,17 +31,14 @@ class RunData:
     Attributes:
         run: the directory.
         data_dir: the directory of simulated data sets.
-        moved: the new path of the run's store of ingested clips, if it was moved.
     """
 
     run: Path
     data_dir: Path = Path("data")
-    moved: Path | None = None
 
     @cached_property
     def config(self) -> Config:
-        config = load_config(self.run)
-        return relocated(config, self.moved) if self.moved else config
+        return load_config(self.run)
 
     @cached_property
     def clips(self) -> Store:
@@ -136,13 +134,13 @@ def sized_policy(size: str, steps: int) -> PolicyConfig:
 
 
 def named(runs: Sequence[Path]) -> dict[str, Path]:
-    """Names each run by the shortest end of its path that tells the runs apart.
+    """Names each run by the shortest end of its path that tells the runs apart, and from other folders of results.
 
     Raises:
         UserError: two runs are the same.
     """
     for parts in range(1, 8):
         names = ["-".join(run.absolute().parts[-parts:]) for run in runs]
-        if len(set(names)) == len(names):
+        if len(set(names) - TAKEN) == len(names):
             return dict(zip(names, runs, strict=True))
     raise UserError(f"two of the runs {', '.join(map(str, runs))} are the same; name each once")

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from rsjax.config import SimConfig, require
-from rsjax.policies.actions import OutOfRange, checked_actions
+from rsjax.policies.actions import OutOfRange, check_out_of_range, checked_actions
 from rsjax.sim.expert import Expert, Manner
 from rsjax.sim.lift import LiftSim, State
 
@@ -54,6 +54,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
     Raises:
         GLError: no OpenGL context can be made.
         ConfigError: there is no such camera, or the clips are of another simulator.
+        UserError: ``out_of_range`` is neither of the two.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
@@ -66,6 +67,7 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
     ) -> None:
         require(config.env == "lift", f"sim.env is {config.env}; only lift can be acted in so far")
+        check_out_of_range(out_of_range)
         size = config.image_size
         self._config, self._max_steps, self._out_of_range = config, max_steps, out_of_range
         self._sim = LiftSim(config.camera, size)

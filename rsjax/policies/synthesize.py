@@ -37,12 +37,13 @@ class Synthesis:
     """The settings of the demonstrations to make.
 
     Attributes:
-        demos: how many. Beyond the number of clips, clips are used again with new noise and new draws of the model.
+        demos: number of demonstrations. Beyond the number of clips, clips are used again with new noise and new draws
+            of the model.
         noise: standard deviation of the noise on actions, in each number's own standard deviation in the data set.
             Numbers with at most two values in a clip, such as a gripper command, get no noise.
         split: split of the clips whose first frames and actions are used.
         only: success uses only clips that end in success, if the data set says which do.
-        seed: of the choice of clips, the noise and the model's draws.
+        seed: seed of the choice of clips, the noise and the model's draws.
         batch: clips that are generated together.
         fps: frames per second; 0: as the clips say.
     """

@@ -35,7 +35,8 @@ def train_policy(
     """Trains a policy on demonstrations, resuming where an earlier call was interrupted.
 
     Args:
-        config: the policy's settings; ``config.train.steps`` is the length of this training.
+        config: the policy's settings; ``config.train.steps`` is the length of this training. Plans are rounded up to
+            whole frames (:meth:`PolicyConfig.fitted`).
         demos: the demonstrations to learn from.
         directory: the directory of checkpoints, logs and, in the end, the policy itself.
         name: for the progress line.
@@ -47,6 +48,7 @@ def train_policy(
         UserError: the directory holds a training on other data, with other settings, or with other stops.
         FileError: another process trains in the directory.
     """
+    config = config.fitted(demos.controls)
     model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
     span = start.range if start else demos.range
     loop = replace(config.train, seed=seed)

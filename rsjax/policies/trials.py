@@ -27,7 +27,7 @@ class Trials:
     """The same episodes for every policy.
 
     Attributes:
-        episodes: how many, from fixed seeds.
+        episodes: episodes of each policy, from fixed seeds.
         max_steps: steps after which an episode counts as a failure.
         together: episodes that run at a time.
         videos: how many episodes are saved as videos.

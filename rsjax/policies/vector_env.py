@@ -1,5 +1,6 @@
 """Many episodes in a trained world model, batched on the device, as a Gymnasium vector environment."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
+from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.policies.episodes import Episodes, Settings
 from rsjax.policies.simulator import Observation
@@ -40,17 +42,18 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._rng: list[np.random.Generator] = []
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins all episodes, with arguments as for one environment; environment i takes the seed + i.
 
         From a list of seeds, each environment takes its own. The options apply to all.
+
+        Raises:
+            UserError: there are more or fewer seeds than environments.
+            StartError: the given frame does not fit, or the run's clips are missing.
         """
         if seed is not None or not self._rng:
-            seeds = (
-                [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
-            )
-            self._rng = [np.random.default_rng(each) for each in seeds]
+            self._rng = [np.random.default_rng(each) for each in _seeds(seed, self.num_envs)]
         self._over[:] = False
         seen = self._episodes.restart(np.ones(self.num_envs, bool), self._rng, options or {})
         return seen, _marked(self._episodes.info(self._episodes.verdict()))
@@ -79,6 +82,16 @@ class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             success, over = success & ~again, over & ~again
         self._over = success | over
         return seen, success.astype(np.float64), success, over, _marked(info)
+
+
+def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """Returns the seed of each environment."""
+    if seed is None:
+        return [None] * count
+    seeds = [int(seed) + i for i in range(count)] if np.isscalar(seed) else list(seed)  # type: ignore[arg-type]
+    if len(seeds) != count:
+        raise UserError(f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment")
+    return seeds
 
 
 def _marked(info: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -50,6 +50,16 @@ def test_the_public_size_is_the_public_one() -> None:
     config = public()
     net = DiffusionPolicy(config, 84, 1, 7)
     assert net.cropped == 76
+    assert (config.observations, config.horizon, config.execute) == (2, 16, 8)
+    assert (config.noise_steps, config.sample_steps, config.keypoints) == (100, 100, 32)
+    optimizer = config.train.optimizer
+    assert (optimizer.learning_rate, optimizer.beta1, optimizer.beta2, optimizer.weight_decay) == (
+        1e-4,
+        0.95,
+        0.999,
+        1e-6,
+    )
+    assert (optimizer.schedule, optimizer.warmup_steps, config.train.ema) == ("cosine", 500, 0.9999)
     shapes = jax.eval_shape(net.init, jax.random.key(0))
     condition, kernel, total = 128 + 2 * 64, 5, 0
 
@@ -245,6 +255,15 @@ def test_an_actor_plans_every_few_frames(policy: tuple[Policy, Path], monkeypatc
         np.testing.assert_allclose(row, np.repeat([first, first + 0.01], WIDTH)[None].repeat(2, 0), atol=1e-6)
     with pytest.raises(UserError, match=r"sees frames \(B, 16, 16, 3\), not \(2, 8, 8, 3\)"):
         actor(np.zeros((2, 8, 8, 3), np.uint8))
+
+
+@given(st.integers(1, 20), st.integers(1, 40), st.integers(1, 40))
+def test_plans_are_rounded_up_to_whole_frames(controls: int, horizon: int, execute: int) -> None:
+    config = replace(public(), horizon=4 * horizon, execute=min(execute, 4 * horizon))
+    fitted = config.fitted(controls)
+    DiffusionPolicy(fitted, SIZE, controls, WIDTH)  # raises if they are not whole
+    assert 0 <= fitted.execute - config.execute < controls and 0 <= fitted.horizon - config.horizon < 4 * controls
+    assert public().fitted(1) == public().fitted(4) == public()
 
 
 def test_impossible_settings_are_named() -> None:

@@ -101,9 +101,11 @@ def test_a_vector_of_environments_restarts_each_as_one_alone_would(model: Traine
     settings: dict[str, Any] = {"judge": judge, "max_steps": 5, "data_dir": clips.path.parent}
     many = gymnasium.make_vec("rsjax/WorldModel-v0", num_envs=count, run=model, **settings)
     assert isinstance(many, WorldModelVectorEnv)
+    with pytest.raises(UserError, match="1 seeds for 3 environments"):
+        many.reset(seed=[1])
     alone = WorldModelEnv(model, **settings)
     rows = np.random.default_rng(3).uniform(-1, 1, (steps, count, 28)).astype(np.float32)
-    seen, _ = many.reset(seed=4)
+    seen, _ = many.reset(seed=np.int64(4))
     made = [(seen, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
     for number in range(steps):
         rows[number, made[-1][2] | made[-1][3]] = np.nan  # of episodes that begin anew, whose actions do not matter
@@ -146,6 +148,8 @@ def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedMode
         assert message in str(error.value)
     with pytest.raises(UserError, match="max_steps is 0"):
         WorldModelEnv(model, max_steps=0)
+    with pytest.raises(UserError, match="out_of_range is 'refused'; it is clip or refuse"):
+        WorldModelEnv(model, out_of_range="refused")
     with pytest.raises(StartError, match='reset needs a first frame of its own: options={"rgb": …, "depth": …}'):
         WorldModelEnv(model, data_dir=tmp_path).reset()
 

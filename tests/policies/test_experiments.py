@@ -190,5 +190,6 @@ def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:
 def test_runs_are_named_by_what_tells_them_apart() -> None:
     assert list(named([Path("/a/runs/tiny")])) == ["tiny"]
     assert list(named([Path("/a/tiny/s0"), Path("/a/genie/s0")])) == ["tiny-s0", "genie-s0"]
+    assert list(named([Path("/a/runs/simulator")])) == ["runs-simulator"]  # results have a folder of that name
     with pytest.raises(UserError, match="are the same"):
         named([Path("/a"), Path("/a")])

@@ -56,7 +56,7 @@ def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudg
     np.testing.assert_array_equal(load_judge(tmp_path / "judge", 32)(frames), judge(frames))
     assert load_judge(tmp_path / "judge").key == judge.key != replace(judge, temperature=3.0).key
     for name in ("judge", "run"):  # a directory of one, or the run's own
-        with pytest.raises(UserError, match="was trained on frames of another size, these have 64 × 64 pixels"):
+        with pytest.raises(UserError, match="was trained on frames of 32 × 32 pixels, these have 64 × 64"):
             judging.judge_of(tmp_path, tmp_path / name if name == "judge" else name, 64)
     report = tmp_path / "judge" / "validation.json"
     for name, known in ((judge.key, True), ("another", False)):
@@ -109,7 +109,9 @@ def test_scores_agree_with_a_count_by_hand() -> None:
 
 def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The toy's clips teach nothing, so a fresh network stands in for the result of its training."""
-    judge = TrainedJudge(Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0)
+    judge = TrainedJudge(
+        Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
+    )
     run, store = tmp_path / "run", toy.store(tmp_path / "clips")
     trained = toy.trained(store)
     monkeypatch.setattr(judging, "load", lambda run: trained)

@@ -223,6 +223,15 @@ def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, mo
         compare(model, tmp_path, replace(settings, energy="judge"))
     with pytest.raises(ConfigError, match="needs lpips_weights"):
         replace(settings, energy="lpips")
+    monkeypatch.setattr(planning, "LiftEnv", FakeLift)
+
+    def diverge(env: Any, action: Any) -> None:
+        raise ArithmeticError("the simulation diverged")
+
+    monkeypatch.setattr(FakeLift, "step", diverge)
+    monkeypatch.setattr(planning, "_goal", lambda env, seed: np.zeros((64, 64, 3), np.uint8))
+    lost = compare(model, tmp_path, replace(settings, episodes=1, max_steps=2))["ways"]
+    assert {name: (way["success"], way["steps"]) for name, way in lost.items()} == dict.fromkeys(ways, (0.0, 2.0))
     still: Any = replace(model.config.model, action_encoder="none")  # type: ignore[call-arg]
     with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
         compare(replace(model, config=replace(model.config, model=still)), tmp_path, settings)

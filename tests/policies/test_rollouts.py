@@ -40,6 +40,12 @@ def test_episodes_end_when_each_succeeds(kind: str) -> None:
     assert [len(one.rgb) for one in slow] == [5, 5, 5] and not any(one.success.any() for one in slow)
 
 
+def test_a_first_frame_that_looks_like_success_ends_nothing() -> None:
+    world = imagined(2)
+    one, other = run_together(world, ToyPolicy(0.1).actor(), frames([10, 0]), 4)
+    assert one.success.tolist() == [False, True] and len(other.rgb) == 5
+
+
 def test_a_family_that_generates_whole_videos_goes_on_from_its_last_frames() -> None:
     calls: list[Any] = []
 

@@ -8,6 +8,7 @@ from gymnasium.utils.env_checker import check_env
 
 from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
+from rsjax.errors import UserError
 from rsjax.play.simulate import Job, simulate
 from rsjax.policies.actions import ActionError
 from rsjax.policies.simulator import LiftEnv, clip_seed, run_episode, skilled_expert
@@ -77,6 +78,8 @@ def test_actions_are_clipped_and_counted_or_refused(env: LiftEnv) -> None:
     wide[[3, 8]] = 1.5, -7
     assert env.step(wide)[4]["clipped"] == 2
     assert env.step(wide)[4]["clipped"] == 4
+    with pytest.raises(UserError, match="out_of_range is 'no'; it is clip or refuse"):
+        LiftEnv(CONFIG, out_of_range="no")  # type: ignore[arg-type]
     env._out_of_range = "refuse"
     with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D change"):
         env.step(wide)

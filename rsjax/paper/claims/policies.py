@@ -18,6 +18,7 @@ from rsjax.pipeline.run import Run
 from rsjax.policies import comparison, planning
 from rsjax.policies.episodes import action_range
 from rsjax.policies.improvement import Improvement, improve
+from rsjax.policies.judge import FILE as JUDGE_FILE
 from rsjax.policies.judging import FOLDER as JUDGE
 from rsjax.policies.judging import JudgeSettings, make_judge
 from rsjax.policies.learning import Learning, learn
@@ -100,7 +101,7 @@ def _judged(run: Run, size: Size) -> RunData:
     """
     if not _in_lift(run.config):
         raise Unavailable(f"policies are tried in the simulated Lift alone; the clips are of {run.config.sim.env}")
-    if not (run.directory / JUDGE).exists():
+    if not (run.directory / JUDGE / JUDGE_FILE).exists():
         make_judge(run.directory, run.data_directory, settings=JudgeSettings(steps=size.judge))
     return RunData(run.directory, run.data_directory)
 
