@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--tokens", type=int, default=226, help="tokens of each text")
         if kind in ("ivideogpt", "cogvideox"):
             command.add_argument(
-                "--part", choices=("tokenizer", "world_model"), help="to export; default: all there is"
+                "--part", choices=("tokenizer", "world_model"), help="which one to export, if there are both"
             )
         if kind == "irasim":
             command.add_argument(

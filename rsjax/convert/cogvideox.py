@@ -7,6 +7,7 @@ latents, and how positions are encoded. The weights of a large transformer are i
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from flax.traverse_util import flatten_dict
 
 from rsjax.config import CausalVAEConfig, CogVideoXConfig, ConfigError
-from rsjax.convert.files import ConvertError, Tensors
+from rsjax.convert.files import ConvertError, Tensors, setting
 from rsjax.convert.table import (
     SAME_NAMES,
     Entry,
@@ -119,9 +120,10 @@ def autoencoder_from_public(
     Raises:
         ConvertError: tensors are missing, unexpected, of the wrong shape or not finite; or the settings do not fit.
     """
-    factor = settings.get("scaling_factor", FACTOR)
-    if type(factor) not in (int, float) or not math.isfinite(factor) or factor <= 0:
-        raise ConvertError(f"{source}: its {CONFIG} has scaling_factor {factor!r}; a number above 0 fits")
+    factor, groups = (
+        setting(source, settings, "scaling_factor", FACTOR),
+        setting(source, settings, "norm_num_groups", 32),
+    )
     first = re.compile(r"encoder\.down_blocks\.(\d+)\.resnets\.(\d+)\.conv1\.conv\.weight")
     places = [(int(match[1]), int(match[2])) for match in map(first.fullmatch, tensors) if match]
     levels, blocks = (max(column) + 1 for column in zip(*places, strict=True)) if places else (0, 0)
@@ -135,7 +137,7 @@ def autoencoder_from_public(
             patch_size=max(1, round((width("decoder.conv_out") / 3) ** 0.5)),
             widths=tuple(width(f"encoder.down_blocks.{level}.resnets.0.conv1") for level in range(levels)),
             res_blocks=blocks,
-            norm_groups=settings.get("norm_num_groups", 32),
+            norm_groups=groups,
         )
     except ConfigError as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
@@ -176,11 +178,12 @@ def infer_transformer(
     (width, inputs, patch, _), text = shape("patch_embed.proj.weight", 4), shape("patch_embed.text_proj.weight", 2)[1]
     channels = shape("proj_out.weight", 2)[0] // patch**2
     head = shape("transformer_blocks.0.attn1.norm_q.weight", 1)[0]
-    tokens, learned = settings.get("max_text_seq_length", 226), tuple[int, ...]()
-    rotary = settings.get("use_rotary_positional_embeddings", width != WIDTH_2B)
-    if settings.get("use_learned_positional_embeddings", rotary) and "patch_embed.pos_embedding" in tensors:
-        sides = (settings.get("sample_height", 60), settings.get("sample_width", 90))
-        frames = (settings.get("sample_frames", 49) - 1) // settings.get("temporal_compression_ratio", 4) + 1
+    read = partial(setting, source, settings)
+    tokens, learned = read("max_text_seq_length", 226), tuple[int, ...]()
+    rotary = read("use_rotary_positional_embeddings", width != WIDTH_2B)
+    if read("use_learned_positional_embeddings", rotary) and "patch_embed.pos_embedding" in tensors:
+        sides = (read("sample_height", 60), read("sample_width", 90))
+        frames = (read("sample_frames", 49) - 1) // read("temporal_compression_ratio", 4) + 1
         learned = (frames, *(side // patch for side in sides))
     try:
         config = CogVideoXConfig(
@@ -192,7 +195,7 @@ def infer_transformer(
             time_width=shape("time_embedding.linear_1.weight", 2)[0],
             image="channels" if inputs == 2 * channels else "first_latent",
             positions="rotary" if rotary else "sincos",
-            position_scale=settings.get("spatial_interpolation_scale", 1.875),
+            position_scale=read("spatial_interpolation_scale", 1.875),
             learned_positions=learned,
             autoencoder=CausalVAEConfig(latent_channels=channels),
         )

@@ -1,10 +1,12 @@
 """Reads and writes tensor files as dictionaries of numpy arrays, without executing anything from them."""
 
 import importlib
+import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import safetensors
@@ -195,6 +197,26 @@ def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
 
 def _unreadable(path: Path, name: str, dtype: str) -> ConvertError:
     return ConvertError(f"{path}: {name} is of type {dtype} or a form that cannot be read; save it as dense float32")
+
+
+_KINDS = {bool: "true or false", int: "a whole number above 0", float: "a number above 0"}
+S = TypeVar("S", bool, int, float)
+
+
+def setting(source: object, settings: dict[str, Any], name: str, default: S) -> S:
+    """Returns a setting from ``published_settings``, or its default if it is missing or null.
+
+    Raises:
+        ConvertError: it is not of its default's type, or a number that is not above 0.
+    """
+    value = settings.get(name)
+    if value is None:
+        return default
+    kinds = (int, float) if isinstance(default, float) else (type(default),)
+    if type(value) not in kinds or (type(value) is not bool and not 0 < value < math.inf):
+        found = json.dumps(value)
+        raise ConvertError(f"{source}: its config.json has {name} {found:.80}; {_KINDS[type(default)]} fits")
+    return value  # type: ignore[no-any-return]
 
 
 def published_settings(weights: Path, *classes: str) -> dict[str, Any]:

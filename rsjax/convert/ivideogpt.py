@@ -158,7 +158,8 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     before = saved_part(out, IVideoGPTConfig, "tokenizer")
     whole = replace(model, autoencoder=before[0].autoencoder) if before else model
     _check_codes(out, before and before[0], model)
-    inputs = Inputs(before[1].image_size if before else own[1].image_size if own else 0, actions)
+    sizes = [found.image_size for _, found in filter(None, (before, own))]
+    inputs = Inputs(sizes[0] if sizes else 0, actions)
     replaces = save_part(out, "world_model", whole, inputs, params)
     lines = left_aside(aside, others)
     return [f"{out}: a transformer of {len(used)} tensors, {model}{REPLACES * replaces}", *lines]

@@ -12,10 +12,11 @@ import jax
 import numpy as np
 
 from rsjax.config import ConfigError, KLConfig
-from rsjax.convert.files import ConvertError, Tensors
+from rsjax.convert.files import ConvertError, Tensors, setting
 from rsjax.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors
 from rsjax.convert.vae_names import vae_table
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
+from rsjax.progress import note
 from rsjax.trainable import Params
 
 CONFIG = "config.json"
@@ -68,7 +69,7 @@ def infer_config(source: object, tensors: Tensors, settings: dict[str, Any], nam
                 width(f"encoder.down_blocks.{level}.resnets.0.conv1") // channels for level in range(levels)
             ),
             res_blocks=blocks,
-            norm_groups=settings.get("norm_num_groups", 32),
+            norm_groups=setting(source, settings, "norm_num_groups", 32),
         )
     except ConfigError as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
@@ -98,6 +99,8 @@ def from_public(
         raise ConvertError(
             f"{source}: its {CONFIG} has scaling_factor {factor!r} and shift_factor {shift!r}; numbers fit"
         )
+    if factor != SDXL_FACTOR:
+        note(f"{source}: its latents have the factor {factor:g}; the public IRASim needs SDXL's, {SDXL_FACTOR:g}")
     fixed = {"mean": shift, "log_deviation": -math.log(factor)}
     params = to_params(source, tensors, table(config), _shapes(config), names)
     latents = {name: np.full(config.latent_channels, x, np.float32) for name, x in fixed.items()}

@@ -113,7 +113,8 @@ class TrainedModel:
 
     def _codec(self) -> Codec:
         if self.assets.tokenizer is None or self.config.model.own_autoencoder is not None:
-            raise UserError(f"a model of family {self.config.model.family!r} has no tokens; use generate")
+            family = self.config.model.family
+            raise UserError(f"a model of family {family!r} has no tokens that encode and decode take; use generate")
         return Codec(self.config.tokenizer, self.assets.tokenizer, self.assets.normalization)
 
     def _actions(self, actions: Any, prompt: Video, lead: tuple[int | str, ...]) -> Float32[np.ndarray, "*B T A"]:

@@ -52,7 +52,11 @@ def test_irasim_comes_back_to_the_bit(weights: Path, capsys: pytest.CaptureFixtu
 
 def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.CaptureFixture[str]) -> None:
     convert("sdxl", vae, vae.parent / "own")
-    assert "left aside: no tensors" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert (
+        "left aside: no tensors" in printed
+        and "have the factor 0.2; the public IRASim needs SDXL's, 0.13025" in printed
+    )
     config, params = load_kl_autoencoder(vae.parent / "own")
     assert config == SMALL
     np.testing.assert_allclose(np.exp(-params["latents"]["log_deviation"]), 0.2, rtol=1e-5)

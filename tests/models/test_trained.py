@@ -227,5 +227,7 @@ def test_a_family_without_tokens_encodes_nothing(model: TrainedModel) -> None:
     config = replace(CONFIG, model=ToyConfig())
     plain = replace(model, config=config, assets=replace(model.assets, tokenizer=None))
     for use in (lambda: plain.encode(RGB), lambda: plain.decode({"rgb": TOKENS})):
-        with pytest.raises(UserError, match="a model of family 'toy' has no tokens; use generate"):
+        with pytest.raises(
+            UserError, match="a model of family 'toy' has no tokens that encode and decode take; use generate"
+        ):
             use()

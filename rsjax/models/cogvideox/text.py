@@ -47,10 +47,13 @@ def read_texts(file: str, tokens: int, width: int) -> Texts:
         with safetensors.safe_open(path, "np") as opened:
             names = json.loads((opened.metadata() or {}).get(TEXTS, "[]"))
             made = opened.get_tensor(EMBEDDINGS).astype(np.float32) if EMBEDDINGS in opened.keys() else None  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
+    except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # the last: a type of 8 bits
         raise UserError(f"{path}: not a file of text embeddings, or damaged ({first_line(error)}); {CURE}") from error
-    if made is None or made.ndim != 3 or len(names) != len(made) or names[:1] != [EMPTY]:
+    listed = isinstance(names, list) and names[:1] == [EMPTY] and all(isinstance(name, str) for name in names)
+    if made is None or made.ndim != 3 or not listed or len(names) != len(made):
         raise UserError(f"{path}: holds no {EMBEDDINGS} of texts, the empty one first; {CURE}")
+    if not np.isfinite(made).all():
+        raise UserError(f"{path}: its {EMBEDDINGS} have values that are not finite; {CURE}")
     if made.shape[1:] != (tokens, width):
         raise UserError(
             f"{path}: its texts have {made.shape[1]} tokens of {made.shape[2]} numbers, the model takes {tokens} of "

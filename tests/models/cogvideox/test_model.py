@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from rsjax.bench import inputs
 from rsjax.clip import Video
@@ -228,6 +229,15 @@ def test_texts_come_from_a_file_or_are_learned(tmp_path: Path) -> None:
     (tmp_path / "other").write_bytes(b"x")
     with pytest.raises(UserError, match="not a file of text embeddings, or damaged"):
         read_texts(str(tmp_path / "other"), 2, 4)
+    for number, (names, bad) in enumerate(((["x", ""], made[:2]), ("5", made[:1]), ([""], made[:1] * np.nan))):
+        (tmp_path / f"bad-{number}").write_bytes(write_texts(names, bad))  # a string is written as a list of characters
+        with pytest.raises(
+            UserError, match=r"holds no embeddings of texts, the empty one first|values that are not finite"
+        ):
+            read_texts(str(tmp_path / f"bad-{number}"), 2, 4)
+    (tmp_path / "number").write_bytes(safetensors.numpy.save({"embeddings": made}, {"texts": "5"}))
+    with pytest.raises(UserError, match="holds no embeddings of texts, the empty one first"):
+        read_texts(str(tmp_path / "number"), 2, 4)
     learned = TextConfig(tasks=("lift", "press"))
     assert texts_of(learned, ["press", "unknown", "lift"], 3).tolist() == [2, 0, 1]
     assert texts_of(TextConfig(), ["whatever"], 1).tolist() == [1]

@@ -13,10 +13,11 @@ from rsjax.models.roboscape.transformer import Transformer
 
 
 @pytest.mark.parametrize(("bf16", "tolerance"), [(True, 0.02), (False, 2e-6)])
-@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize(("causal", "long"), [(False, 8), (True, 8), (True, 100)])  # long: cells cut into blocks
 def test_output_and_gradients_are_plain_attention_s_to_rounding(
-    monkeypatch: pytest.MonkeyPatch, causal: bool, bf16: bool, tolerance: float
+    monkeypatch: pytest.MonkeyPatch, causal: bool, long: int, bf16: bool, tolerance: float
 ) -> None:
+    monkeypatch.setattr(frame_attention, "LONG", long)
     monkeypatch.setattr(frame_attention, "bf16_pays", lambda: bf16)
     keys = jax.random.split(jax.random.key(0), 4)
     q, k, v, cotangent = (jax.random.normal(key, (3, 10, 2, 8)) for key in keys)  # N S h e
