@@ -24,6 +24,7 @@ Tokens = dict[str, Int[np.ndarray, "B T h w"]]
 Grids: TypeAlias = Int[np.ndarray, "*B h w"] | Float32[np.ndarray, "*B h w D"]  # tokens, or codes of D bits
 
 CHUNK = 128  # most images per pass, to bound memory
+PIXELS, CPU_PIXELS = 128 * 64**2, 16 * 64**2  # of a pass; a CPU keeps the features of so few pixels in its cache
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,11 @@ class Codec:
 
         codes = images.dtype == np.float32  # not tokens
         return in_chunks(apply, images, 3 if method == "encode" or codes else 2)
+
+
+def images_per_pass(side: int) -> int:
+    """Returns how many images of ``side`` × ``side`` pixels one pass of a large network takes."""
+    return max(1, (CPU_PIXELS if jax.default_backend() == "cpu" else PIXELS) // side**2)
 
 
 def in_chunks(

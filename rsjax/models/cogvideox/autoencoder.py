@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import CausalVAEConfig, CogVideoXConfig, Config, TokenizerTrainConfig, require
-from rsjax.config.cogvideox import padded_frames
+from rsjax.config.cogvideox import COMPRESSION, padded_frames
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
@@ -28,7 +28,7 @@ from rsjax.models.diffusion import latents as distributions
 from rsjax.models.saved import check_alike, read_model
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.tokenizers.autoencoder import Autoencoder
-from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
@@ -37,8 +37,7 @@ from rsjax.trainable import Extra, Params, StepContext, Term
 
 Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's noise
 
-CHUNK_PIXELS = CHUNK * 64**2  # pixels per pass, at most, to bound memory
-FREE = {"kl_weight", "image_draws", "image_noise"}
+FREE = {"kl_weight", "image_draws", "image_noise", "compute_dtype"}
 
 
 def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
@@ -134,7 +133,9 @@ class CausalVAETraining(Autoencoder[Batch]):
 def notes_on_filling(what: str, frames: int) -> list[str]:
     """Returns a line that says to how many frames videos are padded; none if they need no padding."""
     whole = padded_frames(frames)
-    return [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"] * (whole != frames)
+    return (
+        [] if whole == frames else [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"]
+    )
 
 
 def filled(frames: np.ndarray, axis: int) -> np.ndarray:
@@ -166,8 +167,8 @@ class CausalCodec:
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
         """Decodes "mean", the latents of an odd number of latent frames, and keeps "frames" frames if that is given."""
         latents = np.asarray(tokens["mean"])
-        pixels = latents.shape[1] * 4 * (latents.shape[-2] * self.config.downsampling) ** 2
-        frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, CHUNK_PIXELS // pixels))
+        most = images_per_pass(latents.shape[-2] * self.config.downsampling) // (COMPRESSION * latents.shape[1])
+        frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, most))
         return Video(np.round(frames[:, : tokens["frames"][0] if "frames" in tokens else None]).astype(np.uint8))
 
     def images(
@@ -187,8 +188,8 @@ class CausalCodec:
         return {name: x.reshape(*pixels.shape[:2], *x.shape[2:]) for name, x in made.items()}
 
     def _encode(self, frames: np.ndarray) -> dict[str, np.ndarray]:
-        most = max(1, CHUNK_PIXELS // (frames.shape[1] * frames.shape[2] ** 2))
-        made = in_chunks(partial(self._run, _encode), frames, 4, most)
+        most = images_per_pass(frames.shape[2]) // frames.shape[1]
+        made = in_chunks(partial(self._run, _encode), frames, 4, max(1, most))
         return dict(zip(("mean", "deviation"), np.split(made, 2, axis=-1), strict=True))
 
     def _run(self, function: Any, chunk: np.ndarray) -> Any:

@@ -35,7 +35,7 @@ def rollout(
         clip_frames: frames of a training clip; a chunk adds one frame less.
         index: each clip's number, which determines its noise.
     """
-    made, image, number = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1], 0
+    made, image = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1]
     count, text = len(prompt), arch.model.text
     texts, empty = texts_of(text, known_tasks(text, prompt.tasks, count), count), empty_texts(text, count)
     for number in range(-(-(frames - prompt.rgb.shape[1]) // (clip_frames - 1))):

@@ -27,7 +27,7 @@ from rsjax.models.irasim import pretrained
 from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.autoencoder import Autoencoder
-from rsjax.tokenizers.codec import CHUNK, in_chunks
+from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_pixels, to_unit
@@ -39,7 +39,6 @@ Batch = dict[str, Any]  # images 0–255 (B, H, W, 3) and index (B,), which dete
 Latents = Float[Array, "B h w z"]
 
 SDXL_FACTOR = 0.13025  # the public code multiplies latents by it
-CHUNK_PIXELS = CHUNK * 64**2  # pixels per pass, at most, to bound memory
 
 
 def networks(config: KLConfig) -> tuple[Any, Any]:
@@ -146,7 +145,7 @@ class KLCodec:
 
     def encode(self, video: Video) -> dict[str, Float[np.ndarray, "B T h w z"]]:
         """Returns the posterior's "mean" and "deviation" of each frame."""
-        made = in_chunks(partial(self._run, _encode), video.rgb, 3, self._most(video.rgb.shape[-2]))
+        made = in_chunks(partial(self._run, _encode), video.rgb, 3, images_per_pass(video.rgb.shape[-2]))
         mean, deviation = np.split(made, 2, axis=-1)
         return {"mean": mean, "deviation": deviation}
 
@@ -154,14 +153,11 @@ class KLCodec:
         """Decodes the latents "mean" to frames."""
         latents = np.asarray(tokens["mean"])
         side = latents.shape[-2] * self.config.downsampling
-        frames = in_chunks(partial(self._run, _decode), latents, 3, self._most(side))
+        frames = in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side))
         return Video(np.round(frames).astype(np.uint8))
 
     def _run(self, function: Any, chunk: np.ndarray) -> Any:
         return function(self.config, self.params, divide(chunk, self.params))
-
-    def _most(self, side: int) -> int:
-        return max(1, CHUNK_PIXELS // side**2)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -27,6 +27,7 @@ from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
+from rsjax.tokenizers.codec import images_per_pass
 from rsjax.tokenizers.conditional_vq import ConditionalVQ, Reconstruction
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
@@ -34,8 +35,6 @@ from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's dropout
-
-FRAMES = 128  # frames per pass, at most, to bound memory
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ class ConditionalVQTraining(Autoencoder[Batch]):
             UserError: the weights are missing or of another network; the message names the differing fields.
         """
         saved = read_model(directory, IVideoGPTConfig, "tokenizer").autoencoder
-        free = {"dropout", "codebook_scale", "codebook_weight"}
+        free = {"dropout", "codebook_scale", "codebook_weight", "compute_dtype"}
         free |= {"context_frames"} if saved.context_frames >= self.config.context_frames else set()
         check_alike(directory, saved, self.config, free, "model.autoencoder")
         if (size := saved_inputs(directory).image_size) != self.image_size:
@@ -159,7 +158,9 @@ class ConditionalCodec:
         lacking = max(0, self.config.context_frames - video.rgb.shape[1])
         frames = np.concatenate([np.repeat(video.rgb[:, :1], lacking, 1), video.rgb], axis=1)
         alone = frames.shape[1] == self.config.context_frames
-        context, future = self._chunked("encode", np.repeat(frames, [*[1] * (frames.shape[1] - 1), 1 + alone], 1))
+        if alone:  # a placeholder for the later frame that the network needs
+            frames = np.concatenate([frames, frames[:, -1:]], axis=1)
+        context, future = self._chunked("encode", frames.shape[2], frames)
         return {"context": context, "future": future[:, : future.shape[1] - alone]}
 
     def decode(self, tokens: dict[str, Any], has_depth: Bool[np.ndarray, " B"] | None = None) -> Video:
@@ -167,13 +168,14 @@ class ConditionalCodec:
         context, future = (np.asarray(tokens[name]) for name in ("context", "future"))
         alone = future.shape[1] == 0  # if there are no later frames, a placeholder is decoded
         future = np.zeros((len(future), 1, future.shape[2]), np.int32) if alone else future
-        (frames,) = self._chunked("decode", context, future)
+        (frames,) = self._chunked("decode", context.shape[2] * self.config.downsampling, context, future)
         return Video(np.round(frames[:, : frames.shape[1] - alone]).astype(np.uint8))
 
-    def _chunked(self, method: Literal["encode", "decode"], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Applies the network to a power of two of clips at a time."""
+    def _chunked(self, method: Literal["encode", "decode"], side: int, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Applies the network to a power of two of clips at a time; their images have ``side`` pixels a side."""
         total, frames = len(arrays[0]), sum(x.shape[1] for x in arrays)
-        size = min(2 ** (total - 1).bit_length(), 2 ** (max(1, FRAMES // frames).bit_length() - 1))
+        most = max(1, images_per_pass(side) // frames)
+        size = min(2 ** (total - 1).bit_length(), 2 ** (most.bit_length() - 1))
         parts = []
         for start in range(0, total, size):
             chunk = [x[start : start + size] for x in arrays]

@@ -45,7 +45,8 @@ def generate(
     count = rows.shape[1] if rows.shape[1] <= layout.most_frames else layout.most_frames  # frames of a sequence
     given = frames.shape[1] if frames.shape[1] < count else layout.context
     begin = frames.shape[1] - given
-    made = [codec.decode(codec.encode(Video(frames))).rgb[:, : begin + given]]
+    # The first sequence is decoded as a whole and usually has all frames of the prompt.
+    made = [codec.decode(codec.encode(Video(frames))).rgb] if begin or frames.shape[1] == rows.shape[1] else []
     window = frames[:, begin:]
     keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), jnp.asarray(index))
     while begin + given < rows.shape[1]:
@@ -58,7 +59,7 @@ def generate(
         inputs = (sequence, used, folded(keys, jnp.full(len(index), begin)))
         drawn = sample(arch, params, *divide(inputs, params))
         whole = codec.decode({"context": tokens["context"], "future": layout.future(np.asarray(drawn))}).rgb
-        made.append(whole[:, given:])
+        made.append(whole[:, given if made else 0 :])
         begin, given = begin + count - layout.context, layout.context
         window = whole[:, -layout.context :]
     return np.concatenate(made, axis=1)[:, lacking : rows.shape[1]]

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from rsjax.matmul import bf16_pays, transposed_in_memory
 
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
+BLOCKS, LONG = 4, 256  # blocks of queries in causal attention of at least so many cells
 SCORES = 2**24  # the most in all frames that run at the same time: 64 MiB
 
 
@@ -61,8 +62,20 @@ def _each_frame(run: Callable[..., Any], *operands: Array) -> Any:
     return jax.lax.scan(lambda _, frame: (None, run(*frame)), None, operands, unroll=unroll)[1]
 
 
+def _blocks(causal: bool, cells: int) -> list[slice]:
+    """Returns the blocks of queries: all, or a few, each of which skips the keys that come after it."""
+    size = -(-cells // BLOCKS) if causal and cells >= LONG else cells
+    return [slice(begin, min(begin + size, cells)) for begin in range(0, cells, size)]
+
+
 def _frame(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
     """Returns one frame's output (h, S, e), and the log-sum of each row of its scores (h, S, 1)."""
+    parts = [_block(causal, q[:, rows], k[:, : rows.stop], v[:, : rows.stop]) for rows in _blocks(causal, q.shape[1])]
+    out, log_total = (jnp.concatenate(same, axis=1) for same in zip(*parts, strict=True))
+    return out, log_total
+
+
+def _block(causal: bool, q: Array, k: Array, v: Array) -> tuple[Array, Array]:
     scores = _scores(q, k, causal)
     top = jnp.max(scores, axis=-1, keepdims=True)
     weights = _rounded(jnp.exp(scores - top))
@@ -74,6 +87,18 @@ def _frame_gradient(
     causal: bool, q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
     """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
+    parts, cells = [], q.shape[1]
+    for rows in _blocks(causal, cells):
+        seen, own = (k[:, : rows.stop], v[:, : rows.stop]), (x[:, rows] for x in (q, g, along, log_total))
+        dq, *of_keys = _block_gradient(causal, *seen, *own)
+        parts.append((dq, *(jnp.pad(x, ((0, 0), (0, 0), (0, cells - rows.stop))) for x in of_keys)))
+    queries, keys, values = zip(*parts, strict=True)
+    return jnp.concatenate(queries, axis=1), sum(keys[1:], keys[0]), sum(values[1:], values[0])
+
+
+def _block_gradient(
+    causal: bool, k: Array, v: Array, q: Array, g: Array, along: Array, log_total: Array
+) -> tuple[Array, Array, Array]:
     weights = _rounded(jnp.exp(_scores(q, k, causal) - log_total))
     of_weights = _product("hqe,hke->hqk", g, v)
     of_scores = _rounded(weights * (of_weights - along))
@@ -86,7 +111,8 @@ def _frame_gradient(
 
 def _scores(q: Array, k: Array, causal: bool) -> Array:
     scores = _product("hqe,hke->hqk", q, k)
-    return jnp.where(jnp.tri(len(q[0]), dtype=bool), scores, -jnp.inf) if causal else scores
+    (queries, keys), before = scores.shape[1:], scores.shape[2] - scores.shape[1]
+    return jnp.where(jnp.tri(queries, keys, before, dtype=bool), scores, -jnp.inf) if causal else scores
 
 
 def _rounded(x: Array) -> Array:
