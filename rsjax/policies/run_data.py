@@ -11,6 +11,7 @@ from rsjax.data.clips import readable
 from rsjax.data.store import Store, open_store
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
+from rsjax.pipeline.own_data import relocated
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.trained import load, load_config
 from rsjax.policies.actions import check_takes_actions
@@ -31,14 +32,17 @@ class RunData:
     Attributes:
         run: the directory.
         data_dir: the directory of simulated data sets.
+        moved: the new path of the run's store of ingested clips, if it was moved.
     """
 
     run: Path
     data_dir: Path = Path("data")
+    moved: Path | None = None
 
     @cached_property
     def config(self) -> Config:
-        return load_config(self.run)
+        config = load_config(self.run)
+        return relocated(config, self.moved) if self.moved else config
 
     @cached_property
     def clips(self) -> Store:

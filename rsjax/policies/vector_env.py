@@ -88,6 +88,7 @@ def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | No
     """Returns the seed of each environment."""
     if seed is None:
         return [None] * count
+    seeds: list[int | None]
     seeds = [int(seed) + i for i in range(count)] if np.isscalar(seed) else list(seed)  # type: ignore[arg-type]
     if len(seeds) != count:
         raise UserError(f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment")

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 from rsjax.config import CausalVAEConfig
 from rsjax.config.cogvideox import DECODED, ENCODED
 from rsjax.tokenizers import convolution
+from rsjax.tokenizers.convolution import Dtype
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
-from rsjax.tokenizers.vae_blocks import Downsample, Dtype, Upsample, group_norm
+from rsjax.tokenizers.vae_blocks import Downsample, Upsample, group_norm
 from rsjax.trainable import Params
 
 Video = Float[Array, "B T H W C"]

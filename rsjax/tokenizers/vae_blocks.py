@@ -7,16 +7,14 @@ Axes: N images, h×w cells, C channels.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, TypeAlias
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.tokenizers.convolution import conv
+from rsjax.tokenizers.convolution import Dtype, conv
 
-Dtype: TypeAlias = Literal["float32", "bfloat16"]
 Map = Float[Array, "N h w C"]
 
 

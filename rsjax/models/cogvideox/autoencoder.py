@@ -133,9 +133,9 @@ class CausalVAETraining(Autoencoder[Batch]):
 def notes_on_filling(what: str, frames: int) -> list[str]:
     """Returns a line that says to how many frames videos are padded; none if they need no padding."""
     whole = padded_frames(frames)
-    return (
-        [] if whole == frames else [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"]
-    )
+    if whole == frames:
+        return []
+    return [f"{what} of {frames} frames are encoded as {whole}, 8k + 1, by repeating the last"]
 
 
 def filled(frames: np.ndarray, axis: int) -> np.ndarray:
