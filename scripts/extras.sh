@@ -43,6 +43,11 @@ fi
 echo "extras: installing the packages of requirements-extras.txt (about 1.7 GB)"
 "$base/bin/python" -m pip --python "$python" install --quiet --progress-bar off "${index[@]}" -r requirements-extras.txt ||
     stop "pip could not install requirements-extras.txt, which needs a package index and 1.7 GB of disk; see its lines above"
+if ! "$python" -c 'import torchvision' >/dev/null 2>&1; then
+    # Then transformers does not import either. It does without torchvision; only the annotators RAFT and InternVL need that.
+    echo "extras: torchvision does not fit this build of PyTorch and is removed; the tests that need it are skipped"
+    "$base/bin/python" -m pip --python "$python" uninstall --quiet --yes torchvision
+fi
 if ! command -v chromium >/dev/null; then
     echo "extras: installing Chromium for the tests of pages"
     scripts/apt.sh chromium ||

@@ -127,6 +127,7 @@ def test_no_network_is_loaded_where_all_parts_have_text(tmp_path):
 def test_the_real_network_sees_every_picture_and_is_checked(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("transformers")
+    pytest.importorskip("torchvision", reason="transformers' processor of videos needs it")
     from tests.ingest.annotators.networks.internvl import save_small
 
     recording = episode(FRAMES, "", PARTS)
