@@ -98,8 +98,9 @@ class Codec:
 
 
 def images_per_pass(side: int) -> int:
-    """Returns how many images of ``side`` × ``side`` pixels one pass of a large network takes."""
-    return max(1, (CPU_PIXELS if jax.default_backend() == "cpu" else PIXELS) // side**2)
+    """Returns how many images of ``side`` × ``side`` pixels one pass of a large network takes, over all devices."""
+    pixels = CPU_PIXELS * jax.local_device_count() if jax.default_backend() == "cpu" else PIXELS
+    return max(1, pixels // side**2)
 
 
 def in_chunks(

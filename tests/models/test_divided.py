@@ -13,6 +13,6 @@ def test_devices_divide_the_clips_of_a_batch() -> None:
     in_rows = json.loads(done.stdout.splitlines()[-1])
     assert {name.removeprefix("rsjax.models."): rows for name, rows in in_rows.items()} == {
         "ivideogpt.rollout.sample": [True],
-        "ivideogpt.autoencoder._apply": [True] * 4,
+        "ivideogpt.autoencoder._apply": [True] * 2,
         "roboscape.teacher._score_window": [True] * 2,
     }
