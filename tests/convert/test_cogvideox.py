@@ -119,17 +119,19 @@ def test_files_of_something_else_are_refused(tmp_path: Path, capsys: pytest.Capt
     assert "describes AutoencoderKL, not" in refused(capsys, "cogvideox", path, tmp_path / "o")
     path = written(tmp_path / "factor", vae, settings | {"scaling_factor": 0})
     assert "has scaling_factor 0; a number above 0 fits" in refused(capsys, "cogvideox", path, tmp_path / "o")
-    for name, value, message in (
+    wrong: tuple[tuple[str, Any, str], ...] = (
         ("norm_num_groups", "32", 'norm_num_groups "32"; a whole number above 0 fits'),
         ("scaling_factor", True, "scaling_factor true; a number above 0 fits"),
-    ):
+    )
+    for name, value, message in wrong:
         path = written(tmp_path / name, vae, settings | {name: value})
         assert message in refused(capsys, "cogvideox", path, tmp_path / "o")
     own = cogvideox.transformer_settings(NET)
-    for name, value, message in (
+    wrong = (
         ("use_rotary_positional_embeddings", "false", 'positional_embeddings "false"; true or false fits'),
         ("max_text_seq_length", -1, "max_text_seq_length -1; a whole number above 0 fits"),
-    ):
+    )
+    for name, value, message in wrong:
         path = written(tmp_path / name, transformer(NET), own | {name: value})
         assert message in refused(capsys, "cogvideox", path, tmp_path / "o")
     del vae["encoder.conv_out.conv.bias"]

@@ -105,7 +105,7 @@ def test_a_vector_of_environments_restarts_each_as_one_alone_would(model: Traine
         many.reset(seed=[1])
     alone = WorldModelEnv(model, **settings)
     rows = np.random.default_rng(3).uniform(-1, 1, (steps, count, 28)).astype(np.float32)
-    seen, _ = many.reset(seed=np.int64(4))
+    seen, _ = many.reset(seed=np.int64(4))  # type: ignore[arg-type]
     made = [(seen, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool))]
     for number in range(steps):
         rows[number, made[-1][2] | made[-1][3]] = np.nan  # of episodes that begin anew, whose actions do not matter
