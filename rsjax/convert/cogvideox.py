@@ -120,10 +120,8 @@ def autoencoder_from_public(
     Raises:
         ConvertError: tensors are missing, unexpected, of the wrong shape or not finite; or the settings do not fit.
     """
-    factor, groups = (
-        setting(source, settings, "scaling_factor", FACTOR),
-        setting(source, settings, "norm_num_groups", 32),
-    )
+    factor = setting(source, settings, "scaling_factor", FACTOR)
+    groups = setting(source, settings, "norm_num_groups", 32)
     first = re.compile(r"encoder\.down_blocks\.(\d+)\.resnets\.(\d+)\.conv1\.conv\.weight")
     places = [(int(match[1]), int(match[2])) for match in map(first.fullmatch, tensors) if match]
     levels, blocks = (max(column) + 1 for column in zip(*places, strict=True)) if places else (0, 0)

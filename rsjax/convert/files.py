@@ -199,8 +199,15 @@ def _unreadable(path: Path, name: str, dtype: str) -> ConvertError:
     return ConvertError(f"{path}: {name} is of type {dtype} or a form that cannot be read; save it as dense float32")
 
 
-_KINDS = {bool: "true or false", int: "a whole number above 0", float: "a number above 0"}
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number"}
 S = TypeVar("S", bool, int, float)
+
+
+def check_type(source: object, name: str, value: object, example: bool | int | float) -> None:
+    """Raises :class:`ConvertError` unless a setting is null or of the example's type; integers count as floats, too."""
+    kinds = (int, float) if type(example) is float else (type(example),)
+    if value is not None and type(value) not in kinds:
+        raise ConvertError(f"{source}: {name} is {json.dumps(value):.80}, not {_KINDS[type(example)]}")
 
 
 def setting(source: object, settings: dict[str, Any], name: str, default: S) -> S:
@@ -209,13 +216,12 @@ def setting(source: object, settings: dict[str, Any], name: str, default: S) -> 
     Raises:
         ConvertError: it is not of its default's type, or a number that is not above 0.
     """
-    value = settings.get(name)
+    value, where = settings.get(name), f"{source}: its config.json"
+    check_type(where, name, value, default)
     if value is None:
         return default
-    kinds = (int, float) if isinstance(default, float) else (type(default),)
-    if type(value) not in kinds or (type(value) is not bool and not 0 < value < math.inf):
-        found = json.dumps(value)
-        raise ConvertError(f"{source}: its config.json has {name} {found:.80}; {_KINDS[type(default)]} fits")
+    if type(value) is not bool and not 0 < value < math.inf:
+        raise ConvertError(f"{where}: {name} is {json.dumps(value)}, not above 0")
     return value  # type: ignore[no-any-return]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from rsjax.config import ConfigError
-from rsjax.convert.files import ConvertError, Tensors
+from rsjax.convert.files import ConvertError, Tensors, check_type
 from rsjax.convert.table import SAME_NAMES, Entry, Names, Table, norm, shape_of, to_params, weight_and_bias
 from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
@@ -139,11 +139,7 @@ def infer_config(
 def _check_types(path: Path, settings: dict[str, Any]) -> None:
     """Raises :class:`ConvertError` unless each known field is null or of its type; integers count as floats, too."""
     for name, example in settings_of(Architecture()).items():
-        value = settings.get(name)
-        kinds = (int, float) if type(example) is float else (type(example),)
-        if value is not None and type(value) not in kinds:
-            kind = {bool: "true or false", int: "a whole number", float: "a number"}[type(example)]
-            raise ConvertError(f"{path}: {name} is {json.dumps(value):.80}, not {kind}")
+        check_type(path, name, settings.get(name), example)
 
 
 def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, Any]) -> None:

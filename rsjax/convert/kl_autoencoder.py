@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from rsjax.config import ConfigError, KLConfig
-from rsjax.convert.files import ConvertError, Tensors, setting
+from rsjax.convert.files import ConvertError, Tensors, check_type, setting
 from rsjax.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors
 from rsjax.convert.vae_names import vae_table
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
@@ -94,11 +94,8 @@ def from_public(
         {n: names.get(o, o) for n, o in own.items()},
     )
     config = infer_config(source, tensors, settings, names)
-    factor, shift = settings.get("scaling_factor", SDXL_FACTOR), settings.get("shift_factor") or 0.0
-    if not all(type(x) in (int, float) and math.isfinite(x) for x in (factor, shift)) or factor <= 0:
-        raise ConvertError(
-            f"{source}: its {CONFIG} has scaling_factor {factor!r} and shift_factor {shift!r}; numbers fit"
-        )
+    factor, shift = setting(source, settings, "scaling_factor", SDXL_FACTOR), settings.get("shift_factor") or 0.0
+    check_type(f"{source}: its {CONFIG}", "shift_factor", shift, 0.0)
     if factor != SDXL_FACTOR:
         note(f"{source}: its latents have the factor {factor:g}; the public IRASim needs SDXL's, {SDXL_FACTOR:g}")
     fixed = {"mean": shift, "log_deviation": -math.log(factor)}

@@ -131,7 +131,7 @@ class Imagined:
     def __init__(self, trained: Any, count: int, judge: Judge, low: np.ndarray, high: np.ndarray) -> None:
         self._imagination = imagination(trained, count)
         self._count, self._judge, self._low, self._high = count, judge, low, high
-        self.key = content_key("imagined", model_key(trained), judge_key(judge), arrays_key(low, high))
+        self.key = content_key("imagined", 2, model_key(trained), judge_key(judge), arrays_key(low, high))
         self.validation = getattr(judge, "validation", None)
 
     @property

@@ -9,7 +9,7 @@ Axes: B images, h×w cells, C channels in, D channels out, i×j cells of a kerne
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 
 from rsjax.matmul import bf16_pays, matmul_bf16, transposed_in_memory
 
-Dtype: TypeAlias = Literal["float32", "bfloat16"]
 LEAST = 64  # channels, in and out, from which the products save more time than their copies of the image cost
 STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
 
@@ -26,7 +25,7 @@ STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
 def conv(
     features: int,
     kernel: int,
-    dtype: Dtype,
+    dtype: Literal["float32", "bfloat16"],
     name: str | None = None,
     stride: int = 1,
     padding: Any = "SAME",

@@ -118,18 +118,18 @@ def test_files_of_something_else_are_refused(tmp_path: Path, capsys: pytest.Capt
     path = written(tmp_path / "other", vae, {"_class_name": "AutoencoderKL"})
     assert "describes AutoencoderKL, not" in refused(capsys, "cogvideox", path, tmp_path / "o")
     path = written(tmp_path / "factor", vae, settings | {"scaling_factor": 0})
-    assert "has scaling_factor 0; a number above 0 fits" in refused(capsys, "cogvideox", path, tmp_path / "o")
+    assert "its config.json: scaling_factor is 0, not above 0" in refused(capsys, "cogvideox", path, tmp_path / "o")
     wrong: tuple[tuple[str, Any, str], ...] = (
-        ("norm_num_groups", "32", 'norm_num_groups "32"; a whole number above 0 fits'),
-        ("scaling_factor", True, "scaling_factor true; a number above 0 fits"),
+        ("norm_num_groups", "32", 'norm_num_groups is "32", not a whole number'),
+        ("scaling_factor", True, "scaling_factor is true, not a number"),
     )
     for name, value, message in wrong:
         path = written(tmp_path / name, vae, settings | {name: value})
         assert message in refused(capsys, "cogvideox", path, tmp_path / "o")
     own = cogvideox.transformer_settings(NET)
     wrong = (
-        ("use_rotary_positional_embeddings", "false", 'positional_embeddings "false"; true or false fits'),
-        ("max_text_seq_length", -1, "max_text_seq_length -1; a whole number above 0 fits"),
+        ("use_rotary_positional_embeddings", "false", 'positional_embeddings is "false", not true or false'),
+        ("max_text_seq_length", -1, "max_text_seq_length is -1, not above 0"),
     )
     for name, value, message in wrong:
         path = written(tmp_path / name, transformer(NET), own | {name: value})

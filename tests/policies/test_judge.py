@@ -11,6 +11,7 @@ import pytest
 from rsjax.clip import Video
 from rsjax.data.store import Store
 from rsjax.errors import UserError
+from rsjax.policies import judge as judge_module
 from rsjax.policies import judging
 from rsjax.policies.env import WorldModelEnv
 from rsjax.policies.judge import Footage, Network, TrainedJudge, load_judge, spoilt, train_judge
@@ -86,6 +87,17 @@ def test_every_history_is_spoilt_and_in_several_ways() -> None:
     frames, rng = footage(40, 4).rgb[:, :HISTORY], np.random.default_rng(0)
     changed = np.abs(spoilt(frames, frames[::-1], rng).astype(float) - frames).mean((1, 2, 3, 4))
     assert changed.min() > 1 and changed.max() > 10 * changed.min()
+
+
+def test_no_history_is_put_on_top_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    monkeypatch.setattr(judge_module, "spoilt", lambda frames, others, rng: pairs.append((frames, others)) or frames)
+    some, rng = footage(20, 5), np.random.default_rng(0)
+    found = [np.argwhere(some.success == done) for done in (True, False)]
+    for _ in range(30):
+        judge_module._batch(some, found, rng)
+    assert len(pairs) == 30
+    assert all((one != other).any((1, 2, 3, 4)).all() for one, other in pairs)
 
 
 def test_frames_whose_side_is_no_multiple_of_8_are_spoilt_but_for_a_border() -> None:
