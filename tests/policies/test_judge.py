@@ -91,7 +91,12 @@ def test_every_history_is_spoilt_and_in_several_ways() -> None:
 
 def test_no_history_is_put_on_top_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs: list[tuple[np.ndarray, np.ndarray]] = []
-    monkeypatch.setattr(judge_module, "spoilt", lambda frames, others, rng: pairs.append((frames, others)) or frames)
+
+    def keep(frames: np.ndarray, others: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        pairs.append((frames, others))
+        return frames
+
+    monkeypatch.setattr(judge_module, "spoilt", keep)
     some, rng = footage(20, 5), np.random.default_rng(0)
     found = [np.argwhere(some.success == done) for done in (True, False)]
     for _ in range(30):
