@@ -3,6 +3,7 @@
 import io
 import itertools
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -176,23 +177,26 @@ def test_frames_of_two_viewers_share_passes_and_keep_their_bits(server: Server, 
     def drive(page: Client, made: list[Picture]) -> None:
         made += page.drive(6, source={"kind": "random"})
 
-    with server.client() as (one, _), server.client() as (other, _):
-        one.ask("start", clip=0, seed=3)
-        other.ask("start", clip=1, seed=4)
+    with server.client() as (one, _), server.client() as (other, _), server.client() as (third, _):
+        for clip, page in enumerate((one, other, third)):
+            page.ask("start", clip=clip, seed=3 + clip)
         alone = one.drive(6)
         one.ask("start", clip=0, seed=3)
-        fake = fakes.kinds[True]
+        fake, engine = fakes.kinds[True], server.hub.engine
         fake.gate.clear()
         fake.passes.clear()
+        blocking = third.send("step", branch=0, action=[0] * 7)  # holds the engine until both have asked
         made: tuple[list[Picture], list[Picture]] = ([], [])
         threads = [threading.Thread(target=drive, args=each) for each in zip((one, other), made, strict=True)]
         for thread in threads:
             thread.start()
-        threading.Timer(3, fake.gate.set).start()  # by then both have asked, on a busy machine too
+        while len(engine._waiting) < 2:
+            time.sleep(0.01)
+        fake.gate.set()
         for thread in threads:
             thread.join()
-        assert 2 in fake.passes, "no pass had two frames, which tests nothing"
-        assert sum(fake.passes) == 12
+        assert third.wait(blocking)["type"] == "stepped"
+        assert 2 in fake.passes and sum(fake.passes) == 13
         assert same(made[0], alone)
 
 
