@@ -22,6 +22,7 @@ ORDER = [
     "ingest",
     "trainable",
     "matmul",
+    "group_norm",
     "tokenizers",
     "models",
     "training",

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Float32, Int, UInt8
 from rsjax.data.codec import Record
 from rsjax.data.shift import moved
 from rsjax.evaluation.registry import Places
+from rsjax.group_norm import GroupNorm
 from rsjax.progress import Progress
 
 OBJECTS = ("cube", "gripper")
@@ -72,7 +73,7 @@ class Network(nn.Module):
 
 
 def _layer(x: Array) -> Array:
-    return nn.relu(nn.GroupNorm(8)(x))
+    return nn.relu(GroupNorm(8)(x))
 
 
 def _enlarged(x: Array, like: Array) -> Array:

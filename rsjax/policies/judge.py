@@ -24,6 +24,7 @@ from rsjax.config import content_key
 from rsjax.data.codec import decode, encode
 from rsjax.errors import UserError
 from rsjax.files import read_json, write_file
+from rsjax.group_norm import GroupNorm
 from rsjax.policies.keys import arrays_key
 from rsjax.policies.verdicts import FAIL, HISTORY, LABELS, SUCCESS, UNINTERPRETABLE, last_frames
 from rsjax.progress import Progress
@@ -47,7 +48,7 @@ class Network(nn.Module):
         if height > SIDE:
             x = jax.image.resize(x, (b, SIDE, SIDE, count * 3), "linear")
         for width, stride in ((24, 2), (32, 2), (32, 1), (48, 2), (48, 2)):
-            x = nn.relu(nn.GroupNorm(8)(nn.Conv(width, (3, 3), (stride, stride))(x)))
+            x = nn.relu(GroupNorm(8)(nn.Conv(width, (3, 3), (stride, stride))(x)))
         return nn.Dense(len(LABELS))(nn.relu(nn.Dense(64)(x.reshape(b, -1))))
 
 

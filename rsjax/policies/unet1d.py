@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rsjax.config.policy import PolicyConfig
+from rsjax.group_norm import GroupNorm
 
 
 def mish(x: Array) -> Array:
@@ -61,7 +62,7 @@ class ConvBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "B H C"]) -> Float[Array, "B H C2"]:
-        return mish(nn.GroupNorm(self.groups)(Conv(self.channels, self.kernel)(x)))
+        return mish(GroupNorm(self.groups)(Conv(self.channels, self.kernel)(x)))
 
 
 class ResidualBlock(nn.Module):
@@ -120,7 +121,7 @@ class Vision(nn.Module):
     def __call__(self, pictures: Float[Array, "B S S 3"]) -> Float[Array, "B F"]:
         cfg = self.config
         x = nn.Conv(cfg.vision[0], (7, 7), strides=(2, 2), use_bias=False)(pictures)
-        x = nn.relu(nn.GroupNorm(self._groups(cfg.vision[0]))(x))
+        x = nn.relu(GroupNorm(self._groups(cfg.vision[0]))(x))
         if cfg.pool:
             x = nn.max_pool(x, (3, 3), strides=(2, 2), padding="SAME")
         for stage, channels in enumerate(cfg.vision):
@@ -134,10 +135,10 @@ class Vision(nn.Module):
     def _block(self, x: Array, channels: int, stride: int) -> Array:
         groups = self._groups(channels)
         y = nn.Conv(channels, (3, 3), strides=(stride, stride), use_bias=False)(x)
-        y = nn.relu(nn.GroupNorm(groups)(y))
-        y = nn.GroupNorm(groups)(nn.Conv(channels, (3, 3), use_bias=False)(y))
+        y = nn.relu(GroupNorm(groups)(y))
+        y = GroupNorm(groups)(nn.Conv(channels, (3, 3), use_bias=False)(y))
         if x.shape != y.shape:
-            x = nn.GroupNorm(groups)(nn.Conv(channels, (1, 1), strides=(stride, stride), use_bias=False)(x))
+            x = GroupNorm(groups)(nn.Conv(channels, (1, 1), strides=(stride, stride), use_bias=False)(x))
         return nn.relu(x + y)
 
 

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from rsjax.config import CausalVAEConfig
 from rsjax.config.cogvideox import DECODED, ENCODED
+from rsjax.group_norm import GroupNorm
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
-from rsjax.tokenizers.vae_blocks import Downsample, Upsample, group_norm
+from rsjax.tokenizers.vae_blocks import Downsample, Upsample
 from rsjax.trainable import Params
 
 Video = Float[Array, "B T H W C"]
@@ -70,7 +71,7 @@ class CellNorm(nn.Module):
     def __call__(self, x: Video, latents: Float[Array, "B t h w z"]) -> Video:
         # Repeating cells after the layers gives the same result as before them, with less work.
         scale, shift = (spread(nn.Dense(x.shape[-1], name=f"conv_{name}")(latents), x) for name in "yb")
-        return group_norm(self.groups, name="norm_layer")(x) * scale + shift
+        return GroupNorm(self.groups, name="norm_layer")(x) * scale + shift
 
 
 def spread(cells: Video, like: Video) -> Video:
@@ -105,7 +106,7 @@ class ResBlock(nn.Module):
         h = x
         for i in (1, 2):
             if latents is None:
-                h = group_norm(self.groups, name=f"norm{i}")(h)
+                h = GroupNorm(self.groups, name=f"norm{i}")(h)
             else:
                 h = CellNorm(self.groups, name=f"norm{i}")(h, latents)
             h = CausalConv(self.features, name=f"conv{i}")(nn.silu(h))
@@ -132,7 +133,7 @@ class Encoder(nn.Module):
                 x = by_frame(x, Downsample(name=f"down_{level}_downsample"))
         for i in range(2):
             x = ResBlock(cfg.widths[-1], cfg.norm_groups, name=f"mid_block_{i}")(x)
-        x = nn.silu(group_norm(cfg.norm_groups, name="norm_out")(x))
+        x = nn.silu(GroupNorm(cfg.norm_groups, name="norm_out")(x))
         return CausalConv(2 * cfg.latent_channels, name="conv_out")(x)
 
 

@@ -9,7 +9,7 @@ frame, C channels.
 
 from collections.abc import Callable
 from itertools import count
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -17,11 +17,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ConditionalVQConfig
+from rsjax.group_norm import GroupNorm
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
-from rsjax.tokenizers.vae_blocks import Map, decode, encode, group_norm
+from rsjax.tokenizers.vae_blocks import Map, decode, encode
 
 Features = list[Float[Array, "B c h w C"]]  # of the context after each level
 Index = Int[Array, " B"] | None  # each clip's number, which decides its dropout; None: no dropout
+Dropout = Callable[[Float[Array, "B ..."], Any], Float[Array, "B ..."]]  # (values, number of the draw) → values
+
+UNROLLED = 16  # frames whose code is written out; more take longer to compile
 
 
 class CrossAttention(nn.Module):
@@ -33,30 +37,53 @@ class CrossAttention(nn.Module):
     def __call__(self, z: Map, context: Float[Array, "B c h w C"], index: Index) -> Map:
         cfg, (clips, frames, h, w, width) = self.config, context.shape
         # Context frames are stacked along the height before the norm, as in the public code.
-        kv = group_norm(cfg.norm_groups, 1e-5, "kv_norm")(context.reshape(clips, frames * h, w, width))
+        kv = GroupNorm(cfg.norm_groups, 1e-5, name="kv_norm")(context.reshape(clips, frames * h, w, width))
         kv = kv.reshape(clips, -1, width) + self.param("kv_pos_emb", nn.initializers.zeros, (frames * h * w, width))
-        q = group_norm(cfg.norm_groups, 1e-5, "q_norm")(z).reshape(clips, -1, h * w, width)
+        q = GroupNorm(cfg.norm_groups, 1e-5, name="q_norm")(z).reshape(clips, -1, h * w, width)
         q = q + self.param("q_pos_emb", nn.initializers.zeros, (h * w, width))
         kernel = self.param("in_proj_kernel", nn.initializers.xavier_uniform(), (width, 3 * width))
         bias = self.param("in_proj_bias", nn.initializers.zeros, (3 * width,))
-        heads = lambda x: x.reshape(*x.shape[:-1], cfg.heads, width // cfg.heads)  # noqa: E731
+        heads = lambda x: x.reshape(*x.shape[:-1], cfg.heads, width // cfg.heads).swapaxes(-3, -2)  # noqa: E731
         q = heads(q @ kernel[:, :width] + bias[:width])
         k, v = map(heads, jnp.split(kv @ kernel[:, width:] + bias[width:], 2, axis=-1))
-        scores = jnp.einsum("bfqhe,bkhe->bfhqk", q, k) * q.shape[-1] ** -0.5
-        weights = self._drop(jax.nn.softmax(scores, axis=-1), index)
-        out = jnp.einsum("bfhqk,bkhe->bfqhe", weights, v).reshape(*q.shape[:3], width)
-        return nn.silu(z + self._drop(nn.Dense(width, name="out_proj")(out), index).reshape(z.shape))
+        drop = self._dropout(index)
+        out = _attend(q, k, v, drop).swapaxes(2, 3).reshape(clips, -1, h * w, width)
+        return nn.silu(z + drop(nn.Dense(width, name="out_proj")(out), 0).reshape(z.shape))
 
-    def _drop(self, x: Float[Array, "B ..."], index: Index) -> Float[Array, "B ..."]:
-        """Applies dropout by the clip's number, so that a step does not depend on how its batch is split."""
+    def _dropout(self, index: Index) -> Dropout:
+        """Returns dropout by the clip's number, so that a step does not depend on how its batch is split."""
         if index is None or not self.config.dropout:
-            return x
+            return lambda x, draw: x
         key, share = self.make_rng("dropout"), 1 - self.config.dropout
 
-        def kept(number: Int[Array, ""]) -> Bool[Array, "..."]:
-            return jax.random.bernoulli(jax.random.fold_in(key, number), share, x.shape[1:])
+        def drop(x: Float[Array, "B ..."], draw: Any) -> Float[Array, "B ..."]:
+            def kept(number: Int[Array, ""]) -> Bool[Array, "..."]:
+                return jax.random.bernoulli(jax.random.fold_in(keys, number), share, x.shape[1:])
 
-        return jnp.where(jax.vmap(kept)(index), x / share, 0.0)
+            keys = jax.random.fold_in(key, draw)
+            return jnp.where(jax.vmap(kept)(index), x / share, 0.0)
+
+        return drop
+
+
+def _attend(
+    q: Float[Array, "B F H q e"], k: Float[Array, "B H k e"], v: Float[Array, "B H k e"], drop: Dropout
+) -> Float[Array, "B F H q e"]:
+    """Returns softmax(q·kᵀ/√e)·v with dropout of the weights, for one later frame after another.
+
+    A frame's scores stay in the processor's cache, and the loop is unrolled so that XLA runs several frames at the same
+    time; with the gradient, this takes a third to a half of the time of all frames at once.
+    """
+
+    def one(_: None, frame: tuple[Float[Array, "B H q e"], Int[Array, ""]]) -> tuple[None, Float[Array, "B H q e"]]:
+        q, number = frame
+        scores = jnp.einsum("bhqe,bhke->bhqk", q, k)
+        weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(-1, keepdims=True)))
+        return None, jnp.einsum("bhqk,bhke->bhqe", drop(weights, number), v) / weights.sum(-1, keepdims=True)
+
+    frames = jnp.moveaxis(q * q.shape[-1] ** -0.5, 1, 0)
+    made = jax.lax.scan(one, None, (frames, 1 + jnp.arange(len(frames))), unroll=min(len(frames), UNROLLED))[1]
+    return jnp.moveaxis(made, 0, 1)
 
 
 class Encoder(nn.Module):

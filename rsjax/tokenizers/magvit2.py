@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rsjax.config import TokenizerConfig
+from rsjax.group_norm import GroupNorm
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.convolution import conv
 
@@ -53,7 +54,7 @@ class ResBlock(nn.Module):
     def __call__(self, x: Float[Array, "B h w C"]) -> Float[Array, "B h w C"]:
         h = x
         for i in (1, 2):
-            h = nn.swish(_norm(self.groups, f"norm{i}", local=self.local)(h))
+            h = nn.swish(GroupNorm(self.groups, local=self.local, name=f"norm{i}")(h))
             h = _inner_conv(self.features, f"conv{i}", self.dtype, self.local)(h)
         if x.shape[-1] != self.features:
             x = conv(self.features, 1, self.dtype, "nin_shortcut", use_bias=False)(x)
@@ -62,19 +63,6 @@ class ResBlock(nn.Module):
 
 def _inner_conv(features: int, name: str, dtype: Dtype, local: bool) -> nn.Conv:
     return conv(features, 1, dtype, name, use_bias=False) if local else _conv3(features, name, dtype)
-
-
-def _norm(groups: int, name: str, affine: bool = True, local: bool = False) -> nn.GroupNorm:
-    # The fast variance, E[x²] - E[x]², is too inexact for parity with the public weights.
-    return nn.GroupNorm(
-        groups,
-        epsilon=1e-6,
-        use_bias=affine,
-        use_scale=affine,
-        reduction_axes=(-1,) if local else None,
-        use_fast_variance=False,
-        name=name,
-    )
 
 
 class AdaptiveGroupNorm(nn.Module):
@@ -88,7 +76,7 @@ class AdaptiveGroupNorm(nn.Module):
         deviation = jnp.sqrt(jnp.var(codes, axis=(1, 2), ddof=1) + 1e-6)
         scale = nn.Dense(x.shape[-1], name="gamma")(deviation)
         shift = nn.Dense(x.shape[-1], name="beta")(jnp.mean(codes, axis=(1, 2)))
-        return scale[:, None, None] * _norm(self.groups, "norm", affine=False)(x) + shift[:, None, None]
+        return scale[:, None, None] * GroupNorm(self.groups, affine=False, name="norm")(x) + shift[:, None, None]
 
 
 class Encoder(nn.Module):
@@ -115,7 +103,7 @@ class Encoder(nn.Module):
                     x = _conv3(x.shape[-1], name, dtype, bias=True, stride=2)(x)
         for i in range(cfg.res_blocks):
             x = ResBlock(x.shape[-1], cfg.norm_groups, dtype, local, name=f"mid_block_{i}")(x)
-        x = nn.swish(_norm(cfg.norm_groups, "norm_out", local=local)(x))
+        x = nn.swish(GroupNorm(cfg.norm_groups, local=local, name="norm_out")(x))
         return conv(cfg.code_bits, 1, dtype, "conv_out")(x)
 
 
@@ -138,7 +126,7 @@ class Decoder(nn.Module):
                 x = ResBlock(features, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x)
             if level > 0:
                 x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", dtype, bias=True)(x), 2)
-        x = nn.swish(_norm(cfg.norm_groups, "norm_out")(x))
+        x = nn.swish(GroupNorm(cfg.norm_groups, name="norm_out")(x))
         x = _conv3(3 * cfg.patch_size**2, "conv_out", dtype, bias=True)(x)
         return depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x
 

@@ -13,12 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rsjax.group_norm import GroupNorm
+
 Map = Float[Array, "N h w C"]
-
-
-def group_norm(groups: int, epsilon: float = 1e-6, name: str | None = None) -> nn.GroupNorm:
-    """Returns a GroupNorm with the exact variance; the fast one, E[x²] - E[x]², is too inexact for parity."""
-    return nn.GroupNorm(groups, epsilon=epsilon, use_fast_variance=False, name=name)
 
 
 def conv3(features: int, name: str) -> nn.Conv:
@@ -36,7 +33,7 @@ class ResBlock(nn.Module):
     def __call__(self, x: Map) -> Map:
         h = x
         for i in (1, 2):
-            h = conv3(self.features, f"conv{i}")(nn.silu(group_norm(self.groups, name=f"norm{i}")(h)))
+            h = conv3(self.features, f"conv{i}")(nn.silu(GroupNorm(self.groups, name=f"norm{i}")(h)))
         if x.shape[-1] != self.features:
             x = nn.Conv(self.features, (1, 1), name="conv_shortcut")(x)
         return x + h
@@ -66,7 +63,7 @@ class SelfAttention(nn.Module):
     @nn.compact
     def __call__(self, x: Map) -> Map:
         n, h, w, width = x.shape
-        normed = group_norm(self.groups, name="group_norm")(x).reshape(n, h * w, width)
+        normed = GroupNorm(self.groups, name="group_norm")(x).reshape(n, h * w, width)
         q, k, v = (nn.Dense(width, name=f"to_{name}")(normed) for name in "qkv")
         weights = jax.nn.softmax(jnp.einsum("nqc,nkc->nqk", q, k) * width**-0.5, axis=-1)
         return x + nn.Dense(width, name="to_out")(jnp.einsum("nqk,nkc->nqc", weights, v)).reshape(x.shape)
@@ -105,7 +102,7 @@ def encode(
             x = Downsample(name=f"down_{level}_downsample")(x)
         x = after(x)
     x = middle(x, groups, attention)
-    return conv3(out, "conv_out")(nn.silu(group_norm(groups, name="norm_out")(x)))
+    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
 
 
 def decode(
@@ -125,4 +122,4 @@ def decode(
         if level < len(widths) - 1:
             x = Upsample(name=f"up_{level}_upsample")(x)
         x = after(x)
-    return conv3(out, "conv_out")(nn.silu(group_norm(groups, name="norm_out")(x)))
+    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
