@@ -45,7 +45,7 @@ class GroupNorm(nn.Module):
 
     def _of_images(self, x: Array) -> Array:
         """Returns each image's mean of each group, at every channel of the group."""
-        return self._of_cells(x.mean(range(1, x.ndim - 1), keepdims=True))
+        return self._of_cells(jnp.mean(x, tuple(range(1, x.ndim - 1)), keepdims=True))
 
 
 def _normed(x: Array, mean: Callable[[Array], Array], epsilon: float) -> Array:

@@ -1,9 +1,10 @@
 """Encodes and decodes numpy images with a trained tokenizer: RGB frames and depth maps."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeAlias, cast
+from typing import Literal, TypeAlias, TypeVar, cast
 
 import jax
 import numpy as np
@@ -23,7 +24,8 @@ from rsjax.trainable import Params
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
 Grids: TypeAlias = Int[np.ndarray, "*B h w"] | Float32[np.ndarray, "*B h w D"]  # tokens, or codes of D bits
 
-CHUNK = 128  # most images per pass, to bound memory
+Result = TypeVar("Result")
+
 PIXELS, CPU_PIXELS = 128 * 64**2, 16 * 64**2  # of a pass; a CPU keeps the features of so few pixels in its cache
 
 
@@ -93,19 +95,18 @@ class Codec:
         def apply(chunk: np.ndarray) -> ArrayLike:
             return _apply(self.config, method, self.params, divide(chunk, self.params))
 
-        codes = images.dtype == np.float32  # not tokens
-        return in_chunks(apply, images, 3 if method == "encode" or codes else 2)
+        axes = 3 if method == "encode" or images.dtype == np.float32 else 2  # of pixels, of codes, or of tokens
+        side = images.shape[1 - axes] * (self.config.downsampling if method == "decode" else 1)
+        return in_chunks(apply, images, axes, images_per_pass(side))
 
 
 def images_per_pass(side: int) -> int:
-    """Returns how many images of ``side`` × ``side`` pixels one pass of a large network takes, over all devices."""
+    """Returns how many images of ``side`` × ``side`` pixels one pass takes, over all devices."""
     pixels = CPU_PIXELS * jax.local_device_count() if jax.default_backend() == "cpu" else PIXELS
     return max(1, pixels // side**2)
 
 
-def in_chunks(
-    apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int = CHUNK
-) -> np.ndarray:
+def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_axes: int, most: int) -> np.ndarray:
     """Applies a function to all items, in passes of at most ``most`` items.
 
     Args:
@@ -115,13 +116,24 @@ def in_chunks(
     lead, item = items.shape[:-item_axes], items.shape[-item_axes:]
     flat = items.reshape(-1, *item)
     size = min(most, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
-    out = []
-    for start in range(0, len(flat), size):
+
+    def run(start: int) -> np.ndarray:
         chunk = flat[start : start + size]
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
-        out.append(np.asarray(apply(padded))[: len(chunk)])
-    joined = np.concatenate(out)
+        return np.asarray(apply(padded))[: len(chunk)]
+
+    joined = np.concatenate(each_pass(run, range(0, len(flat), size)))
     return joined.reshape(*lead, *joined.shape[1:])
+
+
+def each_pass(run: Callable[[int], Result], starts: range) -> list[Result]:
+    """Returns the results of passes that start at these items; if a CPU is the only device, two run at the same time.
+
+    A pass by itself leaves a second core half idle. Passes on several devices must keep their order.
+    """
+    alone = jax.default_backend() == "cpu" and jax.device_count() == 1
+    with ThreadPoolExecutor(2 if alone else 1) as threads:
+        return list(threads.map(run, starts))
 
 
 def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:

@@ -31,7 +31,7 @@ def test_chunks_of_any_size_give_the_same(codec: Codec, monkeypatch: pytest.Monk
     tokens = rng.integers(0, 256, (2, 3, 8, 8), np.int32)
     apply = jax.jit(Tokenizer(CONFIG).apply, static_argnames="method")
     whole = apply({"params": codec.params}, frames.reshape(6, 64, 64, 3), method="encode")
-    monkeypatch.setattr(module, "CHUNK", chunk)
+    monkeypatch.setattr(module, "CPU_PIXELS", chunk * 64**2)
     np.testing.assert_array_equal(codec.encode_rgb(frames), np.reshape(whole, (2, 3, 8, 8)))
     decoded = apply({"params": codec.params}, tokens.reshape(6, 8, 8), method="decode")
     plain = np.round(np.reshape(decoded, frames.shape)).astype(np.uint8)

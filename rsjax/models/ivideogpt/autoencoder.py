@@ -27,7 +27,7 @@ from rsjax.devices import divide
 from rsjax.errors import UserError
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
-from rsjax.tokenizers.codec import images_per_pass
+from rsjax.tokenizers.codec import each_pass, images_per_pass
 from rsjax.tokenizers.conditional_vq import ConditionalVQ, Reconstruction
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
@@ -176,12 +176,14 @@ class ConditionalCodec:
         total, frames = len(arrays[0]), sum(x.shape[1] for x in arrays)
         most = max(1, images_per_pass(side) // frames)
         size = min(2 ** (total - 1).bit_length(), 2 ** (most.bit_length() - 1))
-        parts = []
-        for start in range(0, total, size):
+
+        def run(start: int) -> list[np.ndarray]:
             chunk = [x[start : start + size] for x in arrays]
             padded = [np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) for x in chunk]
             made = _apply(self.config, method, self.params, *divide(padded, self.params))
-            parts.append([np.asarray(x)[: len(chunk[0])] for x in (made if isinstance(made, tuple) else (made,))])
+            return [np.asarray(x)[: len(chunk[0])] for x in (made if isinstance(made, tuple) else (made,))]
+
+        parts = each_pass(run, range(0, total, size))
         return tuple(np.concatenate(same) for same in zip(*parts, strict=True))
 
 

@@ -156,7 +156,8 @@ def test_videos_start_with_the_prompt_as_the_autoencoder_sees_it() -> None:
     assets = Assets(inputs.normalization(CONFIG), toy.autoencoder_params(CONFIG))
     prompt, actions = inputs.video(CONFIG, 1, 1), np.zeros((1, 6, CONFIG.clips.action_dim), np.float32)
     made = MODEL.generate(toy.params(CONFIG), assets, prompt, actions)
-    np.testing.assert_array_equal(made.rgb[:, :1], MODEL.reconstruct(assets, Video(prompt.rgb)).rgb)
+    own = MODEL.reconstruct(assets, Video(prompt.rgb)).rgb.astype(int)
+    assert np.abs(made.rgb[:, :1] - own).max() <= 1  # at a half, rounding follows float32's last bit
 
 
 def test_actions_of_another_length_begin_fresh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
