@@ -143,7 +143,7 @@ def _kept(config: Config) -> list[jax.ShapeDtypeStruct]:
 
         return jax.vjp(loss, params)[1]  # a tree of the arrays that are kept
 
-    with inputs.random_texts(config) as readable:
+    with inputs.random_files(config) as readable:
         one = inputs.batch_shapes(create_model(readable), readable)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((_CLIPS, *x.shape[1:]), x.dtype), one)
     kept = jax.eval_shape(backward, params, batch, jax.random.key(0))

@@ -14,12 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rsjax.clip import Video
-from rsjax.config import CogVideoXConfig, Config
-from rsjax.config.leaves import with_values
+from rsjax.config import Config
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
-from rsjax.models.base import Assets, WorldModel, create_autoencoder
-from rsjax.models.cogvideox.text import EMPTY, write_texts
+from rsjax.models.base import Assets, WorldModel, create_autoencoder, with_random_files
 from rsjax.models.roboscape.architecture import Architecture
 
 
@@ -39,20 +37,10 @@ def assets(config: Config) -> Assets:
 
 
 @contextmanager
-def random_texts(config: Config) -> Iterator[Config]:
-    """Yields the configuration with a temporary file of random text embeddings in place of the file that it names.
-
-    A configuration that names no such file is left as it is.
-    """
-    if not (isinstance(config.model, CogVideoXConfig) and config.model.text.file):
-        yield config
-        return
-    text = config.model.text
-    embeddings = np.random.default_rng(0).normal(size=(1, text.tokens, text.width)).astype(np.float32)
+def random_files(config: Config) -> Iterator[Config]:
+    """Yields the configuration with temporary random files in place of those that the model reads."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "text.safetensors"
-        path.write_bytes(write_texts([EMPTY], embeddings))
-        yield with_values(config, {"model.text.file": str(path)})
+        yield with_random_files(config, Path(folder))
 
 
 def video(config: Config, size: int, frames: int) -> Video:

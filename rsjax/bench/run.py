@@ -52,7 +52,7 @@ def bench(
             installed, or the PyTorch baseline cannot be compared with the model.
     """
     check_request(config, batch, only, horizons, torch)
-    with inputs.random_texts(config) as config:
+    with inputs.random_files(config) as config:
         horizons = horizons or (config.clips.frames, 3 * config.clips.frames)
         dtype = getattr(config.model, "compute_dtype", "float32")
         works: dict[str, Callable[[], dict[str, Any]]] = {

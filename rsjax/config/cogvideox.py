@@ -1,7 +1,7 @@
 """Settings of CogVideoX: an autoencoder of videos, causal in time, and a diffusion transformer on its latents."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
@@ -157,6 +157,9 @@ class CogVideoXConfig(ModelConfig):
             f"model.sample.guidance is {self.sample.guidance}, but the learned tokens of the empty text are never "
             f"trained; set it to 1, or model.text.dropout above 0",
         )
+
+    def for_tasks(self, tasks: tuple[str, ...]) -> "CogVideoXConfig":
+        return self if self.text.file else replace(self, text=replace(self.text, tasks=tasks))
 
     @property
     def own_autoencoder(self) -> CausalVAEConfig:

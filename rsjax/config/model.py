@@ -30,6 +30,10 @@ class ModelConfig:
     def check(self, clips: ClipShape) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the model does not fit clips of this shape."""
 
+    def for_tasks(self, tasks: tuple[str, ...]) -> "ModelConfig":
+        """Returns the settings for clips of these tasks, or of tasks without names if there are none."""
+        return self
+
     @property
     def loss_weights(self) -> dict[str, float]:
         """The weight of each active loss term by name; by default the nonzero fields ``NAME_weight``."""

@@ -101,6 +101,14 @@ class WorldModel(Trainable[B], Protocol[B]):
         """
         return TokenizerTraining.create(config)
 
+    @classmethod
+    def with_random_files(cls, config: Config, folder: Path) -> Config:
+        """Returns the configuration with random files in ``folder`` in place of those that the settings name.
+
+        Benchmarks and counts use it. By default a family reads no files.
+        """
+        return config
+
     @property
     def loss_weights(self) -> dict[str, float]:
         """The weight λ of each active loss term by name, from ``config.model``."""
@@ -290,6 +298,11 @@ def create_model(config: Config) -> WorldModel[Any]:
 def create_autoencoder(config: Config) -> Autoencoder[Any]:
     """Returns the autoencoder of the stage "tokenizer"; the family must use one. Errors as in :func:`create_model`."""
     return _implementation(config).autoencoder(config)
+
+
+def with_random_files(config: Config, folder: Path) -> Config:
+    """Returns the configuration with random files in ``folder`` in place of those that its family reads."""
+    return _implementation(config).with_random_files(config, folder)
 
 
 def _implementation(config: Config) -> type[WorldModel[Any]]:

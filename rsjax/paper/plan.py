@@ -186,8 +186,7 @@ def _small(arm: Arm, base: Config) -> Config:
     if name not in presets.PRESETS:
         raise ConfigError(f"there is no preset {name} in this version")
     config = replace(presets.get(name), **{field: getattr(base, field) for field in KEPT})
-    tasks = base.sim.train_tasks
-    return with_values(config, {"model.text.tasks": tasks}) if tasks and hasattr(config.model, "text") else config
+    return replace(config, model=config.model.for_tasks(base.sim.train_tasks))
 
 
 def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:

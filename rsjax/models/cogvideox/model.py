@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
 from rsjax.config import ClipShape, CogVideoXConfig, Config, TextConfig
+from rsjax.config.leaves import with_values
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
@@ -24,7 +25,7 @@ from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.cogvideox import pretrained
 from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining, notes_on_filling
 from rsjax.models.cogvideox.rollout import rollout
-from rsjax.models.cogvideox.text import check_store, check_tasks, empty_texts, texts_of
+from rsjax.models.cogvideox.text import EMPTY, check_store, check_tasks, empty_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, forward_flops
 from rsjax.models.diffusion.schedule import add_noise, target
 from rsjax.progress import note
@@ -56,6 +57,15 @@ class CogVideoX(WorldModel[Batch]):
     @classmethod
     def autoencoder(cls, config: Config) -> Autoencoder[Any]:
         return CausalVAETraining.create(config)
+
+    @classmethod
+    def with_random_files(cls, config: Config, folder: Path) -> Config:
+        text, path = config.model.text, folder / "text.safetensors"
+        if not text.file:
+            return config
+        embeddings = np.random.default_rng(0).normal(size=(1, text.tokens, text.width)).astype(np.float32)
+        path.write_bytes(write_texts([EMPTY], embeddings))
+        return with_values(config, {"model.text.file": str(path)})
 
     @property
     def loss_weights(self) -> dict[str, float]:
