@@ -59,16 +59,18 @@ def tune_process() -> None:
 
 
 def set_xla_flags() -> None:
-    """Keeps matrix products and convolutions from YNNPACK on x86 processors without bf16 units.
+    """Keeps convolutions from YNNPACK on x86 processors, and matrix products on those without bf16 units.
 
-    There XLA's own products of bf16 operands are twice as fast, and so are convolutions (``docs/performance.md``). Sums
-    and maxima stay with YNNPACK. Changes nothing if the user has set this flag.
+    YNNPACK convolves on one core only. Where it has no bf16 units, XLA's own products of bf16 operands are twice as
+    fast (``docs/performance.md``). Sums and maxima stay with YNNPACK. Changes nothing if the user has set this flag.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if platform.machine() != "x86_64" or has_bf16_units() or YNNPACK in flags:
+    if platform.machine() != "x86_64" or YNNPACK in flags:
         return
     if version("jaxlib").startswith(KNOW_IT):
-        os.environ["XLA_FLAGS"] = f"{flags} {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE".strip()
+        kinds = ["REDUCE", "DOT", "INDIVIDUAL_DOT"] if has_bf16_units() else ["REDUCE"]
+        names = ",".join(f"LIBRARY_FUSION_TYPE_{kind}" for kind in kinds)
+        os.environ["XLA_FLAGS"] = f"{flags} {YNNPACK}={names}".strip()
 
 
 def has_bf16_units() -> bool:

@@ -71,7 +71,13 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_told_otherwise(
         ("flags : fma avx512f", "x86_64", "0.10.2", "", f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
         ("flags : fma avx512f", "x86_64", "0.10.2", "--a=1", f"--a=1 {YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE"),
         ("flags : fma avx512f", "x86_64", "0.10.2", f"{YNNPACK}=X", f"{YNNPACK}=X"),
-        ("flags : fma avx512f avx512_bf16", "x86_64", "0.10.2", "", ""),
+        (
+            "flags : fma avx512f avx512_bf16",
+            "x86_64",
+            "0.10.2",
+            "",
+            f"{YNNPACK}=LIBRARY_FUSION_TYPE_REDUCE,LIBRARY_FUSION_TYPE_DOT,LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+        ),
         ("Features : asimd", "aarch64", "0.10.2", "", ""),
         ("flags : fma avx512f", "x86_64", "0.99.0", "", ""),  # a later jaxlib may not know the flag
     ],
