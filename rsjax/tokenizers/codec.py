@@ -115,7 +115,8 @@ def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_
     """
     lead, item = items.shape[:-item_axes], items.shape[-item_axes:]
     flat = items.reshape(-1, *item)
-    size = min(most, 2 ** (len(flat) - 1).bit_length())  # powers of 2, so that few programs are compiled
+    whole = 2 ** (len(flat) - 1).bit_length()  # powers of 2, so that few programs are compiled
+    size = max(1, min(most, whole // passes_at_once()))
 
     def run(start: int) -> np.ndarray:
         chunk = flat[start : start + size]
@@ -127,13 +128,17 @@ def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_
 
 
 def each_pass(run: Callable[[int], Result], starts: range) -> list[Result]:
-    """Returns the results of passes that start at these items; if a CPU is the only device, two run at the same time.
-
-    A pass by itself leaves a second core half idle. Passes on several devices must keep their order.
-    """
-    alone = jax.default_backend() == "cpu" and jax.device_count() == 1
-    with ThreadPoolExecutor(2 if alone else 1) as threads:
+    """Returns the results of passes that start at these items, :func:`passes_at_once` of which run at the same time."""
+    with ThreadPoolExecutor(passes_at_once()) as threads:
         return list(threads.map(run, starts))
+
+
+def passes_at_once() -> int:
+    """Returns 2 if a CPU is the only device, since a pass leaves a second core half idle; otherwise 1.
+
+    Passes on several devices must keep their order.
+    """
+    return 2 if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1
 
 
 def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:
