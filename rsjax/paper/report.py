@@ -245,8 +245,8 @@ def _missing(result: Result) -> str:
 
 
 def _figure(outcome: Outcome) -> bytes | None:
-    """Draws the arms' scores with every seed; returns None before any arm has a score."""
-    columns = _columns(outcome)
+    """Draws the arms' scores with every seed, where any was measured; returns None before any arm has a score."""
+    columns = [column for column in _columns(outcome) if any(column.name in arm.spreads for arm in outcome.arms)]
     names = {column.name for column in columns}
     shown = [(arm, {name: value for name, value in arm.spreads.items() if name in names}) for arm in outcome.arms]
     rows = [Row({"": arm.name}, arm.finished, spreads) for arm, spreads in shown if spreads]
