@@ -335,7 +335,7 @@ def test_a_clip_is_shown_as_every_arm_predicts_it(tmp_path: Path, monkeypatch: p
 
 
 def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tables of grids leave some of them out, such as Physics-IQ's."""
+    """Tables of grids leave some of them out, such as Physics-IQ's; what was not measured has no panel."""
     drawn: list[str] = []
 
     def draw(rows: Any, columns: Any, title: str) -> bytes:
@@ -343,7 +343,7 @@ def test_a_figure_has_the_scores_that_the_claim_compares(tmp_path: Path, monkeyp
         return b""
 
     monkeypatch.setattr(page, "draw", draw)
-    compared = (Comparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial"))
+    compared = (Comparison(metric, "with", "without") for metric in ("psnr", "physics_iq_spatial", "ssim"))
     run(toy.plan(toy.claim("toy", *compared)), tmp_path)
     assert set(drawn) == {"psnr", "physics_iq_spatial"}
 

@@ -56,7 +56,9 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path, gain: float = 0.5
         clips = np.random.default_rng(0).normal(20, 3, CLIPS)
         draw = np.random.default_rng([seed, on]).normal(0, noise, CLIPS)
         psnr = clips + gain * on + draw + noise * np.random.default_rng([seed, on, 1]).normal()
-        result = evaluation.Evaluation({"psnr": psnr.mean()}, {"ssim": "a toy"}, {}, {"psnr": psnr.tolist()})
+        per_clip = {"psnr": psnr.tolist(), "physics_iq_spatial": [0.5] * CLIPS}
+        means = {name: float(np.mean(numbers)) for name, numbers in per_clip.items()}
+        result = evaluation.Evaluation(means, {"ssim": "a toy"}, {}, per_clip)
         evaluation.save(run.output("evaluation"), result)
         (run.directory / "metrics.json").write_text(json.dumps(result.metrics | {"reasons": result.reasons}))
 
