@@ -1,5 +1,7 @@
 """Our group normalisation against flax's."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,10 @@ def test_results_and_gradients_are_flaxs(shape: tuple[int, ...], groups: int, lo
     assert jax.tree.map(jnp.shape, ours.init(keys[0], x)) == jax.tree.map(jnp.shape, flaxs.init(keys[0], x))
 
     def run(layer: nn.Module) -> object:
-        loss = lambda params, x: jnp.sum(weights * layer.apply({"params": params}, x))  # noqa: E731
-        return layer.apply({"params": params}, x), jax.grad(loss, argnums=(0, 1))(params, x)
+        def apply(params: dict[str, Any], x: jax.Array) -> Any:
+            return layer.apply({"params": params}, x)
+
+        gradient = jax.grad(lambda *inputs: jnp.sum(weights * apply(*inputs)), argnums=(0, 1))
+        return apply(params, x), gradient(params, x)
 
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, atol=2e-4), run(ours), run(flaxs))

@@ -60,6 +60,7 @@ class CogVideoX(WorldModel[Batch]):
 
     @classmethod
     def with_random_files(cls, config: Config, folder: Path) -> Config:
+        assert isinstance(config.model, CogVideoXConfig)
         text, path = config.model.text, folder / "text.safetensors"
         if not text.file:
             return config
