@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import ConditionalVQConfig, ConfigError
+from rsjax.config import ConditionalVQConfig, ConfigError, TokenizerTrainConfig
 from rsjax.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, tokenizer_shapes, tokenizer_table
 from rsjax.convert.table import public_shapes, to_tensors
 from rsjax.describe import count
-from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
+from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
 from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
+from rsjax.trainable import StepContext
 from tests.models.ivideogpt.toy import SIZE, VQ, frames, vq_params
 
 LARGE = ConditionalVQConfig(context_frames=2, widths=(128, 256, 256, 512, 768), attention_size=32)
@@ -79,6 +80,37 @@ def test_the_codebook_takes_the_nearest_vector_and_passes_the_gradient_through()
     assert float(codebook) == pytest.approx(float(commitment)) == pytest.approx((0.01 + 0.09 + 0.25 + 0.16) / 4)
     gradient = jax.grad(lambda z: jnp.sum(book.apply(vectors, z)[0] * jnp.array([2.0, 3])))(z)
     np.testing.assert_array_equal(gradient, [[2, 3], [2, 3]])
+
+
+def test_losses_are_the_sums_over_both_kinds_of_frames_of_a_plain_loop() -> None:
+    config = replace(VQ, context_frames=2, codebook_weight=0.5)
+    params, clips = vq_params(config), frames(2, 5)
+    train = TokenizerTrainConfig(frames_per_clip=5, l1_weight=2.0, l2_weight=3.0, commitment_weight=0.25)
+    training = ConditionalVQTraining(config, train, SIZE)
+    batch = {"frames": clips, "index": np.arange(2)}
+    terms = training.loss_terms(params, batch, jax.random.key(0), StepContext(jnp.int32(0), None, None))
+
+    network, images = ConditionalVQ(config), clips / np.float32(255)
+    wanted = {"l1": 0.0, "l2": 0.0, "codebook": 0.0, "commitment": 0.0}
+    latents: Any = network.apply({"params": params}, images, method="_latents")
+    near = []
+    for z, book in zip(latents, ("quantize", "dynamics_quantize"), strict=True):
+        vectors = np.asarray(params[book]["embedding"], np.float64)
+        rows = np.asarray(z, np.float64).reshape(-1, config.latent)
+        chosen = np.stack([vectors[np.argmin([np.sum((row - v) ** 2) for v in vectors])] for row in rows])
+        for name in ("codebook", "commitment"):
+            wanted[name] += float(np.sum((chosen - rows) ** 2) / rows.size)
+        near.append(chosen.reshape(z.shape).astype(np.float32))
+    made: Any = network.apply({"params": params}, *near, method="_images")
+    for true, other in zip((images[:, :2], images[:, 2:]), made, strict=True):
+        differences = np.asarray(true, np.float64) - other
+        wanted["l1"] += float(np.abs(differences).sum() / differences.size)
+        wanted["l2"] += float((differences**2).sum() / differences.size)
+
+    assert training.loss_weights == {"l1": 2.0, "l2": 3.0, "codebook": 0.5, "commitment": 0.25}
+    assert {name: float(count) for name, (_, count) in terms.items()} == dict.fromkeys(wanted, 2.0)
+    got = {name: float(total) / 2 for name, (total, _) in terms.items()}
+    assert got == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize(
