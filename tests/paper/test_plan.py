@@ -22,7 +22,6 @@ from tests.paper import toy
 DATA = Path("data")
 TINY = presets.tiny()
 KNOWN = tuple(claims().values())
-RATES = (", 0.3 × the rate", ", 3 × the rate")
 
 
 @pytest.fixture(scope="module")
@@ -205,11 +204,12 @@ def test_all_families_can_be_compared_on_several_tasks() -> None:
 
 def test_every_family_of_table_1_has_three_trials_of_its_learning_rate(three_hours: Plan) -> None:
     for family in claims()["table1"].arms:
-        cells = {arm: three_hours.of("learning-rates", family.name + arm)[0] for arm in ("", *RATES)}
-        rates = {arm: cell.config.train.optimizer.learning_rate for arm, cell in cells.items()}
-        assert [rates[arm] / rates[""] for arm in RATES] == pytest.approx([0.3, 3])
-        assert cells[""] == three_hours.of("table1", family.name)[0], "its own rate is trained once for both claims"
-        assert {cell.config.train.steps for cell in cells.values()} == {cells[""].config.train.steps}
+        trials = [arm.name for arm in claims()["learning-rates"].arms if arm.name.split(",")[0] == family.name]
+        cells = [three_hours.of("learning-rates", name)[0] for name in trials]
+        rates = sorted(cell.config.train.optimizer.learning_rate for cell in cells)
+        assert [rate / rates[1] for rate in rates] == pytest.approx([0.3, 1, 3])
+        assert len({cell.config.train.steps for cell in cells}) == 1
+        assert three_hours.of("table1", family.name)[0] in cells, "the chosen rate is trained once for both claims"
 
 
 def test_a_trial_of_the_rate_multiplies_that_of_the_base_preset() -> None:

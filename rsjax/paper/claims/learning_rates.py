@@ -5,24 +5,32 @@ from dataclasses import replace
 from rsjax.paper.claim import Arm, Claim, pairs, register
 from rsjax.paper.claims.baselines import TABLE_1
 
-_FACTORS = {"0.3 × the rate": 0.3, "3 × the rate": 3.0}
+_FACTORS = {0.3: "0.3 × the preset's rate", 1.0: "the preset's rate", 3.0: "3 × the preset's rate"}
 
 
 def _trials(arm: Arm) -> tuple[Arm, ...]:
-    """Returns an arm of Table 1, and copies of it with other learning rates of the world model."""
-    arm = replace(arm, published={})
-    return (arm, *(replace(arm, name=f"{arm.name}, {what}", rate=factor) for what, factor in _FACTORS.items()))
+    """Returns an arm of Table 1, and copies of it with the other learning rates of the world model."""
+    others = {factor: what for factor, what in _FACTORS.items() if factor != arm.rate}
+    return (
+        replace(arm, published={}),
+        *(replace(arm, name=f"{arm.name}, {what}", rate=factor, published={}) for factor, what in others.items()),
+    )
 
+
+_TRIALS = {arm.name: _trials(arm) for arm in TABLE_1.arms}
 
 register(
     Claim(
         name="learning-rates",
         title="The learning rates of Table 1",
-        statement="No family of Table 1 is better with another of three learning rates.",
+        statement="Each family of Table 1 has the best of three learning rates.",
         place="the fairness of Table 1",
-        arms=tuple(trial for arm in TABLE_1.arms for trial in _trials(arm)),
+        arms=tuple(trial for trials in _TRIALS.values() for trial in trials),
         comparisons=tuple(
-            each for arm in TABLE_1.arms for what in _FACTORS for each in pairs(arm.name, f"{arm.name}, {what}", "psnr")
+            comparison
+            for chosen, *others in _TRIALS.values()
+            for other in others
+            for comparison in pairs(chosen.name, other.name, "psnr")
         ),
         rank=6,
         notes=("Three trials a family; autoencoders keep the rates of their presets.",),
