@@ -59,6 +59,7 @@ class KLConfig:
     patch_size: int = 1  # magvit2: space-to-depth before the first convolution
     local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
+    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # of convolutions, as in TokenizerConfig
 
     def __post_init__(self) -> None:
         require_range(self, "model.autoencoder", 1, math.inf, "latent_channels")
@@ -81,6 +82,7 @@ class KLConfig:
             norm_groups=self.norm_groups,
             local_codes=self.local_codes,
             code_bits=2 * self.latent_channels,
+            compute_dtype=self.compute_dtype,
         )
 
     @property

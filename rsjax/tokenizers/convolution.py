@@ -1,9 +1,10 @@
 """Convolutions with bf16 operands and float32 accumulation, as matrix products on CPUs.
 
 XLA's CPU backend convolves in float32 whatever its operands are. It does not use bf16 units, and for small images only
-one core. So, on processors that have such units, each row of a 3×3 kernel becomes one product over the whole image:
-three neighbouring cells of a row lie side by side in memory, and the image's rows are shifted by taking another part of
-the same array. Large images are cut into strips, so that these copies stay in the processor's cache.
+one core. So, on processors that have such units, a 3×3 convolution becomes products over the whole image: three
+neighbouring cells of a row lie side by side in memory and are multiplied by a row of the kernel, and the results of its
+three rows are added, each shifted by a row of the image. Large images are cut into strips, so that the copies stay in
+the processor's cache.
 
 Axes: B images, h×w cells, C channels in, D channels out, i×j cells of a kernel, N = B·h·w.
 """
@@ -14,18 +15,21 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, BFloat16, Float
 
 from rsjax.matmul import bf16_pays, matmul_bf16, transposed_in_memory
 
-LEAST = 64  # channels, in and out, from which the products save more time than their copies of the image cost
+Dtype = Literal["float32", "bfloat16"]
+
+LEAST = 32  # channels, in and out, from which the products save more time than their copies of the image cost
+WIDE = 128  # channels out from which a product for each row of the kernel is as fast as one product for all rows
 STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
 
 
 def conv(
     features: int,
     kernel: int,
-    dtype: Literal["float32", "bfloat16"],
+    dtype: Dtype,
     name: str | None = None,
     stride: int = 1,
     padding: Any = "SAME",
@@ -120,36 +124,57 @@ def _in_strips(
     numbers = width * size * x.shape[-1]  # of a row
     rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * numbers <= STRIP))
     many = max(n for n in range(1, images + 1) if images % n == 0 and (n == 1 or n * height * numbers <= STRIP))
-    padded = jnp.pad(x.astype(jnp.bfloat16), ((0, 0), (around, around), (around, around), (0, 0)))
+    # Whole images get their zeros strip by strip: a strip of an array that XLA has padded before is unfolded slowly.
+    within = (around, around) if rows == height else (0, 0)
+    halo = 2 * around if rows < height else 0
+    padded = jnp.pad(x, ((0, 0), (halo // 2, halo // 2), (0, 0), (0, 0)))
 
     def strip(total: Any, place: tuple[Array, Array]) -> tuple[Any, Array]:
         def cut(y: Array, rows: int) -> Array:
             return jax.lax.dynamic_slice(y, (*place, 0, 0), (many, rows, *y.shape[2:]))
 
-        return run(total, _unfold(cut(padded, rows + 2 * around), size), *(cut(y, rows) for y in beside))
+        zeros = ((0, 0), within, (around, around), (0, 0))
+        return run(total, _unfold(cut(padded, rows + halo), zeros, size), *(cut(y, rows) for y in beside))
 
     first, top = jnp.meshgrid(jnp.arange(0, images, many), jnp.arange(0, height, rows), indexing="ij")
     total, strips = jax.lax.scan(strip, total, (first.reshape(-1), top.reshape(-1)))
-    return total, strips.reshape(*x.shape[:3], -1)
+    return total, strips.reshape(images, height, width, -1)
 
 
-def _unfold(strip: Float[Array, "B h2 w2 C"], size: int) -> Float[Array, "B h2 w jC"]:
-    """Puts the cells of each kernel's row side by side."""
-    width = strip.shape[2] - size + 1
-    return jax.lax.optimization_barrier(jnp.concatenate([strip[:, :, j : j + width] for j in range(size)], axis=-1))
+def _unfold(
+    strip: Float[Array, "B h w C"], zeros: Sequence[tuple[int, int]], size: int
+) -> BFloat16[Array, "B h2 w jC"]:
+    """Pads a strip with zeros, and puts the cells of each kernel's row side by side."""
+    width, strip = strip.shape[2], strip.astype(jnp.bfloat16)
+    if paired := strip.shape[-1] % 2 == 0:
+        # Two numbers are copied as one of 32 bits. XLA would copy bf16 through float32, three times as slowly.
+        strip = jax.lax.bitcast_convert_type(strip.reshape(*strip.shape[:-1], -1, 2), jnp.uint32)
+    padded = jax.lax.optimization_barrier(jnp.pad(strip, zeros))
+    unfolded = jnp.concatenate([padded[:, :, j : j + width] for j in range(size)], axis=-1)
+    unfolded = jax.lax.optimization_barrier(unfolded)
+    if paired:
+        unfolded = jax.lax.bitcast_convert_type(unfolded, jnp.bfloat16).reshape(*unfolded.shape[:3], -1)
+    return unfolded
 
 
-def _rows(unfolded: Float[Array, "B h2 w jC"], size: int) -> list[Float[Array, "N jC"]]:
+def _rows(unfolded: BFloat16[Array, "B h2 w jC"], size: int) -> list[BFloat16[Array, "N jC"]]:
     """Returns the inputs of each row of the kernel at every cell."""
     height = unfolded.shape[1] - size + 1
     return [unfolded[:, i : i + height].reshape(-1, unfolded.shape[-1]) for i in range(size)]
 
 
-def _products(unfolded: Float[Array, "B h2 w jC"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
+def _products(unfolded: BFloat16[Array, "B h2 w jC"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
     size, outputs = len(kernel), kernel.shape[-1]
     kernels = kernel.astype(jnp.bfloat16).reshape(size, -1, outputs)
-    out = sum(_product(row, one) for row, one in zip(_rows(unfolded, size), kernels, strict=True))
-    return jnp.reshape(out, (len(unfolded), -1, unfolded.shape[2], outputs))
+    images, height, width, _ = unfolded.shape
+    height -= size - 1
+    if outputs >= WIDE:
+        parts = [_product(row, one) for row, one in zip(_rows(unfolded, size), kernels, strict=True)]
+    else:
+        joined = _product(unfolded.reshape(-1, unfolded.shape[-1]), jnp.concatenate(kernels, axis=-1))
+        whole = joined.reshape(images, -1, width, size, outputs)
+        parts = [whole[:, i : i + height, :, i] for i in range(size)]
+    return jnp.reshape(sum(parts[1:], start=parts[0]), (images, height, width, outputs))
 
 
 def _product(x: Float[Array, "N K"], w: Float[Array, "K M"]) -> Float[Array, "N M"]:

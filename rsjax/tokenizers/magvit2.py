@@ -6,7 +6,7 @@ downsampling pads symmetrically, and there is no attention. Submodules are named
 Axes: B images, H×W pixels, h×w token cells, C channels, D code bits.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -15,9 +15,7 @@ from jaxtyping import Array, Float, Int
 from rsjax.config import TokenizerConfig
 from rsjax.group_norm import GroupNorm
 from rsjax.tokenizers import lfq
-from rsjax.tokenizers.convolution import conv
-
-Dtype = Literal["float32", "bfloat16"]
+from rsjax.tokenizers.convolution import Dtype, conv
 
 
 def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:

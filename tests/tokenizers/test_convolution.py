@@ -23,21 +23,22 @@ def plain(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
-@settings(max_examples=8)
+@settings(max_examples=10)
 @given(
     size=st.sampled_from([1, 3, 5]),
     shape=st.tuples(st.integers(1, 2), st.integers(1, 5), st.integers(1, 5), st.integers(1, 4)),
     outputs=st.integers(1, 4),
     strip=st.sampled_from([1, 24, 2**21]),  # row by row; several rows or images at a time; all at once
+    wide=st.sampled_from([1, 128]),  # a product for each row of the kernel; one for all rows
 )
 def test_output_and_gradients_are_those_of_the_rounded_operands(
-    size: int, shape: tuple[int, int, int, int], outputs: int, strip: int
+    size: int, shape: tuple[int, int, int, int], outputs: int, strip: int, wide: int
 ) -> None:
     rng = np.random.default_rng(0)
     x, kernel, cotangent = (
         rounded(rng.normal(size=each)) for each in (shape, (size, size, shape[-1], outputs), (*shape[:-1], outputs))
     )
-    with mock.patch.object(convolution, "STRIP", strip):
+    with mock.patch.multiple(convolution, STRIP=strip, WIDE=wide):
         out, pull = jax.vjp(conv_bf16, x, kernel)
         gradients = pull(cotangent)
     expected, pull_plain = jax.vjp(plain, x, kernel)

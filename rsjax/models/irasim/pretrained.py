@@ -44,7 +44,7 @@ def saved_network(directory: Path) -> Architecture:
 def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
     """Returns :func:`saved_autoencoder`; also raises UserError if its network differs from ``own``."""
     saved = saved_autoencoder(directory)
-    if differing := differences(saved, own, ("kl_weight",)):
+    if differing := differences(saved, own, ("kl_weight", "compute_dtype")):
         raise UserError(
             f"{directory}: holds another autoencoder ({differing}); set these fields of model.autoencoder alike"
         )
