@@ -76,6 +76,7 @@ def irasim_tiny(base: Config) -> Config:
                 norm_groups=8,
                 patch_size=4,
                 local_codes=True,
+                compute_dtype="bfloat16",
             ),
             integrate_actions=True,
             width=128,
