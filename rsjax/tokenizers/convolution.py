@@ -125,16 +125,15 @@ def _in_strips(
     rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * numbers <= STRIP))
     many = max(n for n in range(1, images + 1) if images % n == 0 and (n == 1 or n * height * numbers <= STRIP))
     # Whole images get their zeros strip by strip: a strip of an array that XLA has padded before is unfolded slowly.
-    within = (around, around) if rows == height else (0, 0)
-    halo = 2 * around if rows < height else 0
-    padded = jnp.pad(x, ((0, 0), (halo // 2, halo // 2), (0, 0), (0, 0)))
+    within, before = (around, 0) if rows == height else (0, around)
+    padded = jnp.pad(x, ((0, 0), (before, before), (0, 0), (0, 0)))
 
     def strip(total: Any, place: tuple[Array, Array]) -> tuple[Any, Array]:
         def cut(y: Array, rows: int) -> Array:
             return jax.lax.dynamic_slice(y, (*place, 0, 0), (many, rows, *y.shape[2:]))
 
-        zeros = ((0, 0), within, (around, around), (0, 0))
-        return run(total, _unfold(cut(padded, rows + halo), zeros, size), *(cut(y, rows) for y in beside))
+        zeros = ((0, 0), (within, within), (around, around), (0, 0))
+        return run(total, _unfold(cut(padded, rows + 2 * before), zeros, size), *(cut(y, rows) for y in beside))
 
     first, top = jnp.meshgrid(jnp.arange(0, images, many), jnp.arange(0, height, rows), indexing="ij")
     total, strips = jax.lax.scan(strip, total, (first.reshape(-1), top.reshape(-1)))

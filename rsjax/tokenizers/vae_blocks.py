@@ -14,14 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.group_norm import GroupNorm
-from rsjax.tokenizers.convolution import Dtype, conv
 
 Map = Float[Array, "N h w C"]
 
 
-def conv3(features: int, name: str, dtype: Dtype = "float32") -> nn.Conv:
+def conv3(features: int, name: str) -> nn.Conv:
     """Returns a 3×3 convolution that keeps the size."""
-    return conv(features, 3, dtype, name, padding=((1, 1), (1, 1)))
+    return nn.Conv(features, (3, 3), padding=((1, 1), (1, 1)), name=name)
 
 
 class ResBlock(nn.Module):
@@ -29,15 +28,14 @@ class ResBlock(nn.Module):
 
     features: int
     groups: int
-    dtype: Dtype = "float32"
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
         h = x
         for i in (1, 2):
-            h = conv3(self.features, f"conv{i}", self.dtype)(nn.silu(GroupNorm(self.groups, name=f"norm{i}")(h)))
+            h = conv3(self.features, f"conv{i}")(nn.silu(GroupNorm(self.groups, name=f"norm{i}")(h)))
         if x.shape[-1] != self.features:
-            x = conv(self.features, 1, self.dtype, "conv_shortcut")(x)
+            x = nn.Conv(self.features, (1, 1), name="conv_shortcut")(x)
         return x + h
 
 
@@ -52,11 +50,9 @@ class Downsample(nn.Module):
 class Upsample(nn.Module):
     """Doubles the size: repeats cells, then a 3×3 convolution."""
 
-    dtype: Dtype = "float32"
-
     @nn.compact
     def __call__(self, x: Map) -> Map:
-        return conv3(x.shape[-1], "conv", self.dtype)(x.repeat(2, axis=1).repeat(2, axis=2))
+        return conv3(x.shape[-1], "conv")(x.repeat(2, axis=1).repeat(2, axis=2))
 
 
 class SelfAttention(nn.Module):
@@ -73,12 +69,12 @@ class SelfAttention(nn.Module):
         return x + nn.Dense(width, name="to_out")(jnp.einsum("nqk,nkc->nqc", weights, v)).reshape(x.shape)
 
 
-def middle(x: Map, groups: int, attention: bool, dtype: Dtype) -> Map:
+def middle(x: Map, groups: int, attention: bool) -> Map:
     """Computes two residual blocks, optionally with attention between them, in the module that calls it."""
-    x = ResBlock(x.shape[-1], groups, dtype, name="mid_block_0")(x)
+    x = ResBlock(x.shape[-1], groups, name="mid_block_0")(x)
     if attention:
         x = SelfAttention(groups, name="mid_attention")(x)
-    return ResBlock(x.shape[-1], groups, dtype, name="mid_block_1")(x)
+    return ResBlock(x.shape[-1], groups, name="mid_block_1")(x)
 
 
 def encode(
@@ -88,7 +84,6 @@ def encode(
     groups: int,
     out: int,
     attention: bool,
-    dtype: Dtype,
     after: Callable[[Map], Map] = lambda x: x,
 ) -> Map:
     """Computes the encoder in the compact module that calls it; every level but the last halves the grid.
@@ -97,18 +92,17 @@ def encode(
         widths: channels of each level.
         out: channels of the result.
         attention: whether the middle has attention.
-        dtype: of the convolutions' operands.
         after: applied to the features after each level.
     """
-    x = conv3(widths[0], "conv_in", dtype)(x)
+    x = conv3(widths[0], "conv_in")(x)
     for level, width in enumerate(widths):
         for i in range(res_blocks):
-            x = ResBlock(width, groups, dtype, name=f"down_{level}_block_{i}")(x)
+            x = ResBlock(width, groups, name=f"down_{level}_block_{i}")(x)
         if level < len(widths) - 1:
             x = Downsample(name=f"down_{level}_downsample")(x)
         x = after(x)
-    x = middle(x, groups, attention, dtype)
-    return conv3(out, "conv_out", dtype)(nn.silu(GroupNorm(groups, name="norm_out")(x)))
+    x = middle(x, groups, attention)
+    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
 
 
 def decode(
@@ -118,15 +112,14 @@ def decode(
     groups: int,
     out: int,
     attention: bool,
-    dtype: Dtype,
     after: Callable[[Map], Map] = lambda x: x,
 ) -> Map:
     """Inverts :func:`encode` with one more residual block at each level; ``after`` also follows the middle."""
-    x = after(middle(conv3(widths[-1], "conv_in", dtype)(x), groups, attention, dtype))
+    x = after(middle(conv3(widths[-1], "conv_in")(x), groups, attention))
     for level, width in enumerate(reversed(widths)):
         for i in range(res_blocks + 1):
-            x = ResBlock(width, groups, dtype, name=f"up_{level}_block_{i}")(x)
+            x = ResBlock(width, groups, name=f"up_{level}_block_{i}")(x)
         if level < len(widths) - 1:
-            x = Upsample(dtype, name=f"up_{level}_upsample")(x)
+            x = Upsample(name=f"up_{level}_upsample")(x)
         x = after(x)
-    return conv3(out, "conv_out", dtype)(nn.silu(GroupNorm(groups, name="norm_out")(x)))
+    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
