@@ -175,6 +175,8 @@ class _Training:
                 if stopping and step < last:
                     self.checkpoints.wait()
                     raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
+            # Here SIGTERM is only recorded; after this block it may keep the caller from closing the checkpoints.
+            self.checkpoints.wait()
             profile.at(last + 1, state)
             damaged = batches.quarantined()
             if damaged and is_lead():

@@ -1,6 +1,7 @@
 import itertools
 import os
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,10 @@ from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.errors import Preempted
 from rsjax.runtime import patient, stop_signals
 from rsjax.training.checkpoint import Checkpoints
+from rsjax.training.checksums import write_checksums
 from rsjax.training.log import read_curve, read_log
 from rsjax.training.loop import DivergedError, Monitor
+from rsjax.training.preemption import StopRequest
 from rsjax.training.skipped import read_skipped
 from rsjax.training.state import TrainState, create_state
 from rsjax.training.validation import Validation
@@ -156,6 +159,26 @@ def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
     checkpoints.close()
     assert_same(train(LOOP, tmp_path), whole[0])
     assert [row for row in read_curve(tmp_path) if "loss" in row] == whole[1]
+
+
+def test_the_last_step_is_written_before_sigterm_is_answered_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish, written = write_checksums, []
+
+    def finish_late(*arguments: Any) -> None:
+        time.sleep(0.3)
+        finish(*arguments)
+
+    class Watched(StopRequest):
+        def __exit__(self, *error: Any) -> None:
+            written.append((tmp_path / "checkpoints" / str(LOOP.steps)).exists())
+            super().__exit__(*error)
+
+    monkeypatch.setattr("rsjax.training.checkpoint.write_checksums", finish_late)
+    monkeypatch.setattr("rsjax.training.loop.StopRequest", Watched)
+    train(LOOP, tmp_path)
+    assert written == [True]
 
 
 def test_sigterm_before_the_first_step_has_nothing_to_save(tmp_path: Path) -> None:
