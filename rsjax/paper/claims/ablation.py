@@ -1,16 +1,10 @@
 """Table 2: what the two physics-informed objectives contribute."""
 
+from rsjax.compare.published import published_by_metric
 from rsjax.paper.claim import Arm, Claim, pairs, register
 
-# The paper does not say which LPIPS it uses. Its depth errors must be an estimator's, since the model without depth has
-# them too.
+# Depth errors must be an estimator's, since the model without depth has them too.
 _DEPTH = tuple(f"depth_{name}_median_estimator" for name in ("absrel", "delta1", "delta2"))
-_COLUMNS = ("lpips_alex", "psnr", *_DEPTH, "delta_psnr")
-
-
-def _published(*numbers: float) -> dict[str, float]:
-    return dict(zip(_COLUMNS, numbers, strict=True))
-
 
 register(
     Claim(
@@ -23,21 +17,14 @@ register(
         ),
         place="Table 2",
         arms=(
-            Arm("full", published=_published(0.1259, 21.8533, 0.3600, 0.6214, 0.8307, 3.3435)),
-            Arm(
-                "w/o depth",
-                {"model.use_depth": False},
-                published=_published(0.1249, 21.9465, 0.3921, 0.5788, 0.8277, 3.4863),
-            ),
-            Arm(
-                "w/o keypoints",
-                {"model.loss.use_keypoints": False},
-                published=_published(0.1264, 21.7087, 0.3417, 0.6497, 0.8673, 2.9462),
-            ),
-            Arm(
-                "w/o both",
-                {"model.use_depth": False, "model.loss.use_keypoints": False},
-                published=_published(0.1299, 21.4873, 0.3565, 0.6248, 0.8129, 1.9871),
+            Arm("full", published=published_by_metric("RoboScape")),
+            *(
+                Arm(name, without, published=published_by_metric(f"RoboScape {name}"))
+                for name, without in {
+                    "w/o depth": {"model.use_depth": False},
+                    "w/o keypoints": {"model.loss.use_keypoints": False},
+                    "w/o both": {"model.use_depth": False, "model.loss.use_keypoints": False},
+                }.items()
             ),
         ),
         comparisons=(
