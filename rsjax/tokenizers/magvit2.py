@@ -10,7 +10,7 @@ from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from rsjax.config import TokenizerConfig
 from rsjax.group_norm import GroupNorm
@@ -167,3 +167,8 @@ def to_unit(pixels: Any) -> Float[Array, "*batch"]:
 def to_pixels(images: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Maps [-1, 1] to pixels 0–255, clipped."""
     return jnp.clip((images + 1.0) * 127.5, 0.0, 255.0)
+
+
+def to_frames(images: Float[Array, "*batch"]) -> UInt8[Array, "*batch"]:
+    """Maps [-1, 1] to frames 0–255, rounded and clipped."""
+    return jnp.round(to_pixels(images)).astype(jnp.uint8)

@@ -31,7 +31,7 @@ from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
-from rsjax.tokenizers.magvit2 import to_pixels, to_unit
+from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
@@ -169,7 +169,7 @@ class CausalCodec:
         latents = np.asarray(tokens["mean"])
         most = images_per_pass(latents.shape[-2] * self.config.downsampling) // (COMPRESSION * latents.shape[1])
         frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, most))
-        return Video(np.round(frames[:, : tokens["frames"][0] if "frames" in tokens else None]).astype(np.uint8))
+        return Video(frames[:, : tokens["frames"][0] if "frames" in tokens else None])
 
     def images(
         self, rgb: UInt8[np.ndarray, "B H W 3"], rng: np.random.Generator | None = None
@@ -202,5 +202,5 @@ def _encode(config: CausalVAEConfig, params: Params, frames: Any) -> Float[Array
 
 
 @partial(jax.jit, static_argnums=0)
-def _decode(config: CausalVAEConfig, params: Params, latents: Any) -> Float[Array, "B T H W 3"]:
-    return to_pixels(vae.decode(config, params, distributions.original(latents, params["latents"])))
+def _decode(config: CausalVAEConfig, params: Params, latents: Any) -> UInt8[Array, "B T H W 3"]:
+    return to_frames(vae.decode(config, params, distributions.original(latents, params["latents"])))

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
 from rsjax.config import Config, KLConfig, TokenizerTrainConfig
@@ -30,7 +30,7 @@ from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
-from rsjax.tokenizers.magvit2 import to_pixels, to_unit
+from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights, require_no_adversarial
 from rsjax.trainable import Extra, Params, StepContext, Term
 
@@ -153,8 +153,7 @@ class KLCodec:
         """Decodes the latents "mean" to frames."""
         latents = np.asarray(tokens["mean"])
         side = latents.shape[-2] * self.config.downsampling
-        frames = in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side))
-        return Video(np.round(frames).astype(np.uint8))
+        return Video(in_chunks(partial(self._run, _decode), latents, 3, images_per_pass(side)))
 
     def _run(self, function: Any, chunk: np.ndarray) -> Any:
         return function(self.config, self.params, divide(chunk, self.params))
@@ -167,5 +166,5 @@ def _encode(config: KLConfig, params: Params, images: Any) -> Float[Array, "B h 
 
 
 @partial(jax.jit, static_argnums=0)
-def _decode(config: KLConfig, params: Params, latents: Any) -> Float[Array, "B H W 3"]:
-    return to_pixels(decode(config, params, distributions.original(latents, params["latents"])))
+def _decode(config: KLConfig, params: Params, latents: Any) -> UInt8[Array, "B H W 3"]:
+    return to_frames(decode(config, params, distributions.original(latents, params["latents"])))

@@ -169,7 +169,7 @@ class ConditionalCodec:
         alone = future.shape[1] == 0  # if there are no later frames, a placeholder is decoded
         future = np.zeros((len(future), 1, future.shape[2]), np.int32) if alone else future
         (frames,) = self._chunked("decode", context.shape[2] * self.config.downsampling, context, future)
-        return Video(np.round(frames[:, : frames.shape[1] - alone]).astype(np.uint8))
+        return Video(frames[:, : frames.shape[1] - alone])
 
     def _chunked(self, method: Literal["encode", "decode"], side: int, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Applies the network to a power of two of clips at a time; their images have ``side`` pixels a side."""
@@ -189,4 +189,5 @@ class ConditionalCodec:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _apply(config: ConditionalVQConfig, method: str, params: Params, *arrays: Array) -> Any:
-    return ConditionalVQ(config).apply({"params": params}, *arrays, method=method)
+    made: Any = ConditionalVQ(config).apply({"params": params}, *arrays, method=method)
+    return jnp.round(made).astype(jnp.uint8) if method == "decode" else made
