@@ -62,7 +62,9 @@ def cogvideox_tiny(base: Config) -> Config:
             eval_every=400,
         ),
         model=CogVideoXConfig(
-            autoencoder=CausalVAEConfig(patch_size=2, widths=(32, 64, 64), res_blocks=1, norm_groups=8),
+            autoencoder=CausalVAEConfig(
+                patch_size=2, widths=(32, 64, 64), res_blocks=1, norm_groups=8, compute_dtype="bfloat16"
+            ),
             # There is one task, so one text: guidance by the text has no effect.
             text=TextConfig(tokens=8, width=64, dropout=0.0),
             width=192,

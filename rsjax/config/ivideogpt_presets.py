@@ -73,6 +73,7 @@ def ivideogpt_tiny(tiny: Config) -> Config:
                 codes=512,
                 dropout=0.0,
                 codebook_scale=1.0,
+                compute_dtype="bfloat16",
             ),
             width=192,
             blocks=6,

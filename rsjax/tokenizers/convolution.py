@@ -24,6 +24,7 @@ Dtype = Literal["float32", "bfloat16"]
 LEAST = 32  # channels, in and out, from which the products save more time than their copies of the image cost
 WIDE = 128  # channels out from which a product for each row of the kernel is as fast as one product for all rows
 STRIP = 2**20  # numbers in an unfolded strip: 2 MiB
+WRITTEN_OUT = 8  # strips that are computed without a loop; more take longer to compile
 
 
 def conv(
@@ -136,7 +137,9 @@ def _in_strips(
         return run(total, _unfold(cut(padded, rows + 2 * before), zeros, size), *(cut(y, rows) for y in beside))
 
     first, top = jnp.meshgrid(jnp.arange(0, images, many), jnp.arange(0, height, rows), indexing="ij")
-    total, strips = jax.lax.scan(strip, total, (first.reshape(-1), top.reshape(-1)))
+    # XLA runs most of a loop's body on one core.
+    unroll = first.size if first.size <= WRITTEN_OUT else 1
+    total, strips = jax.lax.scan(strip, total, (first.reshape(-1), top.reshape(-1)), unroll=unroll)
     return total, strips.reshape(images, height, width, -1)
 
 

@@ -14,13 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.group_norm import GroupNorm
+from rsjax.tokenizers.convolution import Dtype, conv
 
 Map = Float[Array, "N h w C"]
-
-
-def conv3(features: int, name: str) -> nn.Conv:
-    """Returns a 3×3 convolution that keeps the size."""
-    return nn.Conv(features, (3, 3), padding=((1, 1), (1, 1)), name=name)
 
 
 class ResBlock(nn.Module):
@@ -28,12 +24,13 @@ class ResBlock(nn.Module):
 
     features: int
     groups: int
+    dtype: Dtype
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
         h = x
         for i in (1, 2):
-            h = conv3(self.features, f"conv{i}")(nn.silu(GroupNorm(self.groups, name=f"norm{i}")(h)))
+            h = conv(self.features, 3, self.dtype, f"conv{i}")(nn.silu(GroupNorm(self.groups, name=f"norm{i}")(h)))
         if x.shape[-1] != self.features:
             x = nn.Conv(self.features, (1, 1), name="conv_shortcut")(x)
         return x + h
@@ -50,9 +47,11 @@ class Downsample(nn.Module):
 class Upsample(nn.Module):
     """Doubles the size: repeats cells, then a 3×3 convolution."""
 
+    dtype: Dtype
+
     @nn.compact
     def __call__(self, x: Map) -> Map:
-        return conv3(x.shape[-1], "conv")(x.repeat(2, axis=1).repeat(2, axis=2))
+        return conv(x.shape[-1], 3, self.dtype, "conv")(x.repeat(2, axis=1).repeat(2, axis=2))
 
 
 class SelfAttention(nn.Module):
@@ -69,12 +68,12 @@ class SelfAttention(nn.Module):
         return x + nn.Dense(width, name="to_out")(jnp.einsum("nqk,nkc->nqc", weights, v)).reshape(x.shape)
 
 
-def middle(x: Map, groups: int, attention: bool) -> Map:
+def middle(x: Map, groups: int, attention: bool, dtype: Dtype) -> Map:
     """Computes two residual blocks, optionally with attention between them, in the module that calls it."""
-    x = ResBlock(x.shape[-1], groups, name="mid_block_0")(x)
+    x = ResBlock(x.shape[-1], groups, dtype, name="mid_block_0")(x)
     if attention:
         x = SelfAttention(groups, name="mid_attention")(x)
-    return ResBlock(x.shape[-1], groups, name="mid_block_1")(x)
+    return ResBlock(x.shape[-1], groups, dtype, name="mid_block_1")(x)
 
 
 def encode(
@@ -85,6 +84,7 @@ def encode(
     out: int,
     attention: bool,
     after: Callable[[Map], Map] = lambda x: x,
+    dtype: Dtype = "float32",
 ) -> Map:
     """Computes the encoder in the compact module that calls it; every level but the last halves the grid.
 
@@ -93,16 +93,17 @@ def encode(
         out: channels of the result.
         attention: whether the middle has attention.
         after: applied to the features after each level.
+        dtype: of the operands of 3×3 convolutions (:mod:`rsjax.tokenizers.convolution`).
     """
-    x = conv3(widths[0], "conv_in")(x)
+    x = conv(widths[0], 3, dtype, "conv_in")(x)
     for level, width in enumerate(widths):
         for i in range(res_blocks):
-            x = ResBlock(width, groups, name=f"down_{level}_block_{i}")(x)
+            x = ResBlock(width, groups, dtype, name=f"down_{level}_block_{i}")(x)
         if level < len(widths) - 1:
             x = Downsample(name=f"down_{level}_downsample")(x)
         x = after(x)
-    x = middle(x, groups, attention)
-    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
+    x = middle(x, groups, attention, dtype)
+    return conv(out, 3, dtype, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
 
 
 def decode(
@@ -113,13 +114,14 @@ def decode(
     out: int,
     attention: bool,
     after: Callable[[Map], Map] = lambda x: x,
+    dtype: Dtype = "float32",
 ) -> Map:
     """Inverts :func:`encode` with one more residual block at each level; ``after`` also follows the middle."""
-    x = after(middle(conv3(widths[-1], "conv_in")(x), groups, attention))
+    x = after(middle(conv(widths[-1], 3, dtype, "conv_in")(x), groups, attention, dtype))
     for level, width in enumerate(reversed(widths)):
         for i in range(res_blocks + 1):
-            x = ResBlock(width, groups, name=f"up_{level}_block_{i}")(x)
+            x = ResBlock(width, groups, dtype, name=f"up_{level}_block_{i}")(x)
         if level < len(widths) - 1:
-            x = Upsample(name=f"up_{level}_upsample")(x)
+            x = Upsample(dtype, name=f"up_{level}_upsample")(x)
         x = after(x)
-    return conv3(out, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))
+    return conv(out, 3, dtype, "conv_out")(nn.silu(GroupNorm(groups, name="norm_out")(x)))

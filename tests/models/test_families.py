@@ -23,6 +23,7 @@ from rsjax.pipeline.replay import replay
 from rsjax.pipeline.run import Run
 from rsjax.pipeline.setup import tokenizer_setup, world_model_setup
 from rsjax.pipeline.videos import Request, write_videos
+from rsjax.tokenizers import convolution
 from rsjax.trainable import StepContext, combine
 from rsjax.training import loop as loop_module
 from rsjax.training.checkpoint import load_weights
@@ -147,6 +148,25 @@ def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
         for name, (value, weight) in whole.items():
             np.testing.assert_allclose(summed[name], (value, weight), rtol=2e-4, atol=1e-5, err_msg=name)
         assert np.isfinite(combine(whole, model.loss_weights)[0])
+
+
+@pytest.mark.usefixtures("bf16_units")
+@own_autoencoder
+def test_bf16_rounds_an_autoencoders_convolutions_and_keeps_its_parameters_and_operations(
+    family: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(convolution, "LEAST", 4)
+    exact = families.FAMILIES[family]()
+    half = with_values(exact, {"model.autoencoder.compute_dtype": "bfloat16"})
+    (one, shapes, batch), (other, same, _) = (next(families.batches_of(config)) for config in (exact, half))
+    assert shapes == same and one.flops() == other.flops()
+    params = create_state(one, LoopConfig()).params
+    first, second = (
+        jax.jit(each.loss_terms)(params, batch, jax.random.key(0), StepContext(jnp.int32(3), None, None))
+        for each in (one, other)
+    )
+    for name in ("l1", "l2"):
+        assert 0 < abs(first[name][0] - second[name][0]) < 0.01 * first[name][0]
 
 
 @own_autoencoder

@@ -7,7 +7,7 @@ frames of videos of other lengths. Latents are standardised channel by channel, 
 Axes: B videos, T frames, H×W pixels, t latent frames of h×w cells, z latent channels, D draws.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -112,11 +112,12 @@ class CausalVAETraining(Autoencoder[Batch]):
     def flops(self) -> dict[str, int]:
         count = self.train.frames_per_clip
         frames = (1, padded_frames(count), self.image_size, self.image_size, 3)
+        config = replace(self.config, compute_dtype="float32")  # products of bf16 operands multiply padding too
 
         def encode(params: Params, frames: Any) -> Array:
-            return distributions.posterior(vae.encode(self.config, params, frames))[0]
+            return distributions.posterior(vae.encode(config, params, frames))[0]
 
-        whole = traced_flops(self.shapes(), frames, encode, partial(vae.decode, self.config))
+        whole = traced_flops(self.shapes(), frames, encode, partial(vae.decode, config))
         return {half: number // count for half, number in whole.items()}
 
     def pretrained_shapes(self, directory: Path) -> Params:

@@ -7,7 +7,7 @@ Axes: B images, H×W pixels, h×w cells, z latent channels, T frames.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -124,12 +124,12 @@ class KLTraining(Autoencoder[Batch]):
         return KLCodec(self.config, params)
 
     def flops(self) -> dict[str, int]:
-        def encode(params: Params, images: Images) -> Latents:
-            return posterior(self.config, params, images)[0]
+        config = replace(self.config, compute_dtype="float32")  # products of bf16 operands multiply padding too
 
-        return traced_flops(
-            self.shapes(), (1, self.image_size, self.image_size, 3), encode, partial(decode, self.config)
-        )
+        def encode(params: Params, images: Images) -> Latents:
+            return posterior(config, params, images)[0]
+
+        return traced_flops(self.shapes(), (1, self.image_size, self.image_size, 3), encode, partial(decode, config))
 
     def pretrained_shapes(self, directory: Path) -> Params:
         saved = pretrained.check_autoencoder(directory, self.config)

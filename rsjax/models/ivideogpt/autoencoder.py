@@ -7,7 +7,7 @@ Axes: B clips, T frames of which the first c are context, F = T - c, g×g cells,
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -103,7 +103,9 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         return ConditionalCodec(self.config, params)
 
     def flops(self) -> dict[str, int]:
-        count, network = self.train.frames_per_clip, ConditionalVQ(self.config)
+        count = self.train.frames_per_clip
+        # Products of bf16 operands multiply padding too.
+        network = ConditionalVQ(replace(self.config, compute_dtype="float32"))
 
         def encode(params: Params, frames: Any) -> Any:
             return network.apply({"params": params}, frames, method="encode")
