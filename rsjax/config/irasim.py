@@ -59,16 +59,15 @@ class KLConfig:
     patch_size: int = 1  # magvit2: space-to-depth before the first convolution
     local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
-    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # magvit2: as in TokenizerConfig
+    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # of convolutions, as in TokenizerConfig
 
     def __post_init__(self) -> None:
         require_range(self, "model.autoencoder", 1, math.inf, "latent_channels")
         require_range(self, "model.autoencoder", 0, math.inf, "kl_weight")
         require(
-            self.network == "magvit2"
-            or (self.patch_size, self.local_codes, self.compute_dtype) == (1, False, "float32"),
-            "model.autoencoder.patch_size, local_codes and compute_dtype belong to the network magvit2; "
-            "leave them at 1, False and float32, or set model.autoencoder.network",
+            self.network == "magvit2" or (self.patch_size == 1 and not self.local_codes),
+            "model.autoencoder.patch_size and local_codes belong to the network magvit2; "
+            "leave them at 1 and False, or set model.autoencoder.network",
         )
         self.convolutions  # noqa: B018 - checks the other fields
 

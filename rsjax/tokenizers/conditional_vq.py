@@ -100,7 +100,7 @@ class Encoder(nn.Module):
         x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
         after = _crossing(cfg, context, index, features)
         sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, cfg.latent)
-        return encode(x, *sizes, attention=context is not None, after=after, dtype=cfg.compute_dtype), features
+        return encode(x, *sizes, context is not None, cfg.compute_dtype, after), features
 
 
 class Decoder(nn.Module):
@@ -116,7 +116,7 @@ class Decoder(nn.Module):
         cfg, features = self.config, list[Map]()
         after = _crossing(cfg, context, index, features)
         sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, 3 * cfg.patch_size**2)
-        x = decode(latents, *sizes, attention=context is not None, after=after, dtype=cfg.compute_dtype)
+        x = decode(latents, *sizes, context is not None, cfg.compute_dtype, after)
         return (depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x), features
 
 

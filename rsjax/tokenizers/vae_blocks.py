@@ -83,8 +83,8 @@ def encode(
     groups: int,
     out: int,
     attention: bool,
+    dtype: Dtype,
     after: Callable[[Map], Map] = lambda x: x,
-    dtype: Dtype = "float32",
 ) -> Map:
     """Computes the encoder in the compact module that calls it; every level but the last halves the grid.
 
@@ -92,8 +92,8 @@ def encode(
         widths: channels of each level.
         out: channels of the result.
         attention: whether the middle has attention.
-        after: applied to the features after each level.
         dtype: of the operands of 3×3 convolutions (:mod:`rsjax.tokenizers.convolution`).
+        after: applied to the features after each level.
     """
     x = conv(widths[0], 3, dtype, "conv_in")(x)
     for level, width in enumerate(widths):
@@ -113,8 +113,8 @@ def decode(
     groups: int,
     out: int,
     attention: bool,
+    dtype: Dtype,
     after: Callable[[Map], Map] = lambda x: x,
-    dtype: Dtype = "float32",
 ) -> Map:
     """Inverts :func:`encode` with one more residual block at each level; ``after`` also follows the middle."""
     x = after(middle(conv(widths[-1], 3, dtype, "conv_in")(x), groups, attention, dtype))

@@ -131,6 +131,12 @@ def test_clips_replay_alone_as_in_their_batch(run: Run) -> None:
         assert clips[0].scalars["loss"] != clips[1].scalars["loss"]
 
 
+def test_trained_weights_suit_an_autoencoder_that_convolves_in_bf16(run: Run) -> None:
+    half = with_values(run.config, {"model.autoencoder.compute_dtype": "bfloat16"})
+    shapes = create_autoencoder(half).pretrained_shapes(run.directory)
+    assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, create_autoencoder(run.config).shapes())
+
+
 @every_family
 def test_a_step_does_not_depend_on_how_its_batch_is_split(family: str) -> None:
     """What accumulation and every sharding need: the terms of parts add up to those of the whole."""

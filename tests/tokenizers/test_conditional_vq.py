@@ -14,6 +14,7 @@ from rsjax.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, toke
 from rsjax.convert.table import public_shapes, to_tensors
 from rsjax.describe import count
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
+from rsjax.tokenizers import convolution
 from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
 from rsjax.trainable import StepContext
 from tests.models.ivideogpt.toy import SIZE, VQ, frames, vq_params
@@ -68,6 +69,22 @@ def test_clips_are_encoded_alike_in_any_number_and_a_prompt_may_be_short() -> No
     assert single["future"].shape == (1, 0, 4), "one frame is repeated to two of context, and none is left"
     np.testing.assert_array_equal(single["context"], codec.encode(Video(clips[:1, [0, 0]]))["context"])
     assert codec.decode(single).rgb.shape == (1, 2, SIZE, SIZE, 3)
+
+
+@pytest.mark.usefixtures("bf16_units")
+def test_bf16_rounds_its_convolutions_and_keeps_its_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(convolution, "LEAST", 8)
+    params, images, rng = vq_params(), frames(1, 3) / np.float32(255), np.random.default_rng(0)
+    codes = [rng.normal(size=(1, *shape, VQ.latent)).astype(np.float32) for shape in ((1, 8, 8), (2, 4))]
+
+    def run(config: ConditionalVQConfig) -> Any:
+        network = ConditionalVQ(config)
+        methods = {"_latents": (images,), "_images": codes}
+        return jax.jit(lambda p: [network.apply({"params": p}, *x, method=name) for name, x in methods.items()])(params)
+
+    exact, rough = (jax.tree.leaves(run(replace(VQ, compute_dtype=dtype))) for dtype in ("float32", "bfloat16"))
+    for one, other in zip(exact, rough, strict=True):
+        assert 0 < np.abs(other - one).max() < 0.05 * np.abs(one).max()
 
 
 def test_the_codebook_takes_the_nearest_vector_and_passes_the_gradient_through() -> None:

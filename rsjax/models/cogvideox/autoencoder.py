@@ -37,7 +37,7 @@ from rsjax.trainable import Extra, Params, StepContext, Term
 
 Batch = dict[str, Any]  # frames 0–255 (B, T, H, W, 3) and index (B,), which determines a clip's noise
 
-FREE = {"kl_weight", "image_draws", "image_noise"}
+FREE = {"kl_weight", "image_draws", "image_noise", "compute_dtype"}
 
 
 def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:

@@ -20,7 +20,7 @@ class Encoder(nn.Module):
     @nn.compact
     def __call__(self, images: Float[Array, "B H W 3"]) -> Map:
         cfg, out = self.config, 2 * self.config.latent_channels
-        x = encode(images, cfg.widths, cfg.res_blocks, cfg.norm_groups, out, attention=True)
+        x = encode(images, cfg.widths, cfg.res_blocks, cfg.norm_groups, out, True, cfg.compute_dtype)
         return nn.Conv(out, (1, 1), name="quant_conv")(x)
 
 
@@ -33,4 +33,4 @@ class Decoder(nn.Module):
     def __call__(self, latents: Float[Array, "B h w z"]) -> Float[Array, "B H W 3"]:
         cfg = self.config
         x = nn.Conv(cfg.latent_channels, (1, 1), name="post_quant_conv")(latents)
-        return decode(x, cfg.widths, cfg.res_blocks, cfg.norm_groups, 3, attention=True)
+        return decode(x, cfg.widths, cfg.res_blocks, cfg.norm_groups, 3, True, cfg.compute_dtype)

@@ -123,7 +123,7 @@ class ConditionalVQTraining(Autoencoder[Batch]):
             UserError: the weights are missing or of another network; the message names the differing fields.
         """
         saved = read_model(directory, IVideoGPTConfig, "tokenizer").autoencoder
-        free = {"dropout", "codebook_scale", "codebook_weight"}
+        free = {"dropout", "codebook_scale", "codebook_weight", "compute_dtype"}
         free |= {"context_frames"} if saved.context_frames >= self.config.context_frames else set()
         check_alike(directory, saved, self.config, free, "model.autoencoder")
         if (size := saved_inputs(directory).image_size) != self.image_size:
