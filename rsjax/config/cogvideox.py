@@ -101,6 +101,7 @@ class CogVideoXConfig(ModelConfig):
     """CogVideoX: full attention over text and a clip's latents, v-prediction; the defaults are 5B-I2V. No actions."""
 
     uses_tokenizer: ClassVar[bool] = True
+    step_seconds: ClassVar[tuple[float, float] | None] = (0.85, 0.74)
     autoencoder: CausalVAEConfig = CausalVAEConfig()
     text: TextConfig = TextConfig()
     width: int = 3072
@@ -122,6 +123,7 @@ class CogVideoXConfig(ModelConfig):
     # Frames, rows and columns of learned positions, (13, 30, 45) in the public 5B-I2V, where they are near zero.
     learned_positions: tuple[int, ...] = ()
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
+    unroll: int = runtime(1)  # blocks per iteration of the scan; more are faster on a CPU and compile longer
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
     error_weight: float = 1.0
     noise: NoiseConfig = NoiseConfig(
@@ -130,7 +132,8 @@ class CogVideoXConfig(ModelConfig):
     sample: GuidedDenoiseConfig = sampling(GuidedDenoiseConfig())
 
     def __post_init__(self) -> None:
-        require_range(self, "model", 1, math.inf, "width", "blocks", "heads", "mlp_ratio", "patch_size", "time_width")
+        sizes = ("width", "blocks", "heads", "mlp_ratio", "patch_size", "time_width", "unroll")
+        require_range(self, "model", 1, math.inf, *sizes)
         require(self.position_scale > 0, f"model.position_scale is {self.position_scale}; it must be above 0")
         require(
             0 <= self.image_dropout < 1,

@@ -73,6 +73,7 @@ def cogvideox_tiny(base: Config) -> Config:
             patch_size=1,
             time_width=128,
             compute_dtype="bfloat16",
+            unroll=8,
             sample=GuidedDenoiseConfig(steps=20, guidance=1.0),
         ),
         train=replace(

@@ -27,10 +27,11 @@ class DiTConfig:
     mlp_ratio: int = 4
     patch_size: int = 2  # cells of latents that one token covers, along each side
     compute_dtype: Literal["float32", "bfloat16"] = "float32"  # bfloat16: operands of linear layers and attention
+    unroll: int = runtime(1)  # pairs of blocks per iteration of the scan; more are faster on a CPU and compile longer
     remat: Literal["none", "blocks"] = runtime("none")  # blocks: the backward pass keeps only the blocks' inputs
 
     def __post_init__(self) -> None:
-        for name in ("width", "blocks", "heads", "mlp_ratio", "patch_size"):
+        for name in ("width", "blocks", "heads", "mlp_ratio", "patch_size", "unroll"):
             require(getattr(self, name) >= 1, f"model.{name} is {getattr(self, name)}; it must be at least 1")
         require(
             self.width % self.heads == 0 and self.width % 4 == 0,
@@ -102,6 +103,8 @@ class IRASimConfig(DiTConfig, ModelConfig):
     """IRASim (reference: its authors' public code): predicts the noise in a clip's latents; first frames are clean."""
 
     uses_tokenizer: ClassVar[bool] = True
+    step_seconds: ClassVar[tuple[float, float] | None] = (0.13, 0.55)
+    episode_seconds: ClassVar[float] = 29.0  # it generates a whole video for each frame
     autoencoder: KLConfig = KLConfig()
     action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
     error_weight: float = 1.0

@@ -84,6 +84,7 @@ def irasim_tiny(base: Config) -> Config:
             heads=4,
             patch_size=1,
             compute_dtype="bfloat16",
+            unroll=4,
             sample=DenoiseConfig("ddim", steps=20),
         ),
         train=replace(

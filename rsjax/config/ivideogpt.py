@@ -87,6 +87,8 @@ class IVideoGPTConfig(ModelConfig):
     """A LLaMA on the tokens of :class:`ConditionalVQConfig`; the defaults are the public network."""
 
     uses_tokenizer: ClassVar[bool] = True
+    step_seconds: ClassVar[tuple[float, float] | None] = (0.88, 1.02)
+    episode_seconds: ClassVar[float] = 3.4  # it generates a whole video for each frame
     autoencoder: ConditionalVQConfig = ConditionalVQConfig()
     width: int = 768
     blocks: int = 12

@@ -22,10 +22,15 @@ class ModelConfig:
         family: its registered name.
         uses_tokenizer: whether a tokenizer is trained before the model: that of ``Config.tokenizer``, or the family's
             own (:attr:`own_autoencoder`).
+        step_seconds: seconds per step of autoencoder and of model in the family's small preset, on the machine of
+            :mod:`rsjax.paper.budget`; None: estimated from their operations.
+        episode_seconds: the same for what an imagined episode of Lift takes longer than a simulated one.
     """
 
     family: ClassVar[str] = ""
     uses_tokenizer: ClassVar[bool] = False
+    step_seconds: ClassVar[tuple[float, float] | None] = None
+    episode_seconds: ClassVar[float] = 0.0
 
     def check(self, clips: ClipShape) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the model does not fit clips of this shape."""

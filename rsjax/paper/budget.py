@@ -22,10 +22,6 @@ TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
 STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations per second for the rest
 # Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
 TOKENIZER_RATE = 4.6e10
-# Seconds per step of autoencoder and of model in each family's small preset, on the same machine while it was idle.
-# 1.02 and 0.74 are estimates: 1.33 and 0.87 were measured with a slower attention, and are scaled by the speed-ups
-# that a busy machine measured (docs/performance.md).
-FAMILY_STEPS = {"ivideogpt": (0.88, 1.02), "irasim": (0.13, 0.55), "cogvideox": (0.85, 0.74)}
 START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
 EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds per evaluation, step of the localiser, and rollout
 
@@ -140,16 +136,16 @@ def parameters(config: Config) -> tuple[int, int]:
 
 def step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the world model; 0 for a family that does not count its operations."""
-    if config.model.family in FAMILY_STEPS:
-        return FAMILY_STEPS[config.model.family][1]
+    if config.model.step_seconds:
+        return config.model.step_seconds[1]
     flops = train_flops(config)
     return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
 
 
 def tokenizer_step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the tokenizer."""
-    if config.model.family in FAMILY_STEPS:
-        return FAMILY_STEPS[config.model.family][0]
+    if config.model.step_seconds:
+        return config.model.step_seconds[0]
     loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
     return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
 

@@ -15,7 +15,7 @@ from rsjax.trainable import Params
 
 # Settings that the parameters do not depend on, or that are compared below.
 FREE = {"autoencoder", "text", "image", "image_dropout", "stretch", "learned_positions", "compute_dtype", "remat"}
-FREE |= {"error_weight", "noise", "sample"}
+FREE |= {"unroll", "error_weight", "noise", "sample"}
 
 
 def saved_architecture(saved: CogVideoXConfig) -> Architecture:

@@ -171,9 +171,14 @@ class Transformer(nn.Module):
         if cfg.learned_positions:
             x = x + self.param("learned_positions", ZEROS, x.shape[1:])
         time = TimeEmbedding(cfg.time_width, cfg.width, name="time")(t)
-        block = nn.remat(Block) if cfg.remat == "blocks" else Block
+        block = nn.remat(Block, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Block
         scan = nn.scan(
-            block, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=nn.broadcast, length=cfg.blocks
+            block,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+            in_axes=nn.broadcast,
+            length=cfg.blocks,
+            unroll=min(cfg.unroll, cfg.blocks),
         )
         x, _ = scan(arch, name="blocks")(x, time)
         x = _norm("norm_final")(x[:, cfg.text.tokens :])

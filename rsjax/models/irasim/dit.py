@@ -136,9 +136,15 @@ class DiT(nn.Module):
         # In the public Frame-Ada model the last layer does not see the actions. This is an oversight, but the public
         # weights were trained so.
         plain = acted if cfg.conditioning == "video" else time
-        pair = nn.remat(Pair) if cfg.remat == "blocks" else Pair
-        scan = nn.scan(pair, variable_axes={"params": 0}, split_rngs={"params": True}, in_axes=(nn.broadcast, 0))
+        pair = nn.remat(Pair, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Pair
         pairs = cfg.blocks // 2
+        scan = nn.scan(
+            pair,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+            in_axes=(nn.broadcast, 0),
+            unroll=min(cfg.unroll, pairs),
+        )
         x, _ = scan(cfg, name="blocks")(x, (acted, plain), jnp.arange(pairs) == 0)
         return self._unpatchify(self._final(x, plain))
 

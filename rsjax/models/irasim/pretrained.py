@@ -21,7 +21,7 @@ from rsjax.trainable import Params
 AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
 # Fields that may differ between the saved network and the one to train: parameters do not depend on them, or those
 # that do begin afresh.
-FREE = ("rows", "columns", "action_inputs", "compute_dtype", "remat")
+FREE = ("rows", "columns", "action_inputs", "compute_dtype", "unroll", "remat")
 C = TypeVar("C")
 
 

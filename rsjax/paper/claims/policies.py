@@ -31,9 +31,6 @@ from rsjax.progress import Progress
 STRONG = 0.9  # correlation with success in the simulator that counts as strong
 # Seconds on 2 cores; a decision considers 96 sequences.
 POLICY_STEP, JUDGE_STEP, EPISODE, DECISION = 0.31, 0.12, 1.7, 6.5
-# Seconds per imagined episode in addition to EPISODE, for families that generate a whole video for each frame: 30
-# frames at 1.15 and 9.7 s for 10 episodes together, on 2 cores of an Intel Ice Lake, 2026-11-24.
-CONTINUED = {"ivideogpt": 3.4, "irasim": 29.0}
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ def _seconds(
         if not _in_lift(config):
             return 0.0
         size = Size.of(config)
-        beyond = imagined * CONTINUED.get(config.model.family, 0.0)
+        beyond = imagined * config.model.episode_seconds
         acting = size.trials.episodes * (trials * EPISODE + beyond + decisions * DECISION)
         return JUDGE_STEP * size.judge + policies * POLICY_STEP * size.policy.train.steps + acting
 

@@ -44,7 +44,8 @@ def test_weights_of_a_run_start_another_but_no_other_network(tmp_path: Path) -> 
     for part in ("tokenizer", "world_model"):
         (tmp_path / part / "weights").mkdir(parents=True)
     (tmp_path / "config.json").write_text(json.dumps(to_dict(CONFIG)))
-    assert MODEL.pretrained_shapes(tmp_path).keys() == toy.params(MODEL.architecture).keys()
+    for same in (MODEL, create_model(toy.config(unroll=2, remat="blocks", compute_dtype="bfloat16"))):
+        assert same.pretrained_shapes(tmp_path).keys() == toy.params(MODEL.architecture).keys()
     for line, changes in (
         ("holds another network .width is 32 there, 64 here", {"width": 64}),
         ("model.text.width is 4 there, 5 here", {"text": TextConfig(width=5)}),
@@ -92,6 +93,19 @@ def test_padding_does_not_change_the_loss_and_image_and_text_do() -> None:
     np.testing.assert_allclose(loss(params, padded), loss(params, alone), rtol=1e-5)
     assert abs(loss(params, clips | {"image": clips["image"] + 1}) / whole - 1) > 1e-4
     assert abs(loss(params, clips | {"text": 0 * clips["text"]}) / whole - 1) > 1e-4
+
+
+def test_neither_remat_nor_unrolling_changes_loss_or_gradient() -> None:
+    params, clips = toy.params(MODEL.architecture), batch(2)
+
+    def made(**changes: Any) -> Any:
+        return jax.jit(jax.value_and_grad(lambda p: loss(p, clips, **changes)))(params)
+
+    plain = jax.tree.leaves(made())
+    assert all(np.abs(x).max() > 0 for x in plain)
+    for same in ({"remat": "blocks"}, {"unroll": 8}, {"unroll": 2, "remat": "blocks"}):
+        for x, y in zip(jax.tree.leaves(made(**same)), plain, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5 * np.abs(y).max())
 
 
 def test_an_image_as_first_latent_is_clean_and_no_target() -> None:

@@ -67,7 +67,7 @@ def test_export_returns_the_public_file(variant: str) -> None:
 
 
 @pytest.mark.usefixtures("bf16_units")
-def test_bf16_rounds_and_remat_changes_nothing() -> None:
+def test_bf16_rounds_and_neither_remat_nor_unrolling_changes_anything() -> None:
     config, params = model("frame")
     latents, t, actions, _ = inputs(VARIANTS["frame"])
     args = (jnp.asarray(latents.transpose(0, 1, 3, 4, 2)), t, rows_of(actions))
@@ -77,7 +77,8 @@ def test_bf16_rounds_and_remat_changes_nothing() -> None:
 
     plain, rounded = out(), out(compute_dtype="bfloat16")
     assert 0 < np.abs(rounded - plain).max() < 0.05 * np.abs(plain).max()
-    np.testing.assert_allclose(out(remat="blocks"), plain, atol=1e-6)
+    for same in ({"remat": "blocks"}, {"unroll": 8}, {"unroll": 2, "remat": "blocks"}):
+        np.testing.assert_allclose(out(**same), plain, atol=1e-6)
 
 
 @pytest.mark.parametrize(

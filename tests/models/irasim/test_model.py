@@ -15,6 +15,7 @@ from rsjax.clip import Video
 from rsjax.config import Config, DenoiseConfig, KLConfig
 from rsjax.convert.directory import save
 from rsjax.describe import describe
+from rsjax.config.leaves import with_values
 from rsjax.models.base import Assets, create_model
 from rsjax.models.irasim.dit import Architecture, forward_flops
 from rsjax.models.irasim.model import latent_arrays
@@ -168,7 +169,8 @@ def test_actions_of_another_length_begin_fresh(tmp_path: Path, capsys: pytest.Ca
     assert wider.pretrained_shapes(tmp_path / "there")["action_fc1"]["kernel"].shape[0] == arch.action_inputs
     lengths = f"its actions have {arch.action_inputs} numbers, these {arch.action_inputs + 3}"
     assert f"{lengths}; the first layer of the action encoder begins fresh" in capsys.readouterr().out
-    assert MODEL.pretrained_shapes(tmp_path / "there") and not capsys.readouterr().out
+    unrolled = create_model(with_values(CONFIG, {"model.unroll": 2}))
+    assert unrolled.pretrained_shapes(tmp_path / "there") and not capsys.readouterr().out
     fresh = jax.tree.map(lambda x: np.zeros(x.shape), jax.eval_shape(wider.init, jax.random.key(0)))
     begun = wider.start(fresh, params, tmp_path)
     assert begun["action_fc1"]["kernel"].shape[0] == arch.action_inputs + 3
