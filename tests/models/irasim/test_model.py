@@ -13,9 +13,9 @@ import pytest
 from rsjax.bench import inputs
 from rsjax.clip import Video
 from rsjax.config import Config, DenoiseConfig, KLConfig
+from rsjax.config.leaves import with_values
 from rsjax.convert.directory import save
 from rsjax.describe import describe
-from rsjax.config.leaves import with_values
 from rsjax.models.base import Assets, create_model
 from rsjax.models.irasim.dit import Architecture, forward_flops
 from rsjax.models.irasim.model import latent_arrays
