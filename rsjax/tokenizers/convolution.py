@@ -161,7 +161,8 @@ def _rows(unfolded: BFloat16[Array, "B h2 w jC"], size: int) -> list[BFloat16[Ar
 
 def _products(unfolded: BFloat16[Array, "B h2 w jC"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
     size, outputs = len(kernel), kernel.shape[-1]
-    kernels = kernel.astype(jnp.bfloat16).reshape(size, -1, outputs)
+    # A row at a time: XLA would cast the whole kernel first, and then copy its rows.
+    kernels = [row.reshape(-1, outputs).astype(jnp.bfloat16) for row in kernel]
     images, height, width, _ = unfolded.shape
     height -= size - 1
     if outputs >= WIDE:
