@@ -3,6 +3,8 @@
 VENV ?= .venv
 JOBS ?= 2
 python := $(VENV)/bin/python
+# When a test ends its process, the run ends, too: in a new process, xdist would run the same test again.
+in_parallel := -n $(JOBS) --max-worker-restart 0
 
 .PHONY: help setup train test extras lint clean
 
@@ -17,11 +19,11 @@ train: setup  ## simulate, train, generate, evaluate, report: the preset tiny
 	@$(python) -m experiments.train tiny $(ARGS)
 
 test: setup  ## the tests
-	@$(python) -m pytest -n $(JOBS) $(ARGS)
+	@$(python) -m pytest $(in_parallel) $(ARGS)
 
 extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), and the tests that want them
 	@scripts/extras.sh "$(VENV)"
-	@"$(VENV)/extras/bin/python" -m pytest -n $(JOBS) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
+	@"$(VENV)/extras/bin/python" -m pytest $(in_parallel) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
 
 lint: setup  ## ruff and mypy
 	@$(python) -m ruff check

@@ -14,6 +14,7 @@ import pytest
 
 from rsjax.errors import UserError
 from rsjax.processes import WorkerDied, count_workers, run_items
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[1]
 
@@ -183,18 +184,11 @@ def test_a_killed_parent_takes_its_workers_along(tmp_path: Path, when: str) -> N
     parent = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     pids = [int(word) for word in parent.stdout.readline().split()]
-    wait_for(lambda: when == "starting" or (tmp_path / when).exists())
+    wait_until(lambda: when == "starting" or (tmp_path / when).exists())
     parent.kill()
     _, errors = parent.communicate()
-    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     assert len(pids) == 2 and errors == ""
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_workers_are_as_many_as_asked_for_within_reason(monkeypatch: pytest.MonkeyPatch) -> None:

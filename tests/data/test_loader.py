@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from rsjax.data.quarantine import Quarantine
 from rsjax.data.store import Source, StoreError
 from tests.data import toy
 from tests.data.toy import Numbers, assert_same, jitter, take
+from tests.waiting import wait_until
 
 COUNT = 13
 UNLISTED = Quarantine(None, 1, 0.0)
@@ -199,10 +199,7 @@ def test_worker_processes_die_with_the_one_that_started_them(tmp_path: Path) -> 
         worker = int(parent.stdout.readline())
         assert running(worker)
         parent.kill()
-    until = time.monotonic() + 120
-    while running(worker) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not running(worker)
+    wait_until(lambda: not running(worker))
 
 
 def running(pid: int) -> bool:

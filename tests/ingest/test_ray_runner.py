@@ -3,8 +3,7 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from rsjax.ingest.ray_runner import RayError, check_answers, count_actors, run_o
 from rsjax.ingest.summary import summarise
 from rsjax.ingest.work_items import IngestPlan, Step
 from tests.ingest.toy import Source, clip_plan, noting_plan, runs
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 
@@ -147,11 +147,11 @@ def test_a_killed_driver_takes_its_cluster_along_and_only_the_rest_is_run(tmp_pa
     program.write_text(PROGRAM)
     line = [sys.executable, str(program), str(tmp_path)]
     driver = subprocess.Popen(line, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    wait_for(lambda: driver.poll() is not None or bool(list(tmp_path.rglob("units/clips/**/*.json"))))
+    wait_until(lambda: driver.poll() is not None or bool(list(tmp_path.rglob("units/clips/**/*.json"))), 300)
     driver.kill()
     driver.wait()
     pids = [path.name for path in (tmp_path / "pids").iterdir()]
-    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     marks = len(list(tmp_path.rglob("units/**/*.json")))
     assert 0 < marks < 12
     started = len(runs(tmp_path))
@@ -160,10 +160,3 @@ def test_a_killed_driver_takes_its_cluster_along_and_only_the_rest_is_run(tmp_pa
     run_on_this_machine(plan, refs, lambda *ran: None)
     assert summarise(plan, refs).done == 6
     assert len(runs(tmp_path)) - started == 12 - marks
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 300
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)

@@ -2,7 +2,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from rsjax.ingest.ingest import limit_threads, run_on_this_machine
 from rsjax.ingest.summary import IngestSummary, summarise, write_tables
 from rsjax.ingest.work_items import EpisodeWork, IngestPlan, mark_path
 from tests.ingest.toy import Source, noting_plan, runs
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 
@@ -135,10 +135,7 @@ def test_after_a_kill_only_the_rest_is_run(tmp_path: Path) -> None:
     pids = parent.stdout.readline().split()  # once an episode is done
     parent.kill()
     parent.communicate()
-    deadline = time.monotonic() + 120
-    while any(Path(f"/proc/{pid}").exists() for pid in pids):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     marks = len(list(tmp_path.rglob("units/**/*.json")))
     assert 0 < marks < 12
     started = len(runs(tmp_path))

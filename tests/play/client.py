@@ -3,7 +3,6 @@
 import http.client
 import json
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from rsjax.play.hub import Hub
 from rsjax.play.messages import UPLOAD_BYTES
 from rsjax.play.serve import listen
 from rsjax.play.server import make_app
+from tests.waiting import wait_until
 
 NAMES = ("version", "kind", "branch", "frame", "id", "format", "zero", "width", "height", "zero2", "scale")
 
@@ -140,12 +140,12 @@ def serving(hub: Hub, token: str = "", sweep: float = 0.05) -> Iterator[Server]:
         log_level="critical",
         ws_max_size=UPLOAD_BYTES + 1024,
         ws="websockets-sansio",
+        timeout_graceful_shutdown=2,
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
-    while not server.started:
-        time.sleep(0.01)
+    wait_until(lambda: server.started)
     try:
         yield Server(hub, listener.getsockname()[1])
     finally:

@@ -37,7 +37,7 @@ class FakeBranching:
     """Moves the picture, and puts a number into a corner that follows from action, settings, draws and frame.
 
     Attributes:
-        passes: the number of frames of each pass.
+        passes: the number of frames of each pass that has begun.
         gate: passes wait until it is set.
     """
 
@@ -51,11 +51,11 @@ class FakeBranching:
         return self._moment(Memory(first.rgb[0, 0], 0, True), None)
 
     def advance(self, moments: Sequence[Moment], actions: np.ndarray, decodings: Sequence[Decoding]) -> list[Moment]:
-        self.gate.wait(20)
-        if self.fail:
-            raise FloatingPointError("out of everything")
         assert 0 < len(moments) <= self.lanes and len({how.program for how in decodings}) == 1
         self.passes.append(len(moments))
+        self.gate.wait(60)
+        if self.fail:
+            raise FloatingPointError("out of everything")
         return [self._next(*each) for each in zip(moments, actions, decodings, strict=True)]
 
     def lightened(self, moment: Moment) -> Moment:

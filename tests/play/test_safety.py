@@ -25,6 +25,7 @@ from rsjax.play.pictures import read_picture
 from rsjax.play.run_data import FPS, PlayRun
 from tests.play.client import Client, Picture, Server, serving
 from tests.play.fake import Fakes, hub_of
+from tests.waiting import wait_until
 
 TOKEN = "a-token-nobody-knows"
 
@@ -166,8 +167,7 @@ def test_frames_keep_a_session_that_sends_nothing(server: Server, fakes: Fakes) 
         session, gate = server.hub._seats[welcome["session"]].viewer.session, fakes.kinds[True].gate
         gate.clear()
         before, number = session.used, page.send("step", branch=0, action=[0] * 7)
-        while session.used == before:
-            time.sleep(0.01)
+        wait_until(lambda: session.used != before)
         asked = session.used
         gate.set()
         assert page.wait(number)["type"] == "stepped" and session.used > asked

@@ -3,7 +3,6 @@
 import io
 import itertools
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from rsjax.config import DataConfig
 from rsjax.play.run_data import PlayRun
 from tests.play.client import Client, Picture, Server
 from tests.play.fake import LIGHT, Fakes
+from tests.waiting import wait_until
 
 
 def rgb(picture: Picture) -> np.ndarray:
@@ -185,13 +185,13 @@ def test_frames_of_two_viewers_share_passes_and_keep_their_bits(server: Server, 
         fake, engine = fakes.kinds[True], server.hub.engine
         fake.gate.clear()
         fake.passes.clear()
-        blocking = third.send("step", branch=0, action=[0] * 7)  # holds the engine until both have asked
+        blocking = third.send("step", branch=0, action=[0] * 7)
+        wait_until(lambda: fake.passes == [1])  # this pass holds the engine until both others have asked
         made: tuple[list[Picture], list[Picture]] = ([], [])
         threads = [threading.Thread(target=drive, args=each) for each in zip((one, other), made, strict=True)]
         for thread in threads:
             thread.start()
-        while len(engine._waiting) < 2:
-            time.sleep(0.01)
+        wait_until(lambda: len(engine._waiting) == 2)
         fake.gate.set()
         for thread in threads:
             thread.join()

@@ -27,6 +27,7 @@ from tests.soak.faults import (
     schedule,
 )
 from tests.soak.rounds import Event, run_round, settle
+from tests.waiting import wait_until
 
 
 def test_a_round_goes_on_after_every_fault_until_the_run_is_finished(target: Dummies) -> None:
@@ -133,12 +134,10 @@ def test_what_a_killed_soak_had_started_dies_with_it(target: Dummies, tmp_path: 
     soak = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert soak.stdout is not None
     child = int(soak.stdout.readline())
-    while b"setpriv" in Path(f"/proc/{child}/cmdline").read_bytes():  # until it has asked for the signal
-        time.sleep(0.01)
+    command_line = Path(f"/proc/{child}/cmdline")
+    wait_until(lambda: b"setpriv" not in command_line.read_bytes())  # then it has asked for the signal
     soak.kill()
     soak.wait()
-    end = time.monotonic() + 120
-    while Path(f"/proc/{child}/stat").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split():
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    stat = Path(f"/proc/{child}/stat")
+    wait_until(lambda: not stat.exists() or "Z" in stat.read_text().split())
     assert not finished(dummy.trained[0])
