@@ -1,7 +1,9 @@
 """Continues any clip from any of its frames: implements :class:`rsjax.models.moments.Branching` for token models.
 
-Every pass is over the same number of clips, the lanes; repeated clips fill empty lanes. With another number of clips,
-floating-point sums would differ in their last bit. So a frame has the same bits whichever frames share its pass.
+A frame has the same bits whichever frames share its pass. On an accelerator, every pass is over the same number of
+clips, the lanes, and repeated clips fill empty lanes: with another number, floating-point sums would differ in their
+last bit. On a CPU, clips are generated one by one: there, the last bits of a row of a product may also depend on its
+place among the rows (seen without AVX-512), and larger passes gain little (``docs/performance.md``).
 
 Axes: N clips, S cells, A action dimensions.
 """
@@ -62,6 +64,7 @@ class TokenBranching:
         lanes: int,
     ) -> None:
         self.lanes = lanes
+        self._width = program_clips(lanes)
         self._config, self._arch, self._codec, self._params = config, arch, codec, params
         self._has_depth = arch.use_depth and has_depth and codec.normalization.depth_range is not None
         # The state that clips begin with. It is on the parameters' devices, as are the states that passes return, so
@@ -85,7 +88,14 @@ class TokenBranching:
     def advance(
         self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
     ) -> list[Moment]:
-        count, full = len(moments), [*range(len(moments)), *[0] * (self.lanes - len(moments))]
+        parts = [slice(start, start + self._width) for start in range(0, len(moments), self._width)]
+        return [made for part in parts for made in self._advance(moments[part], actions[part], decodings[part])]
+
+    def _advance(
+        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[Moment]:
+        """Advances moments in one run of the program."""
+        count, full = len(moments), [*range(len(moments)), *[0] * (self._width - len(moments))]
         memories = [cast(_Memory, moments[i].memory) for i in full]
         scaled = self._codec.normalization.scaled(actions[full])
         sums = np.stack([memory.sums for memory in memories]) + scaled
@@ -96,7 +106,7 @@ class TokenBranching:
             np.array([each.guidance for each in chosen], np.float32),
         )
         seeds = np.array([(each.seed, each.draw) for each in chosen], np.uint32)
-        own = [memory.cache for memory in memories[:count]] + [None] * (self.lanes - count)
+        own = [memory.cache for memory in memories[:count]] + [None] * (self._width - count)
         caches = tuple(self._empty_cache() if cache is None else cache for cache in own)
         states = tuple(_fitted(net, memory.state) for memory in memories)
         codec = self._codec
@@ -139,6 +149,11 @@ class TokenBranching:
         }
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
         return Moment(rgb, last["tokens"], np.asarray(cast(Array, state.entropy)[0]), memory, size, last["means"])
+
+
+def program_clips(lanes: int) -> int:
+    """Returns how many clips one run of the program generates."""
+    return 1 if jax.default_backend() == "cpu" else lanes
 
 
 def _fitted(net: Network, state: State) -> State:

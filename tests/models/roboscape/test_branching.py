@@ -115,6 +115,26 @@ def test_a_frame_has_the_same_bits_whoever_shares_its_pass(lanes: Branching, cli
         assert_same(mine, expected[number])
 
 
+def test_clips_that_one_program_generates_together_are_the_same_but_for_rounding(
+    lanes: Branching, model: TrainedModel, clips: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on accelerators: two clips at different frames in one run of the program, and one with a repeated clip."""
+    actions, others = rows(2), rows(3)
+    expected = alone(lanes, lanes.begin(first(clips, 0)), actions[:3], DRAWN)
+    monkeypatch.setattr("rsjax.models.roboscape.branching.program_clips", lambda lanes: lanes)
+    together = model.model.branching(model.params, model.assets, True, lanes=2)
+    mine, other = together.begin(first(clips, 0)), together.begin(first(clips, 4))
+    [other] = together.advance([other], others[:1], [DRAWN])
+    for number, action in enumerate(actions[:3]):
+        if number == 2:
+            [mine] = together.advance([mine], action[None], [DRAWN])
+        else:
+            other, mine = together.advance([other, mine], np.stack([others[number], action]), [DRAWN, DRAWN])
+        assert np.abs(mine.rgb.astype(int) - expected[number].rgb).max() <= 1
+        np.testing.assert_array_equal(mine.tokens["rgb"], expected[number].tokens["rgb"])
+        np.testing.assert_allclose(mine.entropy, expected[number].entropy, rtol=1e-3, atol=1e-5)
+
+
 def test_going_on_from_a_lightened_memory_gives_the_same_bits(lanes: Branching, clips: Store) -> None:
     actions, moment = rows(4), lanes.begin(first(clips, 2))
     moments, light = [], {0: lanes.lightened(moment)}
