@@ -46,8 +46,8 @@ class Engine:
 
     Args:
         model: a model whose family implements ``branching``.
-        lanes: frames in one pass, at most. On an accelerator, results for different
-            values differ in their last bits.
+        lanes: frames in one pass, at most. On an accelerator, results for different values differ in
+            their last bits.
 
     Attributes:
         frames: number of frames generated so far.
