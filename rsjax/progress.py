@@ -117,7 +117,9 @@ class Progress:
         parts = [f"{done}/{self.total} {self.unit}"]
         if now > then and done > before:
             rate = (done - before) / (now - then)
-            parts += [*self._rates(rate), f"{duration((self.total - done) / rate)} left"]
+            # A pause, as to compile a second program, must not make the rest look endless.
+            mean = (done - self._first) / (now - self._began)
+            parts += [*self._rates(rate), f"{duration((self.total - done) / max(rate, mean))} left"]
         return parts
 
     def _rates(self, per_second: float) -> list[str]:

@@ -59,6 +59,12 @@ def test_the_rate_forgets_a_slow_first_step() -> None:
     assert ", 1 steps/s, " in lines[-2]
 
 
+def test_a_pause_does_not_make_the_rest_look_endless() -> None:
+    steady = [(1.0, done) for done in range(1, 101)]
+    lines = run([*steady, (60.0, 101)], total=201)
+    assert lines[-2] == "  train: 101/201 steps, 0.0167 steps/s, 2 min 38 s left, loss=0.25"
+
+
 def test_no_rate_includes_the_start_up() -> None:
     lines = run([(12.0, 1), (12.0, 2), (5.0, 12), (5.0, 22)], total=42, settle=2)
     assert lines[:2] == ["  train: 1/42 steps, loss=0.25", "  train: 2/42 steps, loss=0.25"]
