@@ -84,7 +84,9 @@ class Progress:
         """
         now = self._clock()
         self._done = done
-        if done <= self._settled:
+        # A pause between quick units, as to compile a second program, says nothing about the units to come.
+        paused = len(self._samples) > 3 and now - self._samples[-1][0] > RATE_WINDOW_SECONDS
+        if done <= self._settled or paused:
             self._samples.clear()
         self._samples.append((now, done))
         while len(self._samples) > 2 and self._samples[1][0] <= now - RATE_WINDOW_SECONDS:
@@ -117,9 +119,7 @@ class Progress:
         parts = [f"{done}/{self.total} {self.unit}"]
         if now > then and done > before:
             rate = (done - before) / (now - then)
-            # A pause, as to compile a second program, must not make the rest look endless.
-            mean = (done - self._first) / (now - self._began)
-            parts += [*self._rates(rate), f"{duration((self.total - done) / max(rate, mean))} left"]
+            parts += [*self._rates(rate), f"{duration((self.total - done) / rate)} left"]
         return parts
 
     def _rates(self, per_second: float) -> list[str]:

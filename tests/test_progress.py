@@ -59,10 +59,20 @@ def test_the_rate_forgets_a_slow_first_step() -> None:
     assert ", 1 steps/s, " in lines[-2]
 
 
-def test_a_pause_does_not_make_the_rest_look_endless() -> None:
+def test_no_rate_includes_a_pause_between_quick_units() -> None:
     steady = [(1.0, done) for done in range(1, 101)]
-    lines = run([*steady, (60.0, 101)], total=201)
-    assert lines[-2] == "  train: 101/201 steps, 0.0167 steps/s, 2 min 38 s left, loss=0.25"
+    lines = run([*steady, (60.0, 101), (10.0, 106)], total=206)
+    assert lines[-3] == "  train: 101/206 steps, loss=0.25"
+    assert lines[-2] == "  train: 106/206 steps, 0.5 steps/s, 3 min 20 s left, loss=0.25"
+
+
+def test_the_rate_shows_units_that_stay_slow() -> None:
+    steady = [(1.0, done) for done in range(1, 101)]
+    lines = run([*steady, (60.0, 101), (60.0, 102), (60.0, 103)], total=203)
+    assert lines[-3:-1] == [
+        f"  train: {done}/203 steps, 0.0167 steps/s, {left} left, loss=0.25"
+        for done, left in ((102, "1 h 41 min"), (103, "1 h 40 min"))
+    ]
 
 
 def test_no_rate_includes_the_start_up() -> None:
