@@ -9,9 +9,9 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse
-from rsjax.ablation.grid import DEFAULT_AXES, Choice, expand, parse_axes
 from rsjax.config import require
 from rsjax.runtime import tune_process
+from rsjax.tools.studies.ablation.grid import DEFAULT_AXES, Choice, expand, parse_axes
 
 PROG = "python -m experiments.ablation"
 TASK = "SLURM_ARRAY_TASK_ID"
@@ -57,7 +57,7 @@ def main() -> None:
         number = int(task)
     choice = Choice(number, options.only, options.skip)
     # This import loads JAX, so it comes after the arguments have been checked.
-    from rsjax.ablation import sweep
+    from rsjax.tools.studies.ablation import sweep
 
     if options.table:
         sweep.print_table(out, data)

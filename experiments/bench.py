@@ -36,7 +36,7 @@ def main() -> None:
     import jax
     from rich.console import Console
 
-    from rsjax.bench.run import PARTS, bench, table
+    from rsjax.tools.bench.run import PARTS, bench, table
 
     jax.config.update("jax_enable_compilation_cache", False)  # so that compilation itself is measured
     console = Console()

@@ -13,8 +13,8 @@ from tyro import _errors as parse_errors  # private; the alternative is to parse
 from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
 from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
+from rsjax.config.config_fields import leaves
 from rsjax.config.curriculum import format_stage, parse_stage
-from rsjax.config.leaves import leaves
 from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
@@ -83,7 +83,7 @@ class PresetOptions:
         if self.model is not None:
             preset = preset.with_family(self.model)
         if self.store is not None:
-            from rsjax.pipeline.own_data import on_store
+            from rsjax.tools.pipeline.run_clips import on_store
 
             preset = on_store(preset, self.store)
         return preset

@@ -38,10 +38,10 @@ def main() -> None:
     options = parse_options(sys.argv[1:], PROG, Options.__doc__ or "", Options())
     if not options.groups:
         raise ConfigError(f"name run directories; usage: {PROG} RUN RUN, or NAME=RUN,RUN … (see {PROG} --help)")
-    from rsjax.compare.groups import read_groups
-    from rsjax.compare.page import write_page
-    from rsjax.compare.table import as_csv, as_json, as_markdown, compare
     from rsjax.files import safe_id, write_file, write_json
+    from rsjax.tools.studies.compare.groups import read_groups
+    from rsjax.tools.studies.compare.page import write_page
+    from rsjax.tools.studies.compare.table import as_csv, as_json, as_markdown, compare
 
     comparison = compare(read_groups(options.groups, options.protocol), options.only, options.against)
     names = safe_id("-".join(group.name for group in comparison.groups))

@@ -23,7 +23,7 @@ def main() -> None:
     config, options = parse(sys.argv[1:], PROG, "Counts parameters, operations and memory, from shapes.", Options())
     from rich.console import Console
 
-    from rsjax.describe import describe, render
+    from rsjax.tools.describe import describe, render
 
     description = describe(config)
     if options.json:

@@ -9,12 +9,12 @@ import tyro
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError, require
-from rsjax.ingest.formats import FORMATS
+from rsjax.tools.ingest.formats import FORMATS
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from rsjax.ingest.doctor import Diagnosis
+    from rsjax.tools.ingest.doctor import Diagnosis
 
 PROG = "python -m experiments.doctor"
 
@@ -60,10 +60,10 @@ def main() -> None:
     require(options.lines >= 0, f"--lines is {options.lines}; it is how many findings to print, 0 for all")
     from rich.console import Console
 
-    from rsjax.ingest.checks import Thresholds
-    from rsjax.ingest.doctor import diagnose, open_any
-    from rsjax.ingest.options import source_options
     from rsjax.processes import count_workers
+    from rsjax.tools.ingest.checks import Thresholds
+    from rsjax.tools.ingest.doctor import diagnose, open_any
+    from rsjax.tools.ingest.options import source_options
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
     source = open_any(options.what, options.path, **source_options(options.option))
@@ -93,7 +93,7 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from rsjax.ingest.checks import KINDS
+    from rsjax.tools.ingest.checks import KINDS
 
     if diagnosis.findings:
         table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
@@ -111,7 +111,7 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
 
 def _fix(diagnosis: "Diagnosis", path: Path, about: str) -> str:
     """Writes the list of the episodes without a finding, and returns a line that reports it."""
-    from rsjax.ingest.selection import write_selection
+    from rsjax.tools.ingest.selection import write_selection
 
     kept, out = write_selection(path, about, diagnosis.refs, diagnosis.reasons())
     line = f"{path}: keeps {kept}, leaves out {out}"

@@ -88,7 +88,7 @@ def main() -> None:
     from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
-    from rsjax.pipeline.evaluations import Request, evaluate_run
+    from rsjax.tools.pipeline.evaluations import Request, evaluate_run
 
     changes = {name: value for name in CHANGES if (value := getattr(options, name)) is not None}
     settings = {name: value for name, value in vars(options.eval).items() if value is not None}

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
-from rsjax.export.lerobot import LeRobotOptions, export_lerobot
+from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
 
 PROG = "python -m experiments.export"
 

@@ -68,7 +68,7 @@ def main() -> None:
     """Writes one video per clip and prints its path."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.generate", Options.__doc__ or "", Options())
-    from rsjax.pipeline.videos import Request, write_videos
+    from rsjax.tools.pipeline.videos import Request, write_videos
 
     decoding = {field.name: getattr(options, field.name) for field in fields(SampleConfig)}
     sample = {name: value for name, value in decoding.items() if value is not None}

@@ -7,9 +7,9 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse_options, part
-from rsjax.policies.improvement import Improvement
-from rsjax.policies.trials import Trials
 from rsjax.runtime import tune_process
+from rsjax.tools.policies.improvement import Improvement
+from rsjax.tools.policies.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ def main() -> None:
     """Writes results.json, results.md and success.png, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.improve", Options.__doc__ or "", Options())
-    from rsjax.policies.improvement import improve
-    from rsjax.policies.policy import load_policy
-    from rsjax.policies.run_data import RunData, sized_policy
-    from rsjax.policies.training import train_policy
-    from rsjax.policies.trials import lift_simulators
+    from rsjax.tools.policies.improvement import improve
+    from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.run_data import RunData, sized_policy
+    from rsjax.tools.policies.training import train_policy
+    from rsjax.tools.policies.trials import lift_simulators
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
     settings, trials = part(options, Improvement), part(options, Trials)

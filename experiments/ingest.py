@@ -5,8 +5,8 @@ from pathlib import Path
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import ConfigError
-from rsjax.ingest.formats import FORMATS
-from rsjax.ingest.options import RECIPES, IngestOptions, make_plan, make_runner, unfiltered
+from rsjax.tools.ingest.formats import FORMATS
+from rsjax.tools.ingest.options import RECIPES, IngestOptions, make_plan, make_runner, unfiltered
 
 PROG = "python -m experiments.ingest"
 ABOUT = f"""Reads, annotates, cuts and packs episodes.
@@ -31,9 +31,9 @@ def main() -> None:
         options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, recipe)
     plan, runner = make_plan(source, Path(path), options), make_runner(options)
 
-    from rsjax.ingest.ingest import count_steps, ingest, is_up_to_date, list_episodes
-    from rsjax.ingest.summary import lines
     from rsjax.progress import Progress, note
+    from rsjax.tools.ingest.ingest import count_steps, ingest, is_up_to_date, list_episodes
+    from rsjax.tools.ingest.summary import lines
 
     listed = list_episodes(plan)
     refs, _ = listed

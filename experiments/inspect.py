@@ -49,10 +49,10 @@ def main() -> None:
 
     from rsjax.data.store import open_store
     from rsjax.files import disk_guard, write_file
-    from rsjax.report.contents import describe
-    from rsjax.report.lettering import lacks_letters
-    from rsjax.report.rerun_view import rerun_view
-    from rsjax.report.sheet import sheet_page, sheet_picture, sheet_rows
+    from rsjax.tools.studies.report.contents import describe
+    from rsjax.tools.studies.report.lettering import lacks_letters
+    from rsjax.tools.studies.report.rerun_view import rerun_view
+    from rsjax.tools.studies.report.sheet import sheet_page, sheet_picture, sheet_rows
 
     store = open_store(place)
     lines, damaged = describe(store, options.records)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from experiments.cli import main_errors, parse_options
 from rsjax.config import presets, require
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.paper"
@@ -54,10 +54,10 @@ def main() -> None:
     given = {f"eval.{name}": getattr(options, name) for name in FILES if getattr(options, name)}
     preset = with_values(presets.get(options.preset), given)
     # This import loads JAX, so it comes after the arguments have been parsed.
-    from rsjax.paper import run
-    from rsjax.paper.budget import parse_duration, scale
-    from rsjax.paper.claim import chosen, claims
-    from rsjax.paper.plan import make_plan
+    from rsjax.tools.studies.paper import run
+    from rsjax.tools.studies.paper.budget import parse_duration, scale
+    from rsjax.tools.studies.paper.claim import chosen, claims
+    from rsjax.tools.studies.paper.plan import make_plan
 
     wanted = chosen(options.only, claims())
     plan = make_plan(wanted, scale(preset, parse_duration(options.budget)), options.data_dir, options.seeds)

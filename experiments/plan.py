@@ -51,10 +51,10 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.plan", Options.__doc__ or "", Options())
     from rich.console import Console
 
-    from rsjax.pipeline.trained import load
-    from rsjax.policies.planner import PlannerConfig
-    from rsjax.policies.planning import PlanSettings, compare, folder, table
-    from rsjax.policies.policy import load_policy
+    from rsjax.models.load_run import load
+    from rsjax.tools.policies.planner import PlannerConfig
+    from rsjax.tools.policies.planning import PlanSettings, compare, folder, table
+    from rsjax.tools.policies.policy import load_policy
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
     planner = PlannerConfig(**{name: getattr(options, name) for name in fields})

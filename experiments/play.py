@@ -47,12 +47,12 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.play", Options.__doc__ or "", Options())
     try:
-        from rsjax.play.serve import ServeSettings, serve
+        from rsjax.tools.play.serve import ServeSettings, serve
     except ModuleNotFoundError as error:
         from rsjax.errors import UserError
 
         raise UserError(f"{error.name} is not installed; make setup installs it, or pip install rsjax[play]") from error
-    from rsjax.policies.run_data import RunData
+    from rsjax.tools.policies.run_data import RunData
 
     out = options.out or options.run / "play"
     how = (options.host, options.port, options.sessions, options.idle_minutes, options.lanes, options.browser)

@@ -7,9 +7,9 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse_options, part
-from rsjax.policies.learning import Learning
-from rsjax.policies.trials import Trials
 from rsjax.runtime import tune_process
+from rsjax.tools.policies.learning import Learning
+from rsjax.tools.policies.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ def main() -> None:
     """Writes results.json, results.md and success.png, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.policy_learning", Options.__doc__ or "", Options())
-    from rsjax.policies.demos import Demos
-    from rsjax.policies.learning import learn
-    from rsjax.policies.run_data import RunData, sized_policy, synthetic_demos
-    from rsjax.policies.trials import lift_simulators
+    from rsjax.tools.policies.demos import Demos
+    from rsjax.tools.policies.learning import learn
+    from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos
+    from rsjax.tools.policies.trials import lift_simulators
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "policy_learning"
     config, learning, trials = sized_policy(options.size, options.steps), part(options, Learning), part(options, Trials)

@@ -32,10 +32,10 @@ def main() -> None:
     """Prints a line per skipped step, or a line per clip of one step."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.replay", Options.__doc__ or "", Options())
-    from rsjax.pipeline.own_data import relocated
-    from rsjax.pipeline.replay import replay, skipped_steps
-    from rsjax.pipeline.run import Run
-    from rsjax.pipeline.trained import load_config
+    from rsjax.models.load_run import load_config
+    from rsjax.tools.pipeline.replay import replay, skipped_steps
+    from rsjax.tools.pipeline.run import Run
+    from rsjax.tools.pipeline.run_clips import relocated
 
     config = load_config(options.run)
     run = Run(relocated(config, options.store) if options.store else config, options.run, options.data_dir)

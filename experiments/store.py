@@ -92,7 +92,7 @@ def tokenize(options: Tokenize) -> list[Any]:
     from rsjax.data.normalization import Normalization
     from rsjax.data.store import open_store
     from rsjax.models.base import Assets, create_model
-    from rsjax.pipeline.trained import load_config, load_tokenizer
+    from rsjax.models.load_run import load_config, load_tokenizer
 
     config, clips = load_config(options.run), open_store(options.store)
     assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # normalization of these clips

@@ -7,8 +7,8 @@ from pathlib import Path
 import tyro
 
 from experiments.cli import main_errors, parse_options, part
-from rsjax.policies.synthesize import CLIPS, Synthesis
 from rsjax.runtime import tune_process
+from rsjax.tools.policies.synthesize import CLIPS, Synthesis
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.synthesize", Options.__doc__ or "", Options())
     from rsjax.data.store import open_store
-    from rsjax.policies.episodes import action_range
-    from rsjax.policies.run_data import RunData
-    from rsjax.policies.synthesize import synthesize
     from rsjax.progress import Progress
+    from rsjax.tools.policies.episodes import action_range
+    from rsjax.tools.policies.run_data import RunData
+    from rsjax.tools.policies.synthesize import synthesize
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "synthetic"
     store = open_store(options.store) if options.store else run.clips

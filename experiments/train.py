@@ -46,8 +46,8 @@ def main() -> None:
     from rsjax.training import distributed
 
     distributed.initialize(options.coordinator, options.processes, options.process_id)
-    from rsjax.pipeline.run import Run
-    from rsjax.pipeline.stages import run_all
+    from rsjax.tools.pipeline.run import Run
+    from rsjax.tools.pipeline.stages import run_all
 
     run = Run(config, options.run_dir or Path("runs") / config.name, options.data_dir)
     with ExitStack() as stack:

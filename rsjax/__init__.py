@@ -34,9 +34,9 @@ def load(run: "Path | str") -> "TrainedModel":
     Raises:
         rsjax.errors.UserError: the run is missing, unfinished or damaged, or was made by another version of rsjax.
     """
-    from rsjax.pipeline import trained  # jax is imported when it is needed, not with the package
+    from rsjax.models.load_run import load as load_run  # jax is imported when it is needed, not with the package
 
-    return trained.load(run)
+    return load_run(run)
 
 
 def open_store(path: "Path | str") -> "Store":

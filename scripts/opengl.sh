@@ -8,7 +8,7 @@ packages="libegl1 libgl1 libgl1-mesa-dri libosmesa6"
 
 draws() { # whether MuJoCo can draw a lit sphere with the library that the simulator would choose
     "$venv/bin/python" - >/dev/null 2>&1 <<'PYTHON'
-from rsjax.sim.gl import choose_gl
+from rsjax.tools.sim.gl import choose_gl
 
 choose_gl()
 

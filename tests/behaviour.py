@@ -2,8 +2,9 @@
 
 ``python -m tests.behaviour record`` writes the file, ``python -m tests.behaviour check`` compares with it (four minutes
 on 2 cores). The file records the losses of ``tiny`` over 100 steps of both training stages, the metrics of ``debug``,
-the tokens of a greedy rollout, and the bytes of a store into which BridgeData was ingested. Floating-point results
-differ between processors, so a record from another processor is refused, not compared.
+the tokens of a greedy rollout, generated videos, the bytes of a store into which BridgeData was ingested, the parameters
+and outputs of every preset by shape, and the pictures of a played session. Floating-point results differ between
+processors, so a record from another processor is refused, not compared.
 """
 
 import hashlib
@@ -35,7 +36,7 @@ def main() -> None:
             "debug": debug(place),
             "tokens": tokens(place),
         }
-        now |= {"bridge": bridge(place)}
+        now |= {"videos": videos(place), "bridge": bridge(place), "presets": presets(), "session": session(place)}
     if action == "record":
         RECORD.write_text(json.dumps(now, indent=1, sort_keys=True) + "\n")
         return
@@ -95,10 +96,11 @@ def debug(place: Path) -> dict[str, Any]:
 
 def tokens(place: Path) -> dict[str, str]:
     """Returns digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
-    from rsjax.data.clips import Clips
     from rsjax.pipeline.run import Run
     from rsjax.pipeline.trained import load
     from rsjax.pipeline.videos import resampled
+
+    from rsjax.data.clips import Clips
 
     trained = resampled(load(place / "tiny"), {"temperature": 0.0, "unmask": "greedy", "steps": 3})
     source = Run(trained.config, place / "tiny", place / "data").open_clips().source("test")
@@ -123,6 +125,82 @@ def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
     actions = codec.normalization.action_inputs(clips.actions, model.config.integrate_actions)
     sample = model.config.sample
     return rollout(model.architecture, sample, trained.params, prompt, actions, jax.random.key(sample.seed))
+
+
+def videos(place: Path) -> dict[str, str]:
+    """Returns digests of videos that the public API generates with the model that :func:`tiny` trained."""
+    import rsjax
+
+    model = rsjax.load(place / "tiny")
+    (store,) = [path for path in (place / "data").glob("lift-*") if len(list(path.glob("*.array_record"))) > 0][:1]
+    sizes = {len(rsjax.open_store(path).source("test")): path for path in (place / "data").glob("lift-*")}
+    source = rsjax.open_store(sizes.get(4, store)).source("test")
+    clip = source[0]
+    video = model.generate(clip["rgb"][:1], clip["actions"], depth=clip["depth"][:1])
+    planned = model.plan(clip["rgb"][:1], np.stack([source[i]["actions"] for i in range(3)]), clip["depth"][:1])
+    arrays = {"rgb": video.rgb, "depth": video.depth, "planned": planned.rgb}
+    return {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest() for name, x in arrays.items()}
+
+
+def presets() -> dict[str, dict[str, Any]]:
+    """Returns the number of parameters of each preset's networks, and a digest of their names, shapes and types."""
+    import jax
+
+    from rsjax.config import presets
+    from rsjax.models import create_model
+    from rsjax.models.base import create_autoencoder
+
+    found = {}
+    for name in presets.PRESETS:
+        config = presets.get(name)
+        networks = {"model": create_model(config), "autoencoder": create_autoencoder(config)}
+        for part, network in networks.items():
+            shapes = jax.eval_shape(network.init, jax.random.key(0))
+            lines = sorted(f"{jax.tree_util.keystr(path)} {x.shape} {x.dtype}" for path, x in leaves_of(shapes))
+            found[f"{name}/{part}"] = {
+                "parameters": sum(x.size for _, x in leaves_of(shapes)),
+                "digest": hashlib.sha256("\n".join(lines).encode()).hexdigest(),
+            }
+    return found
+
+
+def leaves_of(tree: Any) -> list[Any]:
+    """Returns paths and leaves of a tree."""
+    import jax
+
+    return jax.tree_util.tree_leaves_with_path(tree)
+
+
+def session(place: Path) -> list[str]:
+    """Plays ``tiny`` over the page's socket, and returns digests of the pictures that came."""
+    from websockets.sync.client import connect
+
+    arguments = [f"{place}/tiny", "--data-dir", f"{place}/data", "--port", "0", "--no-browser"]
+    command = [sys.executable, "-m", "experiments.play", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        address = next(line for line in process.stdout if line.startswith("http")).split()[0]
+        pictures = []
+        with connect(address.replace("http", "ws").rstrip("/") + "/ws", max_size=2**24) as socket:
+            socket.recv(600)
+            messages: list[dict[str, Any]] = [{"type": "start", "clip": 1, "seed": 5}]
+            messages += [{"type": "step", "branch": 0, "source": {"kind": "clip"}}] * 5
+            messages += [{"type": "branch", "branch": 0, "frame": 2}]
+            messages += [{"type": "step", "branch": 0, "action": [0.5, 0, 0, 0, 0, 0, 1]}] * 3
+            for number, message in enumerate(messages, 1):
+                socket.send(json.dumps(message | {"id": number}))
+                while True:
+                    answer = socket.recv(600)
+                    if isinstance(answer, bytes):
+                        pictures.append(hashlib.sha256(answer).hexdigest())
+                    elif json.loads(answer).get("id") == number and json.loads(answer)["type"] != "progress":
+                        pictures.append(json.loads(answer)["type"])
+                        break
+        return pictures
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def bridge(place: Path) -> dict[str, str] | None:

@@ -53,7 +53,7 @@ LONGEST = ("reliability", "pipeline", "ablation", "models", "training")
 @pytest.fixture
 def bf16_units(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes processors without bf16 units compute products in bf16 as well."""
-    monkeypatch.setattr("rsjax.matmul.has_bf16_units", lambda: True)
+    monkeypatch.setattr("rsjax.layers.matmul.has_bf16_units", lambda: True)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -99,7 +99,7 @@ _OPERATORS = _operators()  # kept, because the operators exist only as long as t
 @pytest.fixture(scope="session")
 def gl() -> str:
     """Returns the way to render without a screen; skips the test on a machine that cannot render."""
-    from rsjax.sim.gl import GLError, choose_gl
+    from rsjax.tools.sim.gl import GLError, choose_gl
 
     try:
         return choose_gl()

@@ -8,7 +8,7 @@ import pytest
 
 import rsjax
 from rsjax.evaluation import registry
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)

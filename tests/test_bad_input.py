@@ -20,10 +20,10 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
 from rsjax.files import write_file, write_json
-from rsjax.pipeline.run import MARK, Run
 from rsjax.runtime import HUGE_PAGES
+from rsjax.tools.pipeline.run import MARK, Run
 from rsjax.training.checkpoint import Checkpoints, save_weights
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 ROOT = Path(__file__).parents[1]
 Answer = tuple[int, str, str]  # exit status, standard output, standard error
@@ -34,7 +34,7 @@ Command = Callable[..., Answer]
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Returns a function that runs a command's main as its module does; an error that is no exit fails the test."""
     monkeypatch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # otherwise the process would restart itself
-    monkeypatch.setattr("rsjax.pipeline.stages._do", lambda run, name, work: None)  # nothing is trained
+    monkeypatch.setattr("rsjax.tools.pipeline.stages._do", lambda run, name, work: None)  # nothing is trained
 
     def call(line: str, *arguments: object) -> Answer:
         name, *words = line.split()
@@ -248,7 +248,7 @@ OUTPUTS = (
 def test_a_place_where_nothing_can_be_written_is_named(
     line: str, place: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rsjax.bench.run.bench", lambda *_, keep, **__: keep({}))
+    monkeypatch.setattr("rsjax.tools.bench.run.bench", lambda *_, keep, **__: keep({}))
     (place / "file").write_text("something")
     shutil.copytree(place / "store", place / "second")
     for out in (place / "file", Path("/proc/nowhere"), place / "file" / "below"):

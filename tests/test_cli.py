@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from experiments.cli import FIRST_FIELDS, main_errors, parse, parse_options
 from rsjax.config import Config, ConfigError, LossConfig, presets
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError, did_you_mean
 
 

@@ -112,7 +112,7 @@ def test_one_interrupt_is_one_line(lines: str) -> None:
 
 
 @pytest.mark.parametrize("number", ANSWERS)
-@pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("rsjax.convert", "argparse")])
+@pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("experiments.convert", "argparse")])
 def test_a_signal_while_a_command_is_imported_is_one_line(
     number: signal.Signals, command: str, imported: str, tmp_path: Path
 ) -> None:
@@ -125,7 +125,7 @@ def test_a_signal_while_a_command_is_imported_is_one_line(
 
 
 def test_a_program_that_imports_commands_keeps_its_handlers() -> None:
-    program = "import signal, experiments.train, rsjax.convert; print(signal.getsignal(signal.SIGINT).__name__)"
+    program = "import signal, experiments.train, rsjax.tools.convert; print(signal.getsignal(signal.SIGINT).__name__)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "default_int_handler\n"
 

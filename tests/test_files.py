@@ -11,19 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.config import presets
-from rsjax.convert.files import read_tensors
 from rsjax.data.labels import Labels
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.files import FileError, content_hash, holder, is_held, lock, making, placeholder, read_json
-from rsjax.ingest.annotators.networks.local import require_weights
-from rsjax.ingest.episode import SourceError
-from rsjax.ingest.selection import select
-from rsjax.pipeline.videos import Request, _foreign_actions
 from rsjax.tokenizers.lpips import load_lpips
+from rsjax.tools.convert.files import read_tensors
+from rsjax.tools.ingest.annotators.networks.local import require_weights
+from rsjax.tools.ingest.episode import SourceError
+from rsjax.tools.ingest.selection import select
+from rsjax.tools.pipeline.videos import Request, _foreign_actions
 from rsjax.training.log import read_rows
-from tests.ingest.toy import Source
+from tests.tools.ingest.toy import Source
 
 
 def test_a_hash_of_content_is_the_files_wherever_they_lie(tmp_path: Path) -> None:

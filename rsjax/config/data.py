@@ -20,7 +20,7 @@ class ClipShape:
 class DataConfig:
     """A store of clips made by ``experiments.ingest``, to train on instead of simulated episodes.
 
-    ``--store`` fills it in (:func:`rsjax.pipeline.own_data.on_store`).
+    ``--store`` fills it in (:func:`rsjax.tools.pipeline.run_clips.on_store`).
     """
 
     store: str = runtime("")  # its path

@@ -23,7 +23,7 @@ class ModelConfig:
         uses_tokenizer: whether a tokenizer is trained before the model: that of ``Config.tokenizer``, or the family's
             own (:attr:`own_autoencoder`).
         step_seconds: seconds per step of autoencoder and of model in the family's small preset, on the machine of
-            :mod:`rsjax.paper.budget` while it is idle; None: estimated from their operations.
+            :mod:`rsjax.tools.studies.paper.budget` while it is idle; None: estimated from their operations.
         episode_seconds: seconds by which an imagined episode of Lift takes longer than a simulated one, on 2 cores of
             an Intel Ice Lake.
     """

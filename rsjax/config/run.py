@@ -25,7 +25,7 @@ class EvalConfig:
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # Without these files, which are not part of this project, the metrics are null.
-    lpips_alex_weights: str = ""  # a safetensors file of python -m rsjax.convert lpips
+    lpips_alex_weights: str = ""  # a safetensors file of python -m experiments.convert lpips
     lpips_vgg_weights: str = ""
     fvd_weights: str = ""  # i3d_torchscript.pt, for which PyTorch is needed
     depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth

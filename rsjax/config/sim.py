@@ -17,7 +17,7 @@ CONTROLS = {
 
 @dataclass(frozen=True)
 class SimConfig:
-    """Episodes collected in a simulator (:mod:`rsjax.sim`)."""
+    """Episodes collected in a simulator (:mod:`rsjax.tools.sim`)."""
 
     episodes: int = 200
     test_episodes: int = 20  # the last ones collected, never used in training

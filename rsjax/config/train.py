@@ -93,8 +93,8 @@ class LoopConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     ema: float = 0.0  # decay of the averaged weights that later stages use; 0: no averaging
     seed: int = 0
-    # A run directory, or one made by python -m rsjax.convert, whose weights training starts from. With it, steps may be
-    # 0, which uses the weights unchanged. The content key covers the path, not the files.
+    # A run directory, or one made by python -m experiments.convert, whose weights training starts from. With it, steps
+    # may be 0, which uses the weights unchanged. The content key covers the path, not the files.
     start_from: str = ""
     # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored; commands refuse
     # a change of it). Empty: all clips of this run for ``steps`` steps. rsjax/config/curriculum.py says how a stage is

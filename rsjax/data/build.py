@@ -1,4 +1,4 @@
-"""Makes a store from clips in memory, for data that no reader of :mod:`rsjax.ingest` knows.
+"""Makes a store from clips in memory, for data that no reader of :mod:`rsjax.tools.ingest` knows.
 
 Axes: T frames, S×S pixels, A action dimensions, N₀ tracks.
 """

@@ -24,7 +24,7 @@ class Clips:
         index: each clip's number in the split.
         depth: zeros for clips without depth.
         has_depth: whether a clip has depth.
-        metric: whether a clip's depth is in metres rather than relative (see :mod:`rsjax.ingest.annotators.depth`).
+        metric: whether a clip's depth is in metres rather than relative (see ``tools/ingest/annotators/depth.py``).
     """
 
     index: Int[np.ndarray, " B"]

@@ -9,12 +9,12 @@ from jaxtyping import Float32, UInt8
 from rsjax.config import ConfigError, EvalConfig, require
 from rsjax.evaluation.registry import EstimatedDepth
 from rsjax.files import content_hash
-from rsjax.ingest.annotators.choose import choose
-from rsjax.ingest.annotators.depth import inverse_of, stretch
-from rsjax.ingest.annotators.protocols import DepthEstimator, DepthMaps
-from rsjax.ingest.episode import Episode
-from rsjax.ingest.pictures import ArrayFrames
 from rsjax.progress import Progress
+from rsjax.tools.ingest.annotators.choose import choose
+from rsjax.tools.ingest.annotators.depth import inverse_of, stretch
+from rsjax.tools.ingest.annotators.protocols import DepthEstimator, DepthMaps
+from rsjax.tools.ingest.episode import Episode
+from rsjax.tools.ingest.pictures import ArrayFrames
 
 _CAMERA = "rgb"
 

@@ -29,10 +29,10 @@ from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
 from rsjax.evaluation.scoring import Scored, mean_curves, mean_scores, sample_scores, score_all, summarised, with_best
 from rsjax.evaluation.shown import extremes, shown_arrays
 from rsjax.files import write_atomically
-from rsjax.ingest.annotators.protocols import DepthEstimator
 from rsjax.models.base import Assets
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
+from rsjax.tools.ingest.annotators.protocols import DepthEstimator
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
@@ -87,7 +87,7 @@ class HeldOut:
         protocol: with its horizon and resolution as numbers.
         records: the records of the scored clips, in full length.
         clips: the same clips, cut to the protocol's frames.
-        second_takes: second recordings of the same scenes, cut in the same way; None if there are none.
+        retakes: second recordings of the same scenes, cut in the same way; None if there are none.
     """
 
     store: Store
@@ -95,7 +95,7 @@ class HeldOut:
     protocol: Protocol
     records: Sequence[Record]
     clips: Clips
-    second_takes: Video | None = None
+    retakes: Video | None = None
 
     @classmethod
     def read(cls, store: Store, split: str, protocol: Protocol, shape: ClipShape) -> "HeldOut":
@@ -189,7 +189,7 @@ def _repetitions(
     trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
     takes_actions = trained.config.model.takes_actions
     locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
-    taught, takes = teacher_forced(trained, protocol, clips), held_out.second_takes
+    taught, takes = teacher_forced(trained, protocol, clips), held_out.retakes
     repetitions: list[tuple[Scored, Curves]] = []
     first: dict[str, Scene] = {}
     for run in range(protocol.repetitions):

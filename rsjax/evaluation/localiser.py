@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Float32, Int, UInt8
 from rsjax.data.codec import Record
 from rsjax.data.shift import moved
 from rsjax.evaluation.registry import Places
-from rsjax.group_norm import GroupNorm
+from rsjax.layers.group_norm import GroupNorm
 from rsjax.progress import Progress
 
 OBJECTS = ("cube", "gripper")

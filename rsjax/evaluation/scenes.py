@@ -16,9 +16,9 @@ from rsjax.evaluation.generation import OWN
 from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.protocols import Protocol
 from rsjax.evaluation.registry import Located, Places, Scene
-from rsjax.ingest.annotators.protocols import DepthEstimator
 from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
+from rsjax.tools.ingest.annotators.protocols import DepthEstimator
 
 LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
 
@@ -33,14 +33,14 @@ def make_scenes(
     estimator: DepthEstimator | None,
     locate: Locate | None,
     taught: TeacherForced | None = None,
-    second_takes: Video | None = None,
+    retakes: Video | None = None,
 ) -> dict[str, Scene]:
     """Returns the scenes by the suffix that names their scores: "" for the prediction, and one for each baseline.
 
     Args:
         videos: by kind of actions, one for each draw; the first under the clips' own actions is the prediction.
         taught: how well the model predicts tokens from true frames.
-        second_takes: second recordings of the clips' scenes.
+        retakes: second recordings of the clips' scenes.
     """
     reconstruction = trained.model.reconstruct(trained.assets, clips.video)
     shown = {"": videos[OWN][0], "_repeat_first": _repeat_first(clips.metric_video, protocol.prompt_frames)}
@@ -61,7 +61,7 @@ def make_scenes(
             estimated.get(suffix),
             locate(shown[suffix], not suffix) if locate else None,
             None if suffix else taught,
-            scaled(second_takes, protocol.resolution) if second_takes is not None else None,
+            scaled(retakes, protocol.resolution) if retakes is not None else None,
             settings=trained.config.eval,
             truth_cache=truth_cache,
         )

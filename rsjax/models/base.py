@@ -19,7 +19,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
 from rsjax.errors import UserError
-from rsjax.models.moments import Branching
+from rsjax.models.branch_states import Branching
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Params, Trainable

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 
 from rsjax.config import CausalVAEConfig
 from rsjax.config.cogvideox import DECODED, ENCODED
-from rsjax.group_norm import GroupNorm
-from rsjax.tokenizers.convolution import Dtype
-from rsjax.tokenizers.convolution import convolve as convolve_bf16
+from rsjax.layers.convolution import Dtype
+from rsjax.layers.convolution import convolve as convolve_bf16
+from rsjax.layers.group_norm import GroupNorm
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Downsample, Upsample
 from rsjax.trainable import Params

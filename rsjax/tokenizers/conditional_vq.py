@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.config import ConditionalVQConfig
-from rsjax.group_norm import GroupNorm
+from rsjax.layers.group_norm import GroupNorm
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Map, decode, encode
 

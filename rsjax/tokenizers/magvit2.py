@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from rsjax.config import TokenizerConfig
-from rsjax.group_norm import GroupNorm
+from rsjax.layers.convolution import Dtype, conv
+from rsjax.layers.group_norm import GroupNorm
 from rsjax.tokenizers import lfq
-from rsjax.tokenizers.convolution import Dtype, conv
 
 
 def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:

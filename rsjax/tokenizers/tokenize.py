@@ -24,7 +24,6 @@ from rsjax.data.store import Store, StoreError, open_store, write_store
 from rsjax.data.token_sets import FOLDER, OWN, tokenizer_key, tokens_key
 from rsjax.files import lock_file, making
 from rsjax.progress import Progress, note
-from rsjax.sim.expert import difficulty
 from rsjax.tokenizers.codec import Codec
 from rsjax.trainable import Params
 
@@ -197,7 +196,7 @@ def described(clip: Record) -> Record:
         "tracks": clip["tracks"],
         "visible": clip["visible"],
         "task": clip["task"],
-        "difficulty": clip["provenance"].get("difficulty") or difficulty(clip["provenance"]),
+        "difficulty": clip["provenance"].get("difficulty", UNKNOWN),
         "provenance": clip["provenance"],
     }
 

@@ -1,7 +1,7 @@
 """The public image autoencoders (VAE, VQ) of ``diffusers``: both halves, and their layers.
 
-Convolutions have biases, norms are GroupNorms with epsilon 1e-6. :mod:`rsjax.convert.vae_names` lists the public names
-of these modules.
+Convolutions have biases, norms are GroupNorms with epsilon 1e-6. ``rsjax/tools/convert/vae_names.py`` lists the public
+names of these modules.
 
 Axes: N images, h×w cells, C channels.
 """
@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.group_norm import GroupNorm
-from rsjax.tokenizers.convolution import Dtype, conv
+from rsjax.layers.convolution import Dtype, conv
+from rsjax.layers.group_norm import GroupNorm
 
 Map = Float[Array, "N h w C"]
 
@@ -92,7 +92,7 @@ def encode(
         widths: channels of each level.
         out: channels of the result.
         attention: whether the middle has attention.
-        dtype: of the operands of 3×3 convolutions (:mod:`rsjax.tokenizers.convolution`).
+        dtype: of the operands of 3×3 convolutions (:mod:`rsjax.layers.convolution`).
         after: applied to the features after each level.
     """
     x = conv(widths[0], 3, dtype, "conv_in")(x)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rsjax import config as c
 from rsjax.config import presets
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.models.roboscape.architecture import Architecture
 
 # Its own, so that tuning the presets does not touch these tests.

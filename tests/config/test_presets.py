@@ -4,9 +4,9 @@ import jax
 import pytest
 
 from rsjax.config import GenieConfig, RoboScapeConfig, presets
-from rsjax.describe import by_part, count
 from rsjax.models import create_model
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.tools.describe import by_part, count
 
 WORLD_MODELS = {  # (RGB branch with what it shares, all)
     "genie_35m": (35_218_688, 35_218_688),  # published

@@ -12,8 +12,8 @@ from rsjax.config import presets
 from rsjax.data.build import TRACKS, choose_test
 from rsjax.data.normalization import Normalization
 from rsjax.data.store import StoreError
-from rsjax.pipeline.own_data import on_store
-from tests.pipeline import toy
+from rsjax.tools.pipeline.run_clips import on_store
+from tests.tools.pipeline import toy
 
 FRAMES, SIZE = 4, 64
 

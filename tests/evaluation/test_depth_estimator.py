@@ -8,11 +8,11 @@ import pytest
 from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import by_content, choose_estimator, estimate_depth
-from rsjax.ingest.annotators.depth import metric_depth, relative_depth
-from rsjax.ingest.annotators.protocols import AnnotationError, DepthMaps
-from rsjax.ingest.episode import Episode
-from tests.ingest.annotators.networks.checkouts import check_out
-from tests.pipeline import toy
+from rsjax.tools.ingest.annotators.depth import metric_depth, relative_depth
+from rsjax.tools.ingest.annotators.protocols import AnnotationError, DepthMaps
+from rsjax.tools.ingest.episode import Episode
+from tests.tools.ingest.annotators.networks.checkouts import check_out
+from tests.tools.pipeline import toy
 
 
 @dataclass(frozen=True)

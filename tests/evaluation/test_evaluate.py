@@ -19,7 +19,7 @@ from rsjax.evaluation.protocols import PAPER, find, of_run
 from rsjax.evaluation.registry import metrics
 from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
     monkeypatch.setattr(Generation, "_generate", counted)
     monkeypatch.setattr(evaluation, "KEPT_CLIPS", 2)
     # A second take that is the first one sets the limits 1, 1, 1 and 0.
-    again = evaluate(trained, clips, held_out=replace(held_out, second_takes=held_out.clips.video), folder=tmp_path)
+    again = evaluate(trained, clips, held_out=replace(held_out, retakes=held_out.clips.video), folder=tmp_path)
     assert [batch.name for batch in made] == [files[4].name]
     score, own = "physics_iq_score", again.metrics
     assert ({k: v for k, v in own.items() if score not in k}, again.per_clip) == (result.metrics, result.per_clip)

@@ -22,9 +22,9 @@ from rsjax.evaluation.protocols import of_run
 from rsjax.models.base import Assets
 from rsjax.models.ivideogpt import autoencoder, rollout
 from rsjax.models.ivideogpt.model import IVideoGPT
-from rsjax.models.roboscape import teacher
+from rsjax.models.roboscape import teacher_forcing as teacher
 from tests.models.ivideogpt.toy import CLIPS, MODEL, frames, llama_params, vq_params
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 IN_ROWS: dict[str, list[bool]] = {}
 

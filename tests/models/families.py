@@ -7,13 +7,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.bench import inputs
 from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, GenieConfig, LoopConfig
 from rsjax.models.base import create_autoencoder, create_model
+from rsjax.tools.bench import inputs
 from tests.models.cogvideox import toy as toy_cogvideox
 from tests.models.irasim import toy as toy_irasim
 from tests.models.ivideogpt import toy as toy_ivideogpt
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 LOOP: dict[str, Any] = {"steps": 4, "batch_size": 2, "checkpoint_every": 2, "log_every": 1, "ema": 0.9, "eval_every": 4}
 

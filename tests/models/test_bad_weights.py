@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rsjax.config import Config, ConfigError, KLConfig, presets, to_dict
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from tests.models import families

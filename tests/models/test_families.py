@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 import rsjax
-from rsjax.ablation.grid import expand, parse_axes
 from rsjax.config import Config, ConfigError, LoopConfig, presets
-from rsjax.config.leaves import with_values
-from rsjax.describe import count, describe
+from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
+from rsjax.layers import convolution
 from rsjax.models.base import create_autoencoder, create_model
-from rsjax.pipeline import stages
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.replay import replay
-from rsjax.pipeline.run import Run
-from rsjax.pipeline.setup import tokenizer_setup, world_model_setup
-from rsjax.pipeline.videos import Request, write_videos
-from rsjax.tokenizers import convolution
+from rsjax.tools.describe import count, describe
+from rsjax.tools.pipeline import stages
+from rsjax.tools.pipeline.replay import replay
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.setup import tokenizer_setup, world_model_setup
+from rsjax.tools.pipeline.videos import Request, write_videos
+from rsjax.tools.studies.ablation.grid import expand, parse_axes
 from rsjax.trainable import StepContext, combine
 from rsjax.training import loop as loop_module
 from rsjax.training.checkpoint import load_weights
@@ -32,7 +32,7 @@ from rsjax.training.sharding_rules import cut_elements, table
 from rsjax.training.skipped import SkippedSteps
 from rsjax.training.state import create_state
 from tests.models import families
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 PUBLIC = {
     "genie": "genie_35m_actions",

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 import rsjax
-from rsjax.bench import parts
 from rsjax.clip import Video
 from rsjax.config import FAMILIES, Config, LoopConfig, ModelConfig, register_family
-from rsjax.describe import describe
 from rsjax.errors import UserError
 from rsjax.models import WorldModel
 from rsjax.models.base import MODELS, implements
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.run import Run, RunError
-from rsjax.pipeline.stages import prepare, train_tokenizer, train_world_model
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.tokenize import described, prepare_store
-from tests.pipeline import toy
+from rsjax.tools.bench import parts
+from rsjax.tools.describe import describe
+from rsjax.tools.pipeline.run import Run, RunError
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.stages import prepare, train_tokenizer, train_world_model
+from tests.tools.pipeline import toy
 
 
 @dataclass(frozen=True)

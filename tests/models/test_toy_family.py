@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 import rsjax
-from rsjax.ablation import sweep
-from rsjax.ablation.grid import Choice, expand, parse_axes
 from rsjax.config import Config, LoopConfig, OptimizerConfig
 from rsjax.errors import UserError
 from rsjax.evaluation import registry
 from rsjax.evaluation.registry import Scene, metric
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import run_all
-from rsjax.pipeline.videos import Request, write_videos
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.stages import run_all
+from rsjax.tools.pipeline.videos import Request, write_videos
+from rsjax.tools.studies.ablation import sweep
+from rsjax.tools.studies.ablation.grid import Choice, expand, parse_axes
 from tests.models.toy_family import ToyConfig
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.trained import ShapeError, TrainedModel
 from tests.models.toy_family import ToyConfig
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 CONFIG = toy.config()
 PAST, FRAMES, SIZE, WIDTH = 2, 6, CONFIG.clips.image_size, CONFIG.clips.action_dim

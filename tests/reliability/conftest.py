@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.pipeline.conftest import command, debug, shared
 from tests.reliability.program import make_store
 from tests.soak.rounds import Stage, Target, run_without_faults
+from tests.tools.pipeline.conftest import command, debug, shared
 
 __all__ = ["command", "debug", "shared"]
 

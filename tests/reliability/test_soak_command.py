@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from tests.pipeline.conftest import Commands
+from tests.tools.pipeline.conftest import Commands
 
 
 def test_a_soak_of_the_main_job_passes_and_lists_what_was_survived(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from rsjax.config import Config
-from rsjax.pipeline.run import TRAINED, Run
+from rsjax.tools.pipeline.run import TRAINED, Run
 from rsjax.training.log import read_log
 from tests.soak.attempt import last_logged
 from tests.soak.compare import compare_stages, compare_stores

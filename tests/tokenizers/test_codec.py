@@ -12,7 +12,7 @@ from rsjax.errors import UserError
 from rsjax.tokenizers import codec as module
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 CONFIG = toy.config().tokenizer
 NEAR_FAR = (0.4, 3.0)

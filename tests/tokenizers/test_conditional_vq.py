@@ -10,12 +10,12 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import ConditionalVQConfig, ConfigError, TokenizerTrainConfig
-from rsjax.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, tokenizer_shapes, tokenizer_table
-from rsjax.convert.table import public_shapes, to_tensors
-from rsjax.describe import count
+from rsjax.layers import convolution
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
-from rsjax.tokenizers import convolution
 from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
+from rsjax.tools.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, tokenizer_shapes, tokenizer_table
+from rsjax.tools.convert.table import public_shapes, to_tensors
+from rsjax.tools.describe import count
 from rsjax.trainable import StepContext
 from tests.models.ivideogpt.toy import SIZE, VQ, frames, vq_params
 
@@ -154,7 +154,7 @@ def test_images_that_do_not_divide_into_tokens_are_refused() -> None:
 @pytest.mark.parametrize("changes", [{}, {"context_frames": 2, "patch_size": 2}], ids=["plain", "patches-2-context"])
 def test_tokens_and_images_are_those_of_plain_pytorch(changes: dict[str, Any]) -> None:
     torch = pytest.importorskip("torch")
-    from rsjax.bench.ivideogpt_vq_torch import ConditionalVQTorch, public_tensors
+    from rsjax.tools.bench.ivideogpt_vq_torch import ConditionalVQTorch, public_tensors
 
     config = replace(VQ, **changes)
     size = SIZE * config.patch_size

@@ -18,7 +18,7 @@ from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.vae_blocks import SelfAttention
 from rsjax.trainable import StepContext
 from tests.models import families
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 SIZE = 32
 PATCHED = TokenizerConfig(

@@ -12,10 +12,10 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import read_quarantine
 from rsjax.data.shift import moved
 from rsjax.data.store import Store, StoreError
-from rsjax.pipeline.run import Run
 from rsjax.tokenizers.tokenize import fingerprint, tokenize_store
-from tests.pipeline import toy
-from tests.pipeline.damage import damage
+from rsjax.tools.pipeline.run import Run
+from tests.tools.pipeline import toy
+from tests.tools.pipeline.damage import damage
 
 
 def tokenized(clips: Store, place: Path, max_damaged: float = 0.01) -> Store:

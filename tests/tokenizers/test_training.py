@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rsjax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
-from rsjax.convert.directory import save
 from rsjax.errors import UserError
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages
@@ -16,6 +15,7 @@ from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tokenizers.training import TokenizerTraining
+from rsjax.tools.convert.directory import save
 from rsjax.trainable import StepContext
 from rsjax.training.checkpoint import load_weights
 from tests.tokenizers.test_lpips import narrow

@@ -8,7 +8,7 @@ import pytest
 from rsjax.data.depth_color import depth_to_color
 from rsjax.data.store import Record, encode_clip
 from rsjax.tokenizers.training import TokenizerImages, image_batch
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and VGG16; RoboScape does not say which one it uses.
 
-The weights are files that ``python -m rsjax.convert lpips`` makes; without its file, a metric is unavailable.
+The weights are files that ``python -m experiments.convert lpips`` makes; without its file, a metric is unavailable.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ def vgg_score(scene: Scene) -> PerClip:
 
 def _frames(scene: Scene, net: str, path: str, option: str) -> PerFrame:
     if not path:
-        raise Unavailable(f"no weights: {option} FILE (python -m rsjax.convert lpips makes it)")
+        raise Unavailable(f"no weights: {option} FILE (python -m experiments.convert lpips makes it)")
     params, side = load_lpips(path, net), min(scene.truth.rgb.shape[2:4])
     if side < min_size(params):
         raise Unavailable(f"frames of {side} pixels; LPIPS with {net} needs {min_size(params)}")

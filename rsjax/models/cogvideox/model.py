@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
 from rsjax.config import ClipShape, CogVideoXConfig, Config, TextConfig
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform

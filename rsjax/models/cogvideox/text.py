@@ -1,7 +1,7 @@
 """Reads and writes files of text embeddings, and finds the text of each clip.
 
-A file of ``python -m rsjax.convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists the
-texts in the same order; the first text is empty. Learned tokens are numbered in the same way.
+A file of ``python -m experiments.convert text`` has a tensor ``embeddings``, (texts, tokens, width). Its metadata lists
+the texts in the same order; the first text is empty. Learned tokens are numbered in the same way.
 """
 
 import json
@@ -23,7 +23,7 @@ from rsjax.progress import note
 
 EMBEDDINGS, TEXTS = "embeddings", "texts"
 EMPTY = ""
-CURE = "make it with python -m rsjax.convert text, and name it with --model.text.file"
+CURE = "make it with python -m experiments.convert text, and name it with --model.text.file"
 
 
 class Texts(NamedTuple):

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Float32, Int, Key
 from rsjax.config import CogVideoXConfig
 from rsjax.config.cogvideox import latent_frames
 from rsjax.config.data import ClipShape
+from rsjax.layers.attention import Dense, attend_cells
 from rsjax.models.diffusion.layers import PERIOD, TimeEmbedding, grid_positions, positions
-from rsjax.models.roboscape.attention import Dense, attend_cells
 from rsjax.trainable import Params
 
 XAVIER, ZEROS = nn.initializers.xavier_uniform(), nn.initializers.zeros

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from rsjax.config import Config, DiTConfig, IRASimConfig
+from rsjax.layers.attention import Dense, attend, attend_cells
 from rsjax.models.diffusion.layers import TIME_CHANNELS, TimeEmbedding, grid_positions, modulate, positions
-from rsjax.models.roboscape.attention import Dense, attend, attend_cells
 from rsjax.trainable import Params
 
 XAVIER = nn.initializers.xavier_uniform()

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import ClipShape, IVideoGPTConfig
-from rsjax.models.apart import together
+from rsjax.layers.attention import Dense, KeyValues, attend_cells, attend_parts, put_frames, rotate
+from rsjax.layers.unstacked_params import together
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.models.roboscape.attention import Dense, KeyValues, attend_cells, attend_parts, put_frames, rotate
 from rsjax.trainable import Params
 
 NORMAL = nn.initializers.normal(0.02)
@@ -126,8 +126,8 @@ class LLaMA(nn.Module):
         Args:
             actions: actions that led to the later frames, in order; a model without actions does not read them.
             first: position of the first token; may be traced.
-            cache: from :func:`empty_cache` or an earlier call, whole or in parts (:mod:`rsjax.models.apart`); holds the
-                keys and values of tokens before ``first``.
+            cache: from :func:`empty_cache` or an earlier call, whole or in parts
+                (``layers/unstacked_params.py``); holds the keys and values of tokens before ``first``.
             keys: of the dropout of each clip; None: no dropout.
 
         Returns:

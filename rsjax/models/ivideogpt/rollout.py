@@ -17,10 +17,10 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 from rsjax.clip import Video
 from rsjax.config import TopKConfig
 from rsjax.devices import divide
-from rsjax.models.apart import apart, together
+from rsjax.layers.attention import KeyValues
+from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
-from rsjax.models.roboscape.attention import KeyValues
 from rsjax.trainable import Params
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import flax.linen as nn
 from jaxtyping import Array, Float
 
+from rsjax.layers.attention import Attention, Dense, KeyValues, layer_norm
+from rsjax.layers.gelu import gelu
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.attention import Attention, Dense, KeyValues, layer_norm
-from rsjax.models.roboscape.gelu import gelu
 
 Features = Float[Array, "B T S C"]
 

@@ -1,4 +1,4 @@
-"""Continues any clip from any of its frames: implements :class:`rsjax.models.moments.Branching` for token models.
+"""Continues any clip from any of its frames: implements :class:`rsjax.models.branch_states.Branching` for token models.
 
 A frame has the same bits whichever frames share its pass. On an accelerator, every pass is over the same number of
 clips, the lanes, and repeated clips fill empty lanes: with another number, floating-point sums would differ in their
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Float32, Int, UInt8
 from rsjax.clip import Video
 from rsjax.config import TokenizerConfig, TokenModelConfig
 from rsjax.data.normalization import with_sums
-from rsjax.models.moments import Decoding, Moment
+from rsjax.models.branch_states import Decoding, Moment
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.stepping import Dials, Network, State, advance, begin, last_frame, restart
 from rsjax.models.roboscape.transformer import Cache
@@ -47,7 +47,7 @@ class _Memory:
 
 
 class TokenBranching:
-    """Implements :class:`rsjax.models.moments.Branching`.
+    """Implements :class:`rsjax.models.branch_states.Branching`.
 
     Args:
         has_depth: whether the clips have depth; otherwise a depth branch sees it masked.

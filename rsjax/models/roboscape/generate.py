@@ -11,7 +11,7 @@ from rsjax.devices import divide
 from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import Tokens, encode_prompt, rollout, rollout_from
-from rsjax.models.roboscape.teacher import score_tokens
+from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.tokenizers.codec import Codec
 from rsjax.trainable import Params
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
-from rsjax.models.apart import together
+from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, Transformer, empty_cache
 from rsjax.trainable import Params

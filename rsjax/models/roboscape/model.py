@@ -30,8 +30,8 @@ from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.imagine import Imagined
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
-from rsjax.models.roboscape.own_frames import previous_frames
 from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.self_conditioning import previous_frames
 from rsjax.models.roboscape.transformer import Transformer, empty_cache, hidden
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.codec import Codec

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
-from rsjax.models.apart import apart
+from rsjax.layers.unstacked_params import apart
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.decode import Cells, Decoder, Means
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache, repeat_cache

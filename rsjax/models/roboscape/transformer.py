@@ -14,18 +14,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.models.apart import together
+from rsjax.layers.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
+from rsjax.layers.gelu import gelu
+from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
 from rsjax.models.roboscape.blocks import DualBlock
-from rsjax.models.roboscape.gelu import gelu
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
 # Each cell's token, or its code: the mean of each bit, in [-1, 1].
 Cells = Int[Array, "B T S"] | Float[Array, "B T S D"]
 StackedCache = dict[str, KeyValues]  # by branch
-Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by rsjax.models.apart
+Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by rsjax.layers.unstacked_params
 
 MUP_WIDTH = 256  # the public code's base width
 

@@ -94,7 +94,7 @@ def test_without_weights_or_room_there_is_a_reason_and_no_number(net: str, files
     name, field = FIELDS[net]
     function, flag = metrics()[name].function, f"--eval.{field.replace('_', '-')} FILE"
     assert function is not None
-    with pytest.raises(Unavailable, match=rf"^no weights: {flag} \(python -m rsjax.convert lpips"):
+    with pytest.raises(Unavailable, match=rf"^no weights: {flag} \(python -m experiments.convert lpips"):
         function(scene(EvalConfig()))
     with pytest.raises(Unavailable, match=f"frames of 15 pixels; LPIPS with {net} needs"):
         function(scene(with_file(field, files[net]), side=15))

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from rsjax.bench import inputs
 from rsjax.clip import Video
 from rsjax.config import CogVideoXConfig, ConfigError, GuidedDenoiseConfig, NoiseConfig, TextConfig, presets, to_dict
 from rsjax.config.cogvideox import latent_frames, padded_frames
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.data.normalization import Normalization
-from rsjax.describe import describe
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.cogvideox.autoencoder import CausalCodec, filled
@@ -27,13 +25,15 @@ from rsjax.models.cogvideox.rollout import _chunk, rollout
 from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
 from rsjax.models.diffusion.schedule import alphas
-from rsjax.pipeline.own_data import on_store
-from rsjax.pipeline.run import Run
-from rsjax.pipeline.stages import run_all, train_tokenizer
 from rsjax.tokenizers import causal_vae as vae
+from rsjax.tools.bench import inputs
+from rsjax.tools.describe import describe
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.stages import run_all, train_tokenizer
 from rsjax.trainable import StepContext
 from tests.models.cogvideox import toy
-from tests.pipeline.toy import store
+from tests.tools.pipeline.toy import store
 
 CONFIG = toy.config()
 MODEL: Any = create_model(CONFIG)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from rsjax.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
-from rsjax.convert import cogvideox as convert
-from rsjax.convert.table import to_tensors
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, shapes
 from rsjax.models.diffusion.samplers import denoise, make_plan
 from rsjax.models.diffusion.schedule import alphas
 from rsjax.tokenizers import causal_vae as vae
+from rsjax.tools.convert import cogvideox as convert
+from rsjax.tools.convert.table import to_tensors
 
 RNG = np.random.default_rng(0)
 VAE = CausalVAEConfig(latent_channels=4, widths=(8, 16, 16, 16), res_blocks=1, norm_groups=4)

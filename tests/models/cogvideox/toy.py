@@ -9,7 +9,7 @@ from rsjax.models.base import create_autoencoder
 from rsjax.models.cogvideox.transformer import Architecture, shapes
 from rsjax.trainable import Params
 from tests.models.irasim.toy import drawn
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 AUTOENCODER = CausalVAEConfig(
     patch_size=2, latent_channels=3, widths=(8, 8, 8), res_blocks=1, norm_groups=4, image_draws=2

@@ -10,13 +10,13 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import ConfigError, KLConfig
-from rsjax.convert.kl_autoencoder import from_public, infer_config, to_public
+from rsjax.layers import convolution
 from rsjax.models.base import create_autoencoder
 from rsjax.models.irasim.autoencoder import KLCodec, decode, init, posterior
-from rsjax.tokenizers import convolution
+from rsjax.tools.convert.kl_autoencoder import from_public, infer_config, to_public
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy
-from tests.pipeline.toy import config as base_config
+from tests.tools.pipeline.toy import config as base_config
 
 SMALL = KLConfig(channels=8, channel_multipliers=(1, 2, 2), res_blocks=1, norm_groups=4)
 RNG = np.random.default_rng(0)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.convert.irasim import from_public, to_public
 from rsjax.models.irasim.dit import Architecture, DiT
+from rsjax.tools.convert.irasim import from_public, to_public
 from tests.models.irasim import public
 
 RNG = np.random.default_rng(1)

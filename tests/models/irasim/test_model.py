@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.bench import inputs
 from rsjax.clip import Video
 from rsjax.config import Config, DenoiseConfig, KLConfig
-from rsjax.config.leaves import with_values
-from rsjax.convert.directory import save
-from rsjax.describe import describe
+from rsjax.config.config_fields import with_values
 from rsjax.models.base import Assets, create_model
 from rsjax.models.irasim.dit import Architecture, forward_flops
 from rsjax.models.irasim.model import latent_arrays
 from rsjax.models.irasim.rollout import rollout
+from rsjax.tools.bench import inputs
+from rsjax.tools.convert.directory import save
+from rsjax.tools.describe import describe
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy
 

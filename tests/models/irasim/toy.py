@@ -10,7 +10,7 @@ import numpy as np
 from rsjax.config import Config, DenoiseConfig, IRASimConfig, KLConfig
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.trainable import Params
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 AUTOENCODER = KLConfig(
     network="magvit2",

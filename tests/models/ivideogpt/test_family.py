@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import Config, ConfigError, IVideoGPTConfig, TopKConfig, to_dict
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.models.ivideogpt.autoencoder import ConditionalVQTraining
 from rsjax.models.ivideogpt.llama import LLaMA
@@ -83,6 +83,6 @@ def test_training_starts_from_more_context_or_without_actions(config: Config, tm
 
 
 def saved_by(directory: Path, model: IVideoGPTConfig, size: int, actions: int) -> None:
-    """Writes the settings that ``python -m rsjax.convert`` would."""
+    """Writes the settings that ``python -m experiments.convert`` would."""
     inputs = {"image_size": size, "action_dim": actions}
     (directory / "config.json").write_text(json.dumps({"model": to_dict(model), "inputs": inputs}))

@@ -12,13 +12,13 @@ import pytest
 from rsjax.clip import Video
 from rsjax.config import ClipShape, IVideoGPTConfig, TopKConfig
 from rsjax.data.normalization import Normalization
-from rsjax.describe import count
+from rsjax.layers import attention
 from rsjax.models.base import Assets
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.ivideogpt.rollout import pick, sample
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.models.roboscape import attention
+from rsjax.tools.describe import count
 from rsjax.trainable import StepContext
 from tests.models.ivideogpt.toy import ARCH, CLIPS, MODEL, VQ, frames, llama_params, vq_params
 
@@ -161,8 +161,8 @@ def test_a_rollout_beyond_the_positions_goes_on_with_its_last_frame_as_context()
 
 def test_logits_are_those_of_transformers() -> None:
     torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    from rsjax.convert.ivideogpt import llama_table
-    from rsjax.convert.table import to_tensors
+    from rsjax.tools.convert.ivideogpt import llama_table
+    from rsjax.tools.convert.table import to_tensors
 
     params = llama_params()
     tensors = {

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from rsjax.config import ClipShape, ConditionalVQConfig, IVideoGPTConfig
-from rsjax.convert.ivideogpt import tokenizer_shapes
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
+from rsjax.tools.convert.ivideogpt import tokenizer_shapes
 from rsjax.trainable import Params
 
 SIZE = 16  # pixels a side

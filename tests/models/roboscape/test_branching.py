@@ -9,9 +9,9 @@ from rsjax.clip import Video
 from rsjax.config import SampleConfig
 from rsjax.data.store import Store
 from rsjax.models.base import create_model
-from rsjax.models.moments import Branching, Decoding, Moment
+from rsjax.models.branch_states import Branching, Decoding, Moment
 from rsjax.models.trained import TrainedModel
-from tests.pipeline import toy
+from tests.tools.pipeline import toy
 
 FRAMES = 10  # the window is 6
 DRAWN = Decoding(steps=2, temperature=1.0, draw=3)

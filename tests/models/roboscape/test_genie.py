@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.bench import inputs
 from rsjax.config import Config, GenieConfig, LossConfig, MaskConfig, RoboScapeConfig, presets
 from rsjax.models import Genie, RoboScape, create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers.flops import products
+from rsjax.tools.bench import inputs
 from rsjax.trainable import Params, StepContext
 from tests.models.roboscape.toy import BATCH, RGB, apply, apply_plain, random_inputs, random_params
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import ConfigError, SampleConfig, presets
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.rollout import encode_prompt, rollout
 from rsjax.models.roboscape.transformer import Transformer

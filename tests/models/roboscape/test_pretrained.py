@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from rsjax.config import GenieConfig, presets, to_dict
-from rsjax.convert.directory import save
-from rsjax.convert.genie import from_public
 from rsjax.errors import UserError
 from rsjax.models.roboscape import pretrained
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
+from rsjax.tools.convert.directory import save
+from rsjax.tools.convert.genie import from_public
 from rsjax.training.checkpoint import load_weights, save_weights
-from tests.convert.public import genie_shapes, random_tensors
+from tests.tools.convert.public import genie_shapes, random_tensors
 
 ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
 DUAL = replace(ALONE, use_depth=True, action_inputs=5, action_dropout=0.1)

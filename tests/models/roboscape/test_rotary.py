@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rsjax.config import ConfigError
+from rsjax.layers.attention import frames_held, rotate
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.attention import frames_held, rotate
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
 
 ROTARY = Architecture(

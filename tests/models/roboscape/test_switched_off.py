@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rsjax.bench import inputs
 from rsjax.config import presets
-from rsjax.config.leaves import with_values
+from rsjax.config.config_fields import with_values
 from rsjax.models import create_model
 from rsjax.models.roboscape import model as roboscape
+from rsjax.tools.bench import inputs
 from rsjax.trainable import StepContext, combine
 
 DEBUG = presets.debug()

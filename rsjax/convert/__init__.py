@@ -1,5 +1,0 @@
-"""Imports public checkpoints and exports weights under public names. ``python -m rsjax.convert --help``"""
-
-from rsjax.runtime import answer_while_importing
-
-answer_while_importing()

@@ -1,0 +1,115 @@
+"""Measures a family's PyTorch baseline on the same machine in the same process."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import jax
+
+from rsjax.config import CogVideoXConfig, Config, ConfigError, require
+from rsjax.errors import UserError
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.tools.bench.timing import median_seconds
+
+ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # options that the plain Genie lacks
+COMPILER = "inductor"  # backend of torch.compile
+
+
+def check_genie(config: Config) -> None:
+    """Raises :class:`ConfigError` if the model has an option that the plain Genie lacks."""
+    check_plain(Architecture.create(config))
+
+
+def check_cogvideox(config: Config) -> None:
+    """Raises :class:`ConfigError` if a CogVideoX has options that its baseline lacks."""
+    assert isinstance(config.model, CogVideoXConfig)
+    for name in ("stretch", "learned_positions"):
+        require(not getattr(config.model, name), f"model.{name} is set, which the PyTorch baseline lacks; leave it out")
+    ratio = config.model.mlp_ratio
+    require(ratio == 4, f"model.mlp_ratio is {ratio}; the PyTorch baseline has 4; set it alike, or leave --torch out")
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A family's baseline.
+
+    Attributes:
+        module: has a function ``create``, which returns a :class:`rsjax.tools.bench.torch_work.TorchWork`.
+        packages: the packages that it needs besides torch.
+        check: raises :class:`ConfigError` for settings that the baseline lacks.
+    """
+
+    module: str
+    packages: tuple[str, ...] = ()
+    check: Callable[[Config], None] = lambda config: None
+
+
+FAMILIES = {
+    "roboscape": Baseline("rsjax.tools.bench.genie_torch", check=check_genie),
+    "genie": Baseline("rsjax.tools.bench.genie_torch", check=check_genie),
+    "ivideogpt": Baseline("rsjax.tools.bench.ivideogpt_torch", ("transformers",)),
+    "irasim": Baseline("rsjax.tools.bench.irasim_torch", ("diffusers",)),
+    "cogvideox": Baseline("rsjax.tools.bench.cogvideox_torch", ("diffusers",), check_cogvideox),
+}
+
+
+def check_torch(config: Config) -> Baseline:
+    """Returns the baseline of the model's family.
+
+    Raises:
+        UserError: the family has no baseline, the model has options that the baseline lacks, or a package is missing.
+    """
+    family = config.model.family
+    if family not in FAMILIES:
+        raise ConfigError(f"--torch has no network of family {family!r}, only of {', '.join(FAMILIES)}")
+    baseline = FAMILIES[family]
+    baseline.check(config)
+    if find_spec("torch") is None:
+        raise UserError(
+            "--torch needs PyTorch, which is not installed; pip install -e '.[torch]', or leave --torch out"
+        )
+    for package in baseline.packages:
+        if find_spec(package) is None:
+            raise UserError(f"--torch needs the package {package} for this family; make extras, or leave --torch out")
+    return baseline
+
+
+def check_plain(model: Architecture) -> None:
+    """Raises :class:`ConfigError` if the model has an option that the baseline lacks."""
+    plain, cure = "and the PyTorch baseline is the plain Genie", "or leave the baseline out"
+    for name in ADDED:
+        require(not getattr(model, name), f"model.{name} is on, {plain}, without it; set it to False, {cure}")
+    problem = f"model.positions is {model.positions!r}, {plain}, which learns them; set it to 'learned', {cure}"
+    require(model.positions == "learned", problem)
+
+
+def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
+    """Measures the model in PyTorch, in float32 and under bf16 autocast, like the public code of its family.
+
+    This covers the training step, sampling and the autoencoder; for RoboScape, only the RGB branch. All run eagerly;
+    the training step is also measured compiled. PyTorch runs on the GPU if both jax and PyTorch can use one, otherwise
+    on the CPU (``torch_device``).
+
+    Args:
+        horizon: length of a rollout in frames. For RoboScape and Genie only its last frame is decoded.
+
+    Raises:
+        UserError: as :func:`check_torch`.
+    """
+    baseline = check_torch(config)
+    import torch
+
+    from rsjax.tools.bench.torch_work import measure
+
+    device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
+    wait = torch.cuda.synchronize if device == "cuda" else lambda: None
+
+    def timed(call: Callable[[], Any]) -> float:
+        return median_seconds(lambda: (call(), wait())[:0], budget)  # returns no arrays that jax could wait for
+
+    torch.manual_seed(0)
+    work = import_module(baseline.module).create(config, batch, horizon, device)
+    numbers = {"torch": torch.__version__, "torch_device": device, "torch_threads": torch.get_num_threads()}
+    return numbers | measure(work, config.train.optimizer, device, timed, COMPILER)

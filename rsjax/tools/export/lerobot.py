@@ -1,0 +1,166 @@
+"""Writes a store of clips as a LeRobotDataset v3.0 or v2.1, which the training code of LeRobot and openpi reads.
+
+Each clip becomes an episode. LeRobot's row t has the frame at t and the action that leads out of it; a clip's row t has
+the action that leads into it. So actions move up by one row, and the last row repeats the one before it, because no
+action follows the last frame.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.config.fields import require_range
+from rsjax.data.clips import frame_rate, keeps_rate, readable
+from rsjax.data.codec import Record
+from rsjax.data.store import Store, StoreError
+from rsjax.errors import UserError
+from rsjax.files import disk_guard, making, replace_directory
+from rsjax.progress import note
+from rsjax.tools.export.lerobot_layouts import Episode, LayoutV21, LayoutV30
+from rsjax.tools.export.lerobot_meta import describe_features
+from rsjax.tools.export.lerobot_video import VideoSettings, video_rate
+
+LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
+CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
+# Names of a constant state's numbers; from one number LeRobot would make (B, T), but its policies want (B, T, D).
+ZEROS = ("zero_0", "zero_1")
+
+
+@dataclass(frozen=True)
+class LeRobotOptions:
+    """How a store is exported.
+
+    Attributes:
+        version: version of the format; v3.0 for LeRobot 0.4 and later, v2.1 for earlier ones and openpi.
+        split: the clips to export. LeRobot trains on all episodes of a data set, so the default leaves test clips out.
+        state: ``observation.state``, which most policies ask for and clips do not have. zeros: two zeros;
+            command: the action that led into the frame; none: no such column.
+        codec: codec of the videos; LeRobot's own default is av1.
+        crf: constant rate factor of the codec, 0 to 63 (av1) or 51 (h264): lower is larger and sharper (LeRobot: 30).
+        fps: frames per second; 0: as the clips say.
+        robot: ``robot_type`` in ``meta/info.json``.
+    """
+
+    version: Literal["v3.0", "v2.1"] = "v3.0"
+    split: Literal["train", "test", "all"] = "train"
+    state: Literal["zeros", "command", "none"] = "zeros"
+    codec: Literal["av1", "h264"] = "av1"
+    crf: int = 20
+    fps: float = 0.0
+    robot: str = "unknown"
+
+    def __post_init__(self) -> None:
+        require_range(self, "export", 0, 63 if self.codec == "av1" else 51, "crf")
+
+
+def export_lerobot(
+    store: Store,
+    out: Path,
+    options: LeRobotOptions = LeRobotOptions(),
+    report: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Writes a LeRobotDataset to ``out``, which appears only when it is complete.
+
+    Args:
+        store: a store of clips, all of one size and rate; clips that cannot be read are left out with a note.
+        out: a directory that does not exist.
+        report: called with (episodes done, episodes in all).
+
+    Returns:
+        The content of the data set's ``meta/info.json``.
+
+    Raises:
+        UserError: ``out`` exists, the store has no clips, or their sizes or frame rates differ or do not suit a video.
+        FileError: the disk is full, or ``out`` cannot be written.
+    """
+    if out.exists():
+        raise UserError(f"{out}: exists; choose another place for the data set, or move it away")
+    building = out.with_name(f"{out.name}.building")
+    with disk_guard(out), making(out, wait=False):
+        shutil.rmtree(building, ignore_errors=True)
+        building.mkdir(parents=True)
+        try:
+            info = _write(store, building, options, report or (lambda done, total: None))
+            replace_directory(building, out)
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+    return info
+
+
+def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[int, int], None]) -> dict[str, Any]:
+    names = store.splits if options.split == "all" else (options.split,)
+    total, layout, splits = sum(len(store.source(name)) for name in names), None, {}
+    cameras: dict[str, None] = {}
+    for name in names:
+        begins = layout.episodes if layout else 0
+        for clip in _clips(store, name):
+            if layout is None:
+                layout = _layout(store, clip, root, options)
+            episode = _episode(clip, layout.features, options.state)
+            if episode.rgb.shape[1:] != (layout.video.size, layout.video.size, 3):
+                raise StoreError(f"{store.path}: has clips of several sizes; export them from stores of their own")
+            if not options.fps and not keeps_rate(clip, store.manifest, layout.video.fps):
+                rate = frame_rate(clip, store.manifest)
+                raise StoreError(
+                    f"{store.path}: has clips of {layout.video.fps:g} and {rate or 0:g} frames a second (0: unknown); "
+                    f"export them from stores of their own, or give --fps"
+                )
+            cameras[_camera(clip)] = None
+            layout.add(episode)
+            report(layout.episodes, total)
+        if layout is not None and layout.episodes > begins:
+            splits[name] = f"{begins}:{layout.episodes}"
+    if layout is None:
+        raise StoreError(f"{store.path}: has no readable clip of split {options.split}")
+    if len(cameras) > 1:
+        note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
+    return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
+
+
+def _clips(store: Store, split: str) -> Iterator[Record]:
+    if store.manifest.get("kind") != "clips":
+        raise StoreError(f"{store.path}: holds {store.manifest.get('kind')}, not clips; export the clips themselves")
+    return (clip for _, clip in readable(store.source(split)))
+
+
+def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> LayoutV30 | LayoutV21:
+    """Returns the layout for clips of the first clip's size and rate."""
+    fps = options.fps or frame_rate(clip, store.manifest)
+    if not fps:
+        raise UserError(f"{store.path}: its clips do not say how many frames a second have; give --fps")
+    size = clip["rgb"].shape[1]
+    if size % 2 or not 0.001 <= fps <= 1000:
+        raise UserError(
+            f"{store.path}: {size} × {size} pixels at {fps:g} Hz; videos need even sides and 0.001 to 1000 Hz"
+        )
+    fps = float(video_rate(fps))  # timestamps have to be those of the frames, even in a long video of many episodes
+    width = clip["actions"].shape[1]
+    states = {"zeros": ZEROS, "command": _names(store, width), "none": None}[options.state]
+    video = VideoSettings(options.codec, options.crf, fps, size)
+    return LAYOUTS[options.version](root, video, describe_features(video, _camera(clip), _names(store, width), states))
+
+
+def _camera(clip: Record) -> str:
+    return "".join(c if c.isalnum() else "_" for c in str(clip["provenance"].get("camera") or "image"))
+
+
+def _names(store: Store, width: int) -> list[str]:
+    """Returns a name for each dimension of the actions; an action of simulated Lift is a sequence of controls."""
+    steps = width // len(CONTROLS)
+    if store.manifest.get("source", "").startswith("robosuite/") and width == steps * len(CONTROLS):
+        return [f"{name}_{step}" for step in range(steps) for name in CONTROLS]
+    return [f"action_{number}" for number in range(width)]
+
+
+def _episode(clip: Record, features: dict[str, Any], state: str) -> Episode:
+    actions = clip["actions"]
+    columns: dict[str, Float32[np.ndarray, "T D"]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
+    if "observation.state" in features:
+        zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
+        columns["observation.state"] = actions if state == "command" else zeros
+    return Episode(clip["rgb"], columns, str(clip["task"]))

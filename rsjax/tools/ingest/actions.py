@@ -1,0 +1,235 @@
+"""Turns recorded actions into the actions of a clip: the command that led from one *sampled* frame into the next.
+
+An :class:`Episode` has a row of actions for each recorded frame, in its data set's units. A clip
+keeps about every tenth frame; each of its actions combines the rows between two kept frames, in the way that
+:class:`ActionConfig` chooses and :class:`Layout` allows.
+
+Axes: N recorded frames, T sampled frames, K rows between two of these, A recorded and A' resulting action dimensions.
+"""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int
+
+from rsjax.config.fields import ConfigError
+from rsjax.tools.ingest.episode import EpisodeError
+
+Kind = Literal["absolute", "delta"]
+Compose = Literal["join", "last", "stack"]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The meaning of an action's numbers; readers store it in ``episode.meta["actions"]``.
+
+    Attributes:
+        kind: absolute: a target; delta: a change, or the step's velocity or torque; undeclared: the data set does not
+            say.
+        quaternions: first of the four dimensions of each unit quaternion, x y z w.
+        held: dimensions whose command stays in force until the next one, such as open or closed for a gripper, whatever
+            ``kind`` is. Differences of them are never taken, and of several commands the last one counts.
+        unclear: dimensions that cannot be steps, each with the reason; empty if the data set declares what they are.
+    """
+
+    kind: Kind | Literal["undeclared"] = "delta"
+    quaternions: tuple[int, ...] = ()
+    held: tuple[int, ...] = ()
+    unclear: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the fields, JSON-ready; ``unclear`` only if it is not empty."""
+        values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        return values if self.unclear else {name: value for name, value in values.items() if name != "unclear"}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Layout":
+        """Inverts :meth:`to_json`; missing fields get their defaults."""
+        dims = (tuple(values.get(name, ())) for name in ("quaternions", "held", "unclear"))
+        return cls(values.get("kind", "delta"), *dims)
+
+
+@dataclass(frozen=True)
+class ActionConfig:
+    """How a source's actions become the actions of clips.
+
+    Attributes:
+        offset: frames by which this source recorded its commands too early (> 0) or too late (< 0), in addition to its
+            format's documented alignment, which the reader undoes: row t becomes the one recorded at t - offset.
+        compose: how the rows between two sampled frames become one. ``join``: one row of the same effect: deltas are
+            added, quaternions multiplied, and the last absolute and held value counts. ``last``: the last row.
+            ``stack``: all rows, one after the other (A' = K·A); the frames must be evenly spaced.
+        kind: what the clip's actions are: ``recorded``, or ``delta`` of what was recorded as ``absolute``.
+    """
+
+    offset: int = 0
+    compose: Compose = "join"
+    kind: Literal["recorded", "absolute", "delta"] = "recorded"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("compose", get_args(Compose)), ("kind", ("recorded", "absolute", "delta"))):
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"actions.{name} is {getattr(self, name)!r}; choose one of {', '.join(allowed)}")
+
+
+def check_layout(layout: Layout, width: int, where: Path | str) -> None:
+    """Raises :class:`EpisodeError` if a layout names dimensions that actions of this width do not have.
+
+    Args:
+        where: what the message names.
+    """
+    ends = [dim for first in layout.quaternions for dim in (first, first + 3)]
+    for name, dims in (("held", layout.held), ("quaternions", ends)):
+        for wrong in (dim for dim in dims if not 0 <= dim < width):
+            problem = f"{name} names dimension {wrong}, but actions have {width} (from 0 on)"
+            raise EpisodeError.at(where, problem, f"mend the option {name}")
+
+
+def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
+    """Raises :class:`EpisodeError` if it is not declared what must be known to make a clip's actions.
+
+    Args:
+        layout: layout of the recorded actions.
+        skipped: largest number of recorded rows that one action of a clip combines.
+        config: how these rows are combined.
+    """
+    needed = (skipped > 1 and config.compose == "join") or config.offset != 0 or config.kind != "recorded"
+    if not needed or layout.kind == "absolute" or (layout.kind == "delta" and not layout.unclear):
+        return
+    doubts = "; ".join(layout.unclear)
+    if layout.kind == "delta":
+        problem = f"declared as steps, which add up, but {doubts}"
+        cure = "say --option 'held=[…]' with the numbers of those that stay in force ('held=[]' if none does)"
+        raise EpisodeError(f"actions: {problem}; {cure}", option="--option held")
+    problem = f"{skipped} recorded rows become one, and nobody says whether they are steps, which add up, or targets"
+    cure = "say --option kind=delta or --option kind=absolute, and 'held=[…]' for grippers"
+    doubts = f"; these cannot be steps: {doubts}" if doubts else ""
+    raise EpisodeError(f"actions: {problem}; {cure}{doubts}", option="--option kind")
+
+
+def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float32[np.ndarray, "N A"]:
+    """Aligns each action with the frame into which it led; row 0 becomes zeros.
+
+    Args:
+        rows: an action for each frame.
+        after: whether each frame was recorded after the action of its row, so that rows stay where they are. Otherwise
+            row t leads into frame t+1, and the last row is dropped.
+    """
+    aligned = np.zeros(rows.shape, np.float32)
+    aligned[1:] = rows[1:] if after else rows[:-1]
+    return aligned
+
+
+def sampled_actions(
+    actions: Float32[np.ndarray, "N A"], frames: Int[np.ndarray, " T"], config: ActionConfig, layout: Layout
+) -> Float32[np.ndarray, "T A2"]:
+    """Returns the action that led to each of these frames from the previous one in ``frames``; row 0 is zeros.
+
+    Args:
+        actions: an episode's actions; row t led into frame t, row 0 has no meaning.
+        frames: numbers of the sampled frames, increasing, each below N.
+        config: how rows are combined.
+        layout: layout of ``actions``.
+
+    Raises:
+        ConfigError: the configuration asks for absolute actions but the source records deltas, or for ``stack`` but the
+            frames are unevenly spaced.
+        EpisodeError: the layout names dimensions that the actions do not have, or the meaning of the actions has to be
+            declared.
+    """
+    check_layout(layout, actions.shape[1], "meta.actions")
+    if config.kind == "absolute" and layout.kind == "delta":
+        raise ConfigError("actions.kind is 'absolute', but the source records deltas; say 'recorded' or 'delta'")
+    gaps = np.diff(frames)
+    if config.compose == "stack" and len(set(gaps.tolist())) > 1:
+        raise ConfigError(f"actions.compose is 'stack', but frames are {gaps.min()} to {gaps.max()} apart; say 'join'")
+    check_declared(layout, int(gaps.max(initial=1)), config)
+    rows = _shifted(actions.astype(np.float64), config.offset, layout)
+    differences = config.kind == "delta" and layout.kind == "absolute"
+    if differences:
+        rows = _differences(rows, layout)
+    steps = differences or layout.kind == "delta"
+    composed = [
+        _composed(rows[before + 1 : after + 1], config.compose, layout, steps)
+        for before, after in itertools.pairwise(frames)
+    ]
+    width = composed[0].size if composed else actions.shape[1]
+    return np.stack([np.zeros(width), *composed]).astype(np.float32)
+
+
+def continuous_signs(quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Returns the same rotations, each with the sign that is nearer to the previous one; q and -q are one rotation."""
+    flips = np.sum(quaternions[1:] * quaternions[:-1], -1) < 0
+    signs = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
+    return quaternions * signs[: len(quaternions), None].astype(quaternions.dtype)
+
+
+def _shifted(rows: Float64[np.ndarray, "N A"], offset: int, layout: Layout) -> Float64[np.ndarray, "N A"]:
+    """Moves row t - offset to row t. Beyond the ends, absolute and held values repeat and deltas mean no motion."""
+    wanted = np.arange(len(rows)) - offset
+    nearest = np.clip(wanted, min(1, len(rows) - 1), len(rows) - 1)
+    shifted = rows[nearest]
+    if layout.kind == "delta":
+        still = np.zeros(rows.shape[1])
+        still[[first + 3 for first in layout.quaternions]] = 1
+        held = np.isin(np.arange(rows.shape[1]), layout.held)
+        shifted = np.where((wanted != nearest)[:, None] & ~held, still, shifted)
+    return shifted
+
+
+def _differences(rows: Float64[np.ndarray, "N A"], layout: Layout) -> Float64[np.ndarray, "N A"]:
+    """Turns absolute rows into steps from the previous row; quaternions become q₋₁⁻¹ q, in the hand's own frame."""
+    steps = np.diff(rows, axis=0, prepend=rows[:1])
+    before = np.concatenate([rows[:1], rows[:-1]])
+    for first in layout.quaternions:
+        part = slice(first, first + 4)
+        steps[:, part] = _shorter_way(_product(_unit(before[:, part]) * [-1.0, -1.0, -1.0, 1.0], _unit(rows[:, part])))
+    for held in layout.held:
+        steps[:, held] = rows[:, held]
+    return steps
+
+
+def _composed(
+    rows: Float64[np.ndarray, "K A"], compose: Compose, layout: Layout, steps: bool
+) -> Float64[np.ndarray, " A2"]:
+    """Combines rows into one.
+
+    Args:
+        steps: whether rows are steps, which add up, rather than absolute.
+    """
+    if compose == "stack":
+        return rows.reshape(-1)
+    if compose == "last" or not steps:
+        return rows[-1]
+    joined = rows.sum(0)
+    for first in layout.quaternions:
+        part = slice(first, first + 4)
+        turn = _unit(rows[0, part])
+        for row in rows[1:]:
+            turn = _product(turn, _unit(row[part]))
+        joined[part] = _shorter_way(turn)
+    for held in layout.held:
+        joined[held] = rows[-1, held]
+    return joined
+
+
+def _unit(quaternion: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
+    """Scales quaternions to length 1; zeros, which pad damaged data, become the identity."""
+    length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return np.where(length > 0, quaternion / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])
+
+
+def _shorter_way(turn: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
+    """Returns the same rotation with w ≥ 0: at most half a turn."""
+    return np.where(turn[..., 3:] < 0, -turn, turn)
+
+
+def _product(left: Float64[np.ndarray, "*N 4"], right: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
+    """Multiplies quaternions x y z w (Hamilton's product)."""
+    vector_l, vector_r, w_l, w_r = left[..., :3], right[..., :3], left[..., 3:], right[..., 3:]
+    vector = w_l * vector_r + w_r * vector_l + np.cross(vector_l, vector_r)
+    return np.concatenate([vector, w_l * w_r - np.sum(vector_l * vector_r, -1, keepdims=True)], -1)

@@ -1,0 +1,78 @@
+"""Step "shots": finds where a video was cut. Without weights: by jumps of the colour histogram.
+
+It detects hard cuts only. A teleoperated episode has none, so a detected cut should be inspected.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from rsjax.tools.ingest.annotators.protocols import Annotator, in_chunks
+from rsjax.tools.ingest.episode import Frames
+
+_BINS = (16, 4, 4)  # hue, saturation, value
+_SIDE = 96  # pixels; pictures are shrunk to this longer side for their histograms
+
+
+@dataclass(frozen=True)
+class HistogramShots(Annotator):
+    """Cuts where the HSV histogram changes by more than ``threshold``, and much more than in neighbouring frames.
+
+    Attributes:
+        threshold: share of the pixels that change their bin, 0–1.
+        prominence: least ratio of a cut's change to the largest change in the ``around`` steps on either side.
+        around: number of steps.
+        shortest: frames; a cut nearer than this to the beginning of its shot is dropped (a flash makes two cuts).
+    """
+
+    name: ClassVar[str] = "hsv-histogram"
+    threshold: float = 0.4
+    prominence: float = 2.0
+    around: int = 3
+    shortest: int = 8
+
+    def __call__(self, frames: Frames) -> list[tuple[int, int]]:
+        changes = histogram_changes(frames)
+        cuts = []
+        for t in np.flatnonzero(changes > self.threshold).tolist():
+            beside = np.concatenate([changes[max(1, t - self.around) : t], changes[t + 1 : t + 1 + self.around]])
+            if changes[t] >= self.prominence * beside.max(initial=0.0):
+                cuts.append(t)
+        return spans_between(cuts, len(frames), self.shortest)
+
+
+def spans_between(cuts: list[int], count: int, shortest: int = 1) -> list[tuple[int, int]]:
+    """Returns the shots that begin at frame 0 and at each cut.
+
+    Args:
+        cuts: first frames of shots after a cut, increasing, between 1 and ``count`` - 1.
+        count: number of frames of the video.
+        shortest: frames; a cut nearer than this to the beginning of its shot is dropped.
+    """
+    starts = [0]
+    for cut in cuts:
+        if cut - starts[-1] >= shortest:
+            starts.append(cut)
+    return list(zip(starts, [*starts[1:], count], strict=True))
+
+
+def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
+    """Returns half the L1 distance of each frame's HSV histogram from the previous one's, 0–1; 0 for the first."""
+    changes, last = np.zeros(len(frames), np.float32), None
+    for start, pictures in in_chunks(frames):
+        for t, picture in enumerate(pictures, start):
+            histogram = _histogram(picture)
+            changes[t] = 0.0 if last is None else np.abs(histogram - last).sum() / 2
+            last = histogram
+    return changes
+
+
+def _histogram(picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " bins"]:
+    scale = min(1.0, _SIDE / max(picture.shape[:2]))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+    hsv = cv2.cvtColor(small, cv2.COLOR_RGB2HSV)
+    histogram = cv2.calcHist([hsv], [0, 1, 2], None, list(_BINS), [0, 180, 0, 256, 0, 256])
+    return histogram.ravel() / histogram.sum()

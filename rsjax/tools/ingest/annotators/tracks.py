@@ -1,0 +1,197 @@
+"""Step "tracks": follows points through a shot. Without weights: pyramidal Lucas–Kanade.
+
+Every tracker follows a set of points through a few pictures, a span; :func:`track_in_spans` does the rest. Points begin
+on a grid. Those that are visible at a span's end are followed further, and grid cells that lost their points get new
+ones.
+
+Axes: P points, T frames, H×W pixels.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from rsjax.tools.ingest.annotators.protocols import AnnotationError, Annotator, Pictures, Tracked
+from rsjax.tools.ingest.episode import Depths, Frames
+
+Points = Float32[np.ndarray, "P 2"]
+Maps = Float32[np.ndarray, "T H W"]
+Followed = tuple[Float32[np.ndarray, "P T 2"], Bool[np.ndarray, "P T"]]
+Follower = Callable[[Pictures, Points, Maps | None], Followed]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridTracker(Annotator):
+    """Base class of the trackers.
+
+    Attributes:
+        grid: points begin in the middles of grid × grid cells.
+        span: frames after which cells that lost their points get new ones; a network sees a whole span at once.
+        needs_depth: whether :meth:`follow` uses the depth.
+    """
+
+    needs_depth: ClassVar[bool] = False
+    grid: int = 16
+    span: int = 16
+
+    def __call__(self, frames: Frames, depth: Depths | None = None) -> Tracked:
+        if self.needs_depth and depth is None:
+            raise AnnotationError(f"{self.name} needs the frames' depth; add a depth stage, or choose another tracker")
+        return track_in_spans(frames, self.follow, self.grid, self.span, depth if self.needs_depth else None)
+
+    def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
+        """Follows points of the first picture through the other pictures.
+
+        Args:
+            points: x and y, 0 and 1 at the image's outer edges.
+            depth: the pictures' depth maps, if the tracker needs them.
+
+        Returns:
+            The points in every picture, and whether each is visible in it.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class LucasKanade(GridTracker):
+    """Pyramidal Lucas–Kanade from picture to picture; a point that does not return when followed back is lost.
+
+    Where a patch stays the same, its point stays too, even on a surface without texture: if the camera moves over such
+    a surface, the tracker does not notice. A lost point reappears only where it was lost, when its patch reappears.
+
+    Attributes:
+        window: side of the patch that is matched, in pixels.
+        levels: levels of the pyramid, in addition to the picture itself.
+        tolerance: how far from its start a point may end when it is followed forward and back, in pixels.
+        likeness: least correlation of a point's patch with that of the previous picture; less means another surface.
+        still: grey levels (of 255) by which a pixel of a patch may change while the patch counts as the same.
+    """
+
+    name: ClassVar[str] = "lucas-kanade"
+    least: ClassVar[dict[str, int]] = {"window": 3, "levels": 0}
+    window: int = 9
+    levels: int = 3
+    tolerance: float = 0.5
+    likeness: float = 0.8
+    still: float = 8.0
+
+    def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
+        grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
+        size = np.array(pictures.shape[2:0:-1], np.float32)
+        place = points.astype(np.float32) * size - 0.5
+        seen, patch = np.ones(len(points), bool), _patches(grey[0], place, self.window)
+        places, visible = [place], [seen]
+        for before, after in itertools.pairwise(grey):
+            stays = np.abs(_patches(after, place, self.window) - patch).max(1, initial=0.0) <= self.still
+            going = np.flatnonzero(seen & ~stays)
+            place, seen = place.copy(), stays
+            place[going], seen[going] = self._step(before, after, place[going])
+            now = _patches(after, place, self.window)
+            patch = np.where(seen[:, None], now, patch)
+            places.append(place)
+            visible.append(seen)
+        return ((np.stack(places, 1) + 0.5) / size).astype(np.float32), np.stack(visible, 1)
+
+    def _step(
+        self, before: UInt8[np.ndarray, "H W"], after: UInt8[np.ndarray, "H W"], start: Points
+    ) -> tuple[Points, Bool[np.ndarray, " P"]]:
+        """Moves points from one picture to the next; points that are lost (False) stay where they are."""
+        if not len(start):
+            return start, np.zeros(0, bool)
+        options: Any = {"winSize": (self.window, self.window), "maxLevel": self.levels}
+        lucas_kanade: Any = cv2.calcOpticalFlowPyrLK  # its stub knows no None
+        end, found, _ = lucas_kanade(before, after, start, None, **options)
+        back, found_back, _ = lucas_kanade(after, before, end, None, **options)
+        came_back = np.linalg.norm(back - start, axis=-1) <= self.tolerance
+        inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
+        kept = (found[:, 0] == 1) & (found_back[:, 0] == 1) & came_back & inside
+        kept[kept] = _likeness(before, after, start[kept], end[kept], self.window) >= self.likeness
+        return np.where(kept[:, None], end, start), kept
+
+
+def _likeness(before: np.ndarray, after: np.ndarray, start: Points, end: Points, side: int) -> np.ndarray:
+    """Correlates the patches around two sets of points; the result is about 1 where both patches are uniform."""
+    left, right = _patches(before, start, side), _patches(after, end, side)
+    left, right = left - left.mean(1, keepdims=True), right - right.mean(1, keepdims=True)
+    even = np.float32(side * side)  # a variance of one grey level is noise
+    scale = np.sqrt((left**2).sum(1) * (right**2).sum(1))
+    return ((left * right).sum(1) + even) / (scale + even)
+
+
+def _patches(picture: np.ndarray, points: Points, side: int) -> Float32[np.ndarray, "P side*side"]:
+    ticks = np.arange(side, dtype=np.float32) - (side - 1) / 2
+    x = points[:, 0, None, None] + ticks[None, None, :] + 0 * ticks[None, :, None]
+    y = points[:, 1, None, None] + ticks[None, :, None] + 0 * ticks[None, None, :]
+    flat = (len(points), side * side)
+    if not len(points):
+        return np.zeros(flat, np.float32)
+    maps = x.reshape(flat).astype(np.float32), y.reshape(flat).astype(np.float32)
+    return cv2.remap(picture.astype(np.float32), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth: Depths | None = None) -> Tracked:
+    """Follows points through all frames, ``span`` steps at a time.
+
+    Args:
+        frames: the pictures, at least one.
+        follow: the tracker's method.
+        grid: at the start of each span, each of grid × grid cells has at least one point.
+        span: steps from the first picture of a span to its last, which is the next span's first.
+        depth: depth maps to pass on to ``follow``.
+    """
+    count = len(frames)
+    points, visible = np.zeros((0, count, 2), np.float32), np.zeros((0, count), bool)
+    for start in range(0, max(count - 1, 1), span):
+        end = min(start + span + 1, count)
+        seeds = grid_points(grid, points[visible[:, start], start])
+        points = np.concatenate([points, np.repeat(seeds[:, None], count, 1)])
+        visible = np.concatenate([visible, np.zeros((len(seeds), count), bool)])
+        visible[len(visible) - len(seeds) :, start] = True
+        going = np.flatnonzero(visible[:, start])
+        maps = depth.read(range(start, end)) if depth else None
+        places, seen = follow(frames.read(range(start, end)), points[going, start], maps)
+        points[going, start:end] = places
+        points[going, end:] = places[:, -1:]
+        visible[going, start + 1 : end] = seen[:, 1:]
+    return Tracked(points, visible)
+
+
+def grid_points(grid: int, taken: Float[np.ndarray, "Q 2"]) -> Points:
+    """Returns the centres of those of grid × grid cells that contain none of the points ``taken``."""
+    ticks = (np.arange(grid, dtype=np.float32) + 0.5) / grid
+    middles = np.stack(np.meshgrid(ticks, ticks), -1)  # row, column, (x, y)
+    column, row = np.clip((taken * grid).astype(int), 0, grid - 1).T
+    free = np.ones((grid, grid), bool)
+    free[row, column] = False
+    return middles[free]
+
+
+def window_tracks(tracked: Tracked, frames: Int[np.ndarray, " T"] | Sequence[int], count: int) -> Tracked:
+    """Returns ``count`` tracks of a window of these frames, in the form of :class:`rsjax.clip.Clip`.
+
+    Only points that are visible in the window's first frame are used. If there are more than ``count``, half of the
+    tracks are the points that move most, and the others are spread evenly over the rest; if there are fewer, points are
+    repeated.
+
+    Raises:
+        ValueError: no point is visible in the first frame; this cannot happen within one tracked shot.
+    """
+    frames = np.asarray(frames)
+    first = np.flatnonzero(tracked.visible[:, frames[0]])
+    if not len(first):
+        raise ValueError(f"no point is seen in frame {frames[0]}")
+    points, visible = tracked.points[first][:, frames], tracked.visible[first][:, frames]
+    steps = np.linalg.norm(np.diff(points, axis=1), axis=-1) * (visible[:, 1:] & visible[:, :-1])
+    if len(first) > count:
+        order = np.argsort(-steps.sum(1), kind="stable")
+        most, rest = order[: count // 2], np.sort(order[count // 2 :])
+        spread = rest[np.linspace(0, len(rest) - 1, count - len(most)).round().astype(int)]
+        chosen = np.concatenate([most, spread])
+    else:
+        chosen = np.arange(count) % len(first)
+    return Tracked(points[chosen], visible[chosen])

@@ -1,0 +1,229 @@
+"""Reads a folder of videos with tables of actions, for your own data.
+
+Each episode has a folder, whose name is the episode's id::
+
+    PATH/dataset.json             optional: {"task": "fold the towel", "fps": 30, "after": false, "kind": "delta", …}
+    PATH/EPISODE/CAMERA.mp4       one per camera; or a folder CAMERA/ of pictures 000000.png …
+    PATH/EPISODE/CAMERA.depth/    optional: 16-bit PNG depth maps in millimetres, one per frame
+    PATH/EPISODE/actions.csv      or .parquet or .npy: a row per frame
+    PATH/EPISODE/episode.json     optional: {"task": …, "fps": …, "segments": [{"start", "end", "text", "skill"}]}
+
+or, with one camera, flat: ``PATH/NAME.mp4``, ``PATH/NAME.csv`` and, optionally, ``PATH/NAME.json``.
+
+The columns of a table have names: ``timestamp`` (seconds), ``state…``, and ``action…``; if none begins with ``action``,
+all others are the action, except those that count rows or time (``time``, ``frame``, ``index`` …). A ``.npy`` array
+(N, A) contains only actions. ``after`` says whether each frame was recorded after its row's action. Otherwise a row's
+action leads into the next frame, and the last row may be missing. ``fps`` is needed for pictures without timestamps;
+videos have their own rate.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float, Float32
+
+from rsjax.clip import words_of
+from rsjax.files import safe_id
+from rsjax.tools.ingest.actions import Kind, align_actions, check_layout
+from rsjax.tools.ingest.dimensions import layout_of
+from rsjax.tools.ingest.episode import (
+    MAX_FPS,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    Frames,
+    SourceError,
+    checked,
+    fingerprint,
+)
+from rsjax.tools.ingest.formats import folder_files as parts
+from rsjax.tools.ingest.formats.files import exists, inside, location_of, read_json, seconds, subfolders
+from rsjax.tools.ingest.formats.options import from_json
+from rsjax.tools.ingest.video import VideoFrames, scan
+
+
+@dataclass(frozen=True)
+class FolderConfig:
+    """What ``dataset.json`` and the options say about all episodes.
+
+    Attributes:
+        task: the task of episodes that name none; None (null in JSON) means no task.
+        fps: frames per second; 0: as the videos or the timestamps say.
+        after: whether each frame was recorded after the action of its row.
+        action: the columns that are the action, in order; none: by their names.
+        kind: see :class:`rsjax.tools.ingest.actions.Layout`; None: not declared, so rows of actions are not combined.
+        held: likewise.
+        quaternions: likewise.
+    """
+
+    task: str | None = ""
+    fps: float = 0.0
+    after: bool = False
+    action: tuple[str, ...] = ()
+    kind: Kind | None = None
+    held: tuple[int, ...] | None = None
+    quaternions: tuple[int, ...] = ()
+
+
+def open_source(
+    path: Path,
+    *,
+    task: str | None = None,
+    fps: float | None = None,
+    after: bool | None = None,
+    action: Sequence[str] | None = None,
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+    quaternions: Sequence[int] | None = None,
+) -> "Folder":
+    """Opens the data set at ``path``; options as in :class:`FolderConfig`, None: as ``dataset.json`` says.
+
+    Raises:
+        SourceError: ``dataset.json`` or an option is wrong, or ``path`` is not a folder.
+    """
+    if not path.is_dir():
+        raise SourceError(f"{path}: not a folder; give the one that contains the episodes")
+    file = path / "dataset.json"
+    values = read_json(file) if exists(file) else {}
+    from_json(FolderConfig, values, file)
+    options: dict[str, object] = {"task": task, "fps": fps, "after": after, "action": action}
+    options |= {"kind": kind, "held": held, "quaternions": quaternions}
+    config = from_json(FolderConfig, values | {k: v for k, v in options.items() if v is not None}, path)
+    if not 0 <= config.fps <= MAX_FPS:
+        raise SourceError(f"{path}: fps is {config.fps!r}, should be a number from 0 to {MAX_FPS:g}; mend it")
+    return Folder(path, config)
+
+
+class Folder:
+    """A folder of videos, as :class:`rsjax.tools.ingest.episode.EpisodeSource`; :func:`open_source` builds it."""
+
+    name = "folder"
+
+    def __init__(self, root: Path, config: FolderConfig) -> None:
+        self._root, self._config = root, config
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists folders first, then the files that make up flat episodes, each by name."""
+        folders, flat = subfolders(self._root), 0
+        for folder in folders:
+            yield self._ref(folder.name, flat=False)
+        by_name: dict[str, list[Path]] = {}
+        for path in self._root.iterdir():
+            if path.suffix.lower() in (*parts.VIDEOS, *parts.TABLES, ".json"):
+                by_name.setdefault(path.stem, []).append(path)
+        for name, files in sorted(by_name.items()):
+            if any(path.suffix.lower() != ".json" for path in files):
+                flat += 1
+                yield self._ref(name, flat=True, files=sorted(files))
+        if not folders and not flat:
+            raise SourceError(f"{self._root}: has no episode: no folder, video or table; give the one that does")
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one episode."""
+        location = location_of(ref)
+        place = inside(self._root, location["name"])
+        try:
+            return self._read(ref, location["name"], location["flat"], place)
+        except OSError as error:
+            raise EpisodeError.at(place, f"cannot be read ({error.strerror})", "check its permissions") from error
+
+    def _read(self, ref: EpisodeRef, name: str, flat: bool, place: Path) -> Episode:
+        config, files = self._config, self._files(name, flat)
+        cameras, depth = parts.find_cameras(files, flat)
+        table_path = parts.find_table(files, place)
+        if not cameras:
+            problem = f"has no video ({', '.join(parts.VIDEOS)}) and no folder of pictures"
+            raise EpisodeError.at(place, problem, "add one or leave it out")
+        count = len(next(iter(cameras.values())))
+        json_path = place.with_name(f"{name}.json") if flat else place / "episode.json"
+        task, own_fps, segments = parts.read_description(json_path, count)
+        table, fps = parts.read_table(table_path), own_fps or config.fps
+        chosen, others = parts.choose_columns(table, config.action, table_path)
+        actions, names = parts.columns(table, chosen, table_path)
+        times = _times(table, cameras, fps, count, place)
+        if len(times) != count:
+            problem = f"{len(times)} timestamps for {count} pictures"
+            raise EpisodeError.at(table_path, problem, "one row per frame", "length")
+        actions = _actions(actions, count, config.after, table_path)
+        measured = [column for column in table.column_names if column.startswith("state")]
+        states = parts.columns(table, measured, table_path)[0] if measured else None
+        layout = layout_of(actions, config.kind, config.held, config.quaternions, names, states)
+        check_layout(layout, actions.shape[1], table_path)
+        episode = Episode(
+            id=ref.id,
+            fingerprint=ref.fingerprint,
+            task=task or words_of(config.task),
+            fps=fps or _rate(times),
+            timestamps=times - times[0],
+            actions=actions,
+            states=states,
+            cameras=cameras,
+            depth=depth,
+            segments=segments,
+            meta={
+                "actions": layout.to_json(),
+                "action_names": names,
+                "notes": {"not_taken_for_actions": others} if others else {},
+            },
+        )
+        return checked(episode, table_path)
+
+    def _files(self, name: str, flat: bool) -> list[Path]:
+        """Returns the files of an episode, judged by their names."""
+        try:
+            if flat:
+                return sorted(path for path in self._root.iterdir() if path.stem == name and not path.is_dir())
+            return sorted(path for path in (self._root / name).iterdir() if not path.name.startswith("."))
+        except OSError as error:
+            raise EpisodeError.at(self._root / name, f"cannot be listed ({error.strerror})", "leave it out") from error
+
+    def _ref(self, name: str, flat: bool, files: Sequence[Path] | None = None) -> EpisodeRef:
+        sizes = []
+        try:
+            files = self._files(name, flat) if files is None else files
+            for folder in filter(Path.is_dir, files):  # pictures are too many to open
+                sizes += sorted((folder.name, path.name, path.stat().st_size) for path in folder.iterdir())
+        except (EpisodeError, OSError):
+            files = []  # reading the episode reports why
+        config = dataclasses.asdict(self._config)
+        identity = safe_id(f"{name}.flat" if flat and (self._root / name).is_dir() else name)
+        return EpisodeRef(identity, fingerprint(files, name, sizes, config), {"name": name, "flat": flat})
+
+
+def _times(
+    table: pa.Table, cameras: Mapping[str, Frames], fps: float, count: int, place: Path
+) -> Float[np.ndarray, " N"]:
+    """Returns times from the table, else by the given rate, else from the videos, whose clocks must agree."""
+    if "timestamp" in table.column_names:
+        return seconds(table, "timestamp", place)
+    if fps:
+        return np.arange(count) / fps
+    clocks = {name: scan(f.path).times() for name, f in cameras.items() if isinstance(f, VideoFrames)}
+    for name, times in clocks.items():
+        first, own = next(iter(clocks.items()))
+        apart = np.abs((times - times[0]) - (own - own[0])) if len(times) == len(own) else np.zeros(1)
+        if apart.max() > np.diff(own).max(initial=1e-3):
+            problem = f"its frame {int(apart.argmax())} is shown {apart.max():.2g} s away from that of {first}"
+            raise EpisodeError.at(place / name, problem, "give timestamps in the table, or fps", "time")
+    if clocks:
+        return next(iter(clocks.values()))
+    raise EpisodeError(f"{place}: how fast are its pictures? Give fps in dataset.json or timestamps")
+
+
+def _actions(rows: Float32[np.ndarray, "N A"], count: int, after: bool, path: Path) -> Float32[np.ndarray, "N A"]:
+    """Aligns the rows of the table; the last row may be missing if it leads into no frame."""
+    if not after and len(rows) == count - 1:
+        rows = np.concatenate([rows, rows[-1:]])
+    if len(rows) != count:
+        raise EpisodeError.at(path, f"{len(rows)} rows of actions for {count} pictures", "one row per frame", "length")
+    return align_actions(rows, after)
+
+
+def _rate(times: Float[np.ndarray, " N"]) -> float:
+    """Returns frames per second by the median interval; 1 if time stands still or there is one frame."""
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    return 1 / interval if interval > 0 else 1.0

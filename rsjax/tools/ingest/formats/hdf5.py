@@ -1,0 +1,121 @@
+"""Reads arrays of HDF5 files as pictures, depth maps and rows of numbers; errors name file and data set."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.tools.ingest.episode import LEAVE_OUT, MAX_PIXELS, EpisodeError, data_file, reason
+from rsjax.tools.ingest.formats.files import MAX_CELLS
+
+_MOST_CHUNK = 2**30  # bytes of a chunk, which HDF5 unpacks as a whole however few of them are read
+Stored = Literal["upright", "bottom first", "half turn"]  # how a file stores its pictures
+
+
+@contextmanager
+def open_file(path: Path) -> Iterator[h5py.File]:
+    """Opens a file for reading. Damage that shows only when a part is read also becomes an error of the file.
+
+    Raises:
+        EpisodeError: the file is missing, truncated or not HDF5.
+    """
+    try:
+        data_file(path)
+    except OSError as error:
+        raise EpisodeError.at(path, reason(error)) from error
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # how h5py reports damage
+        raise EpisodeError.at(path, f"not a readable HDF5 file ({' '.join(str(error).split())[:200]})") from error
+
+
+def member(group: Any, key: str, path: Path) -> Any:
+    """Returns the member ``key`` of a group; None if there is none. HDF5 links into other files are refused.
+
+    Raises:
+        EpisodeError: the member lies in another file, or its chunks are too large to be unpacked.
+    """
+    entry = group.get(key)
+    if entry is None:
+        return None
+    name = f"{group.name.rstrip('/')}/{key}"
+    elsewhere = entry.file.filename != group.file.filename
+    if elsewhere or (isinstance(entry, h5py.Dataset) and (entry.external or entry.is_virtual)):
+        raise EpisodeError.at(path, f"{name} lies in another file", f"copy it into this one or {LEAVE_OUT}")
+    chunks = entry.chunks if isinstance(entry, h5py.Dataset) else None
+    if chunks and (size := math.prod(chunks) * entry.dtype.itemsize) > _MOST_CHUNK:
+        raise EpisodeError.at(path, f"{name} has chunks of {size} bytes")
+    return entry
+
+
+def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
+    """Reads a data set of numbers, one row for each frame.
+
+    Raises:
+        EpisodeError: there is no such data set, or it contains something else.
+    """
+    data = member(group, key, path)
+    name = f"{group.name}/{key}"
+    if not isinstance(data, h5py.Dataset):
+        raise EpisodeError.at(path, f"has no {name}", LEAVE_OUT)
+    if 0 in data.shape[1:] or data.dtype.kind not in "fiu" or data.ndim not in (1, 2) or data.size > MAX_CELLS:
+        raise EpisodeError.at(path, f"{name} is {data.dtype} {data.shape}, should be numbers (N, n)")
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite, which is refused later
+        values = data[()].astype(np.float32)
+    return values[:, None] if values.ndim == 1 else values
+
+
+class H5Frames:
+    """Pictures in an HDF5 file, as :class:`rsjax.tools.ingest.episode.Frames`, or depth maps, as ``Depths``.
+
+    Args:
+        path: the file.
+        key: key of the data set: pictures, uint8 [N, H, W, 3]; depth maps, floats [N, H, W] or [N, H, W, 1] in metres.
+        stored: how the file stores them: upright, with the bottom row first, or rotated by half a turn.
+        depth: whether they are depth maps.
+
+    Raises:
+        EpisodeError: the data set has another shape or type.
+    """
+
+    def __init__(self, path: Path, key: str, stored: Stored = "upright", depth: bool = False) -> None:
+        self._path, self._key, self._stored, self._depth = path, key, stored, depth
+        with open_file(path) as file:
+            data = member(file, key, path)
+            if not isinstance(data, h5py.Dataset) or data.shape is None:
+                raise EpisodeError.at(path, f"{key} is no array", f"render it again or {LEAVE_OUT}")
+            shape, kind = data.shape, data.dtype
+        if depth:
+            fits, expected = kind.kind == "f" and len(shape) in (3, 4) and shape[3:] in ((), (1,)), "floats (N, H, W)"
+        else:
+            fits, expected = kind == np.uint8 and len(shape) == 4 and shape[3] == 3, "uint8 (N, H, W, 3)"
+        if not fits or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
+            raise EpisodeError.at(path, f"{key} is {kind} {shape}, should be {expected}", "render it again")
+        self._count = int(shape[0])
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, indices: Sequence[int]) -> np.ndarray:
+        """Returns these pictures or maps, upright; :class:`EpisodeError` if the file is damaged."""
+        wanted, order = np.unique(np.asarray(indices, np.int64), return_inverse=True)  # h5py needs increasing indices
+        with open_file(self._path) as file:
+            pictures = file[self._key][wanted][order]
+        if self._depth:
+            pictures = pictures.reshape(pictures.shape[:3]).astype(np.float32)
+        if self._stored == "upright":
+            return pictures
+        columns = slice(None, None, -1 if self._stored == "half turn" else 1)
+        return np.ascontiguousarray(pictures[:, ::-1, columns])
+
+
+def attribute(group: Any, name: str) -> Any:
+    """Returns an attribute, with text decoded; None if there is none."""
+    value = group.attrs.get(name)
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value

@@ -1,0 +1,258 @@
+"""Reads LeRobotDataset v2.0, v2.1 and v3.0 without the ``lerobot`` package: tables by pyarrow, videos by PyAV.
+
+A row's action is sent at that row's frame, so it leads into the next frame. v2 has a table for each episode, and a
+video for each episode and camera; in v3 many episodes share a file, and an episode's pictures are looked up by time.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float
+
+from rsjax.clip import words_of
+from rsjax.files import safe_id
+from rsjax.tools.ingest.actions import Kind, align_actions, check_layout
+from rsjax.tools.ingest.dimensions import Declared, flat_names, layout_of
+from rsjax.tools.ingest.episode import (
+    FETCH_AGAIN,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    Frames,
+    SourceError,
+    checked,
+    fingerprint,
+    runs,
+)
+from rsjax.tools.ingest.formats.files import (
+    broken,
+    fill,
+    inside,
+    integers,
+    json_lines,
+    location_of,
+    matrix,
+    media,
+    parquet_rows,
+    seconds,
+)
+from rsjax.tools.ingest.formats.lerobot_info import Info, read_info
+from rsjax.tools.ingest.formats.lerobot_tables import TablePictures, read_rows
+from rsjax.tools.ingest.video import at_times
+
+TOLERANCE = 1e-4  # seconds, LeRobot's own tolerance
+_PLACES = ("chunk_index", "file_index")
+_BEGINS = "from_timestamp"
+
+
+def open_source(
+    path: Path,
+    *,
+    action: str = "action",
+    state: str = "observation.state",
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+    quaternions: Sequence[int] = (),
+) -> "LeRobot":
+    """Opens the data set at ``path``, the folder that contains ``meta``.
+
+    Args:
+        action: the column of actions.
+        state: the column of states; if it is missing, episodes have none.
+        kind: what the actions are, which the format does not say; see :class:`rsjax.tools.ingest.actions.Layout`. None:
+            absolute, unless the names of the dimensions contain ``delta``; then the kind has to be declared.
+        held: likewise.
+        quaternions: likewise.
+
+    Raises:
+        SourceError: ``meta`` cannot be read, or there is no such column of actions.
+    """
+    info = read_info(path / "meta" / "info.json")
+    if action not in info.features:
+        raise SourceError(f"{path}: has no column {action!r}; choose among {', '.join(info.features)}")
+    tasks = _tasks(path / "meta", info.shared)
+    names = str(info.features[action].get("names")).lower()
+    stay = None if held is None else tuple(held)
+    declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
+    return LeRobot(path, info, tasks, declared, action, state)
+
+
+class LeRobot:
+    """A LeRobotDataset, as :class:`rsjax.tools.ingest.episode.EpisodeSource`; :func:`open_source` builds it."""
+
+    name = "lerobot"
+
+    def __init__(
+        self, root: Path, info: Info, tasks: dict[int, str], declared: Declared, action: str, state: str
+    ) -> None:
+        self._root, self._info, self._tasks, self._declared = root, info, tasks, declared
+        self._action, self._state = action, state
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
+        seen: set[int] = set()
+        listed = 0
+        for where, row in self._entries():
+            listed += 1
+            try:
+                if isinstance(row, Exception):
+                    raise row
+                number = int(row["episode_index"])
+                if number in seen:
+                    raise ValueError(f"episode {number} a second time")
+                seen.add(number)
+                yield self._ref(number, row)
+            except EpisodeError as error:
+                yield broken(f"episode_{number:06d}", str(error))
+            except SourceError as error:
+                yield broken(safe_id(where), str(error))
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
+                identity = where.rpartition("/")[2].replace(" ", "-").replace(":", "-")
+                yield broken(identity, f"{where}: field missing or wrong ({error}); {FETCH_AGAIN}")
+        if listed < self._info.episodes:
+            problem = f"total_episodes is {self._info.episodes}, meta lists only {listed}"
+            yield broken("meta-info", f"{self._root}/meta/info.json: {problem}; {FETCH_AGAIN}")
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one episode; its pictures are not decoded, but their times are checked."""
+        location = location_of(ref)
+        names = ("timestamp", "frame_index", "episode_index", "index", "task_index", self._action, self._state)
+        path, table = read_rows(self._root, self._info.data_path, location, names)
+        times = seconds(table, "timestamp", path)
+        notes = self._check_rows(table, times, location, path)
+        actions = matrix(table, self._action, path)
+        dimensions = flat_names(self._info.features[self._action].get("names"), actions.shape[1])
+        states = matrix(table, self._state, path) if self._state in table.column_names else None
+        layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
+        check_layout(layout, actions.shape[1], path)
+        tasks = self._task_of_rows(table, path)
+        episode = Episode(
+            id=ref.id,
+            fingerprint=ref.fingerprint,
+            task=tasks[0] if len(set(tasks)) == 1 else "; ".join(location["tasks"]),
+            fps=self._info.fps,
+            timestamps=times - times[0],
+            actions=align_actions(actions),
+            states=states,
+            cameras=self._cameras(location, times, path),
+            segments=tuple(runs(tasks)) if len(set(tasks)) > 1 else (),
+            meta={"actions": layout.to_json(), "action_names": dimensions} | ({"notes": notes} if notes else {}),
+        )
+        return checked(episode, path)
+
+    def _entries(self) -> Iterator[tuple[str, Any]]:
+        """Yields where each episode's metadata are, and the metadata or the error if they cannot be read."""
+        meta = self._root / "meta"
+        if not self._info.shared:
+            path = meta / "episodes.jsonl"
+            yield from ((f"{path}: line {number}", row) for number, row in json_lines(path))
+            return
+        columns = ["episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"]
+        columns += [f"data/{name}" for name in _PLACES]
+        columns += [f"videos/{key}/{name}" for key in self._info.of_type("video") for name in (*_PLACES, _BEGINS)]
+        files = sorted((meta / "episodes").glob("*/*.parquet"))
+        if not files:
+            raise SourceError(f"{meta / 'episodes'}: has no Parquet files; fetch the data set again")
+        for path in files:
+            try:
+                yield from ((f"{path}: row {number}", row) for number, row in enumerate(parquet_rows(path, columns)))
+            except SourceError as error:  # the episodes of other files can still be read
+                yield str(path.relative_to(meta)), error
+
+    def _ref(self, number: int, row: dict[str, Any]) -> EpisodeRef:
+        info, length = self._info, int(row["length"])
+        if number < 0 or length < 0:
+            raise ValueError(f"episode_index {number}, length {length}")
+
+        def fields(prefix: str) -> dict[str, int]:
+            if not info.shared:
+                return {"episode_chunk": number // info.chunks_size, "episode_index": number}
+            return {name: int(row[f"{prefix}/{name}"]) for name in _PLACES}
+
+        location: dict[str, Any] = {"episode": number, "length": length}
+        location["tasks"] = [text for task in row.get("tasks") or () if (text := words_of(task))]
+        location["data"] = fill(info.data_path, **fields("data"))
+        if info.shared:
+            location["rows"] = [int(row["dataset_from_index"]), int(row["dataset_to_index"])]
+        location["videos"] = {
+            key: {
+                "path": fill(info.video_path, video_key=key, **fields(f"videos/{key}")),
+                "from": float(row[f"videos/{key}/{_BEGINS}"]) if info.shared else 0.0,
+            }
+            for key in info.of_type("video")
+        }
+        paths = [location["data"], *(video["path"] for video in location["videos"].values())]
+        mark = fingerprint([inside(self._root, path) for path in paths], location, self._declared)
+        return EpisodeRef(f"episode_{number:06d}", mark, location)
+
+    def _check_rows(
+        self, table: pa.Table, times: Float[np.ndarray, " N"], location: dict[str, Any], path: Path
+    ) -> dict[str, str]:
+        """Raises :class:`EpisodeError` if the rows are not this episode's frames, in order and evenly spaced.
+
+        Returns:
+            A note if the metadata state another range of rows; only this check reads that range.
+        """
+        count, number = len(times), location["episode"]
+        if count != location["length"]:
+            problem = f"{count} rows of episode {number}, metadata say {location['length']}"
+            raise EpisodeError.at(path, problem, kind="length")
+        expected = {"episode_index": np.full(count, number), "frame_index": np.arange(count)}
+        notes = {}
+        if "rows" in location:
+            first = int(integers(table, "index", path)[0])
+            expected["index"] = np.arange(first, first + count)
+            if location["rows"] != [first, first + count]:
+                says = " … ".join(map(str, location["rows"]))
+                notes["range"] = f"rows {first} … {first + count}, where the metadata say {says}"
+        for name, values in expected.items():
+            column = integers(table, name, path)
+            if (wrong := np.flatnonzero(column != values)).size:
+                row = wrong[0]
+                raise EpisodeError.at(path, f"{name} of row {row} is {column[row]}, should be {values[row]}")
+        away = np.abs(np.diff(times) - 1 / self._info.fps)
+        if (uneven := np.flatnonzero(~(away <= _tolerance(times)))).size:
+            row = uneven[0]
+            step = f"{times[row + 1] - times[row]:.4f} s after the one before, at {self._info.fps:g} fps"
+            raise EpisodeError.at(path, f"timestamp of row {row + 1} comes {step}", kind="time")
+        return notes
+
+    def _task_of_rows(self, table: pa.Table, path: Path) -> list[str]:
+        if "task_index" not in table.column_names or not self._tasks:
+            return []
+        indices = integers(table, "task_index", path).tolist()
+        if unknown := set(indices) - set(self._tasks):
+            raise EpisodeError.at(path, f"task_index {min(unknown)} is not among the data set's tasks")
+        return [self._tasks[index] for index in indices]
+
+    def _cameras(self, location: dict[str, Any], times: Float[np.ndarray, " N"], path: Path) -> dict[str, Frames]:
+        cameras: dict[str, Frames] = {}
+        for key, video in location["videos"].items():
+            file = media(inside(self._root, video["path"]))
+            cameras[_camera(key)] = at_times(file, times + video["from"], _tolerance(times))
+        for key in self._info.of_type("image"):
+            cameras[_camera(key)] = TablePictures(path, key, location)
+        return cameras
+
+
+def _tasks(meta: Path, shared: bool) -> dict[int, str]:
+    try:
+        if not shared:
+            return {int(row["task_index"]): words_of(row["task"]) for _, row in json_lines(meta / "tasks.jsonl")}
+        names = ("task_index", "task", "__index_level_0__")  # the last is pandas's name for an unnamed index
+        rows = parquet_rows(meta / "tasks.parquet", names)
+        return {int(row["task_index"]): words_of(row.get("task", row.get("__index_level_0__"))) for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{meta}: its table of tasks is damaged ({error}); fetch the file again") from error
+
+
+def _tolerance(times: Float[np.ndarray, " N"]) -> float:
+    """Returns the largest error of a time in seconds: LeRobot's tolerance plus the rounding of float32 times."""
+    return TOLERANCE + float(np.spacing(np.float32(np.abs(times).max(initial=0))))
+
+
+def _camera(key: str) -> str:
+    return key.removeprefix("observation.images.").removeprefix("observation.")

@@ -1,0 +1,279 @@
+"""Reads RLDS data sets in TFRecord files (Bridge and others of Open X-Embodiment), one episode per record.
+
+A folder contains ``{name}-{split}.tfrecord-00000-of-NNNNN`` and ``features.json``. An episode is flattened:
+``steps/observation/image_0`` is a list of T encoded pictures, ``steps/action`` is T·7 numbers one after the other. The
+meaning of the features differs between data sets: a :class:`KeyMap` states it, and is checked against
+``features.json``. In RLDS the action of a step was done *after* its observation.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.errors import did_you_mean
+from rsjax.files import safe_id
+from rsjax.progress import note
+from rsjax.tools.ingest.actions import Kind, align_actions, check_layout
+from rsjax.tools.ingest.dimensions import layout_of
+from rsjax.tools.ingest.episode import (
+    LEAVE_OUT,
+    MAX_FPS,
+    Depths,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    runs,
+)
+from rsjax.tools.ingest.formats.files import broken, exists, near, read_json
+from rsjax.tools.ingest.formats.keymap import KeyMap, key_map
+from rsjax.tools.ingest.formats.rlds_features import check_keys, propose, step_features
+from rsjax.tools.ingest.formats.tfrecord import Example, read_record, record_refs
+from rsjax.tools.ingest.pictures import ArrayFrames, EncodedFrames
+
+_SHARD = re.compile(r"(?P<name>.+)-(?P<split>[^-]+)\.tfrecord-(?P<number>\d+)-of-(?P<shards>\d+)")
+
+
+def open_source(
+    path: Path,
+    keys: str = "",
+    split: str = "",
+    fps: float = 0.0,
+    kind: Kind | None = None,
+    held: Sequence[int] | None = None,
+) -> "RldsSource":
+    """Opens an RLDS data set.
+
+    Args:
+        path: the folder with the shards, one of its two parents (``name/1.0.0/``), or a single shard.
+        keys: a named key map, the path of one as JSON (the fields of :class:`KeyMap`), or ``auto``: one proposed from
+            ``features.json``, which is printed; "": the one for the data set's name.
+        split: the only split to read; "": all.
+        fps: steps per second, in place of the key map's; 0: the key map's.
+        kind: kind of the actions, likewise; None: the key map's.
+        held: likewise.
+
+    Raises:
+        SourceError: there are no shards, or the key map does not fit ``features.json``.
+    """
+    shards = _shards(path)
+    folder = shards[0].parent
+    info = _read_object(folder / "dataset_info.json")
+    if not 0 <= fps <= MAX_FPS:
+        raise SourceError(f"rlds: option fps is {fps}; it must be above 0 and at most {MAX_FPS:g}")
+    described = folder / "features.json"
+    features = step_features(described, _read_object(described))
+    if keys == "auto":
+        keymap = propose(described, features, fps)
+    else:
+        keymap = key_map(keys, info.get("name") or _split_name(shards[0])[0], folder)
+    keymap = replace(
+        keymap,
+        fps=fps or keymap.fps,
+        kind=kind or keymap.kind,
+        held=keymap.held if held is None else tuple(held),
+    )
+    if keys == "auto":
+        cure = "mend what is wrong in it as a file of your own (--option keys=FILE.json)"
+        note(f"{folder}: key map {json.dumps(keymap.to_json())}; {cure}")
+    check_keys(keymap, described, features)
+    shapes = {key: features[key].shape for key in keymap.depth.values() if key in features}
+    sides = {key: shape[:2] for key, shape in shapes.items() if shape and len(shape) > 1}
+    chosen = [shard.name for shard in shards if not split or _split_name(shard)[1] == split]
+    if not chosen:
+        splits = sorted({_split_name(shard)[1] for shard in shards})
+        raise SourceError(f"{folder}: no split {split!r}{did_you_mean(split, splits)}; it has {', '.join(splits)}")
+    return RldsSource(folder, tuple(chosen), keymap, path.is_file(), sides)
+
+
+@dataclass(frozen=True)
+class RldsSource:
+    """See :class:`rsjax.tools.ingest.episode.EpisodeSource`.
+
+    Attributes:
+        folder: where the shards are.
+        shards: the shards' file names, in order.
+        keys: the meaning of the features.
+        single: whether the user named one shard, not a folder, so that no other shards are missing.
+        sides: height and width of depth maps, by feature.
+    """
+
+    name = "rlds"
+    folder: Path
+    shards: tuple[str, ...]
+    keys: KeyMap
+    single: bool = False
+    sides: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists every record of every shard; one unreadable entry stands for all that a damaged shard lacks."""
+        expected = _expected(self.folder)
+        for shard in self.shards:
+            match = _SHARD.fullmatch(shard)
+            stem = f"{match['split']}-{int(match['number']):05d}" if match else safe_id(shard)
+            counts = expected.get(shard, 0), "dataset_info.json names"
+            settings = {n: v for n, v in asdict(self.keys).items() if self.keys.depth or not n.startswith("depth")}
+            yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, settings)
+        if not self.single:
+            yield from self._missing_shards()
+
+    def _missing_shards(self) -> Iterator[EpisodeRef]:
+        """Yields a reference for each split that lacks shards, judged by the names of its other shards."""
+        numbers: dict[tuple[str, str, int], set[int]] = {}
+        for match in filter(None, map(_SHARD.fullmatch, self.shards)):
+            numbers.setdefault((match["name"], match["split"], int(match["shards"])), set()).add(int(match["number"]))
+        for (_, split, total), present in numbers.items():
+            if missing := total - len(present):
+                first = next(number for number in range(total) if number not in present)
+                problem = f"{missing} of the {total} shards of {split} are missing, the first is {first:05d}"
+                message = f"{self.folder}: {problem}; fetch them or give one shard alone"
+                yield broken(safe_id(f"{split}-missing"), message)
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one record. Cameras with a placeholder of one colour are left out; ``meta["blank"]`` names them."""
+        example = read_record(self.folder, ref)
+        cameras, blank = _cameras(example, self.keys)
+        if not cameras:
+            raise EpisodeError.at(example.where, f"{', '.join(blank)} hold placeholders of one colour", LEAVE_OUT)
+        count = len(next(iter(cameras.values())))
+        keys = self.keys
+        rows, names = _joined(example, keys.action, count)
+        actions = align_actions(rows, keys.after)
+        states = _joined(example, keys.state, count)[0] if keys.state else None
+        layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, names, states)
+        check_layout(layout, actions.shape[1], f"{example.where}: key map")
+        texts = _texts(example, self.keys.task, count)
+        segments = [segment for segment in runs(texts) if segment.text]
+        episode = Episode(
+            id=ref.id,
+            fingerprint=ref.fingerprint,
+            task=next((text for text in texts if text), ""),
+            fps=self.keys.fps,
+            timestamps=np.arange(count) / self.keys.fps,
+            actions=actions,
+            states=states,
+            cameras=cameras,
+            depth={name: self._depth(example, key) for name, key in self.keys.depth.items() if name in cameras},
+            segments=tuple(segments) if len({segment.text for segment in segments}) > 1 else (),
+            meta={
+                "source": "rlds",
+                "file": ref.location["file"],
+                "actions": layout.to_json(),
+                "action_names": names,
+                "blank": blank,
+                "episode": _metadata(example),
+            },
+        )
+        return checked(episode, example.where)
+
+    def _depth(self, example: Example, key: str) -> Depths:
+        """Returns the depth maps of a feature: encoded pictures, or numbers one after the other."""
+        name, scale = f"steps/{key}", self.keys.depth_scale
+        if example.is_bytes(name):
+            return EncodedFrames(example.blobs(name), f"{example.where}: {name}", scale)
+        height, width = self.sides.get(key, (0, 0))
+        if height <= 0 or width <= 0:
+            raise EpisodeError.at(example.where, f"{name} is of numbers, and features.json has no shape", LEAVE_OUT)
+        values, floats = example.flat(name)
+        if values.size % (height * width):
+            raise EpisodeError.at(example.where, f"{name} has {values.size} values, maps have {height} × {width}")
+        maps = values.reshape(-1, height, width) * np.float32(1 if floats else scale)
+        return ArrayFrames(np.nan_to_num(maps, nan=0, posinf=0, neginf=0))
+
+
+def _cameras(example: Example, keys: KeyMap) -> tuple[dict[str, EncodedFrames], list[str]]:
+    """Returns the cameras by name, and the names of placeholders, whose pictures are all the same and of one colour.
+
+    BridgeData has flags for placeholders (``has_image_0``), but files exist in which all flags are false.
+    """
+    frames = {
+        name: EncodedFrames(example.blobs(f"steps/{key}"), f"{example.where}: steps/{key}")
+        for name, key in keys.cameras.items()
+    }
+    blank = [
+        name
+        for name, pictures in frames.items()
+        if len(set(pictures.payloads)) == 1 and not np.ptp(pictures.read([0]), axis=(0, 1, 2)).any()
+    ]
+    return {name: pictures for name, pictures in frames.items() if name not in blank}, blank
+
+
+def _joined(example: Example, keys: Sequence[str], count: int) -> tuple[Float32[np.ndarray, "N n"], list[str]]:
+    """Returns these features side by side, and a name for each dimension."""
+    parts = [example.numbers(f"steps/{key}", count) for key in keys]
+    widths = [part.shape[1] for part in parts]
+    names = [f"{key}[{n}]" if width > 1 else key for key, width in zip(keys, widths, strict=True) for n in range(width)]
+    return np.concatenate(parts, axis=1), names
+
+
+def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
+    """Returns the text of each step, from the first of these features that is not empty."""
+    for key in (f"steps/{key}" for key in keys if f"steps/{key}" in example):
+        if example.is_bytes(key):
+            rows = example.blobs(key)
+        else:  # each text is a row of numbers, padded with zeros
+            codes = np.nan_to_num(example.numbers(key, count))
+            rows = [bytes(int(code) & 0xFF for code in row if code) for row in codes]
+        texts = [row.decode("utf-8", "replace").strip() for row in rows]
+        if any(texts):
+            return texts
+    return []
+
+
+def _metadata(example: Example) -> dict[str, Any]:
+    """Returns those features of the episode itself that are a single text or number."""
+    prefix, values = "episode_metadata/", {}
+    for name in example.names():
+        if name.startswith(prefix) and len(value := example.plain(name)) == 1:
+            values[name.removeprefix(prefix)] = value[0]
+    return values
+
+
+def _shards(path: Path) -> list[Path]:
+    """Returns the shards at a path, all of one folder."""
+    if path.is_file():
+        return [path]
+    shards = near(path, "*.tfrecord*")
+    folders = sorted({shard.parent for shard in shards})
+    if not folders:
+        raise SourceError(f"{path}: no *.tfrecord* files here or two folders further down; give the folder with them")
+    if len(folders) > 1:
+        raise SourceError(f"{path}: several data sets ({', '.join(map(str, folders[:4]))} …); give the folder of one")
+    return sorted(shards)
+
+
+def _split_name(shard: Path) -> tuple[str, str]:
+    """Returns the names of the data set and of the split in a shard's name."""
+    match = _SHARD.fullmatch(shard.name)
+    return (match["name"], match["split"]) if match else (shard.name.partition(".")[0], "")
+
+
+def _expected(folder: Path) -> dict[str, int]:
+    """Returns how many records each shard should have, as far as dataset_info.json says."""
+    counts: dict[str, int] = {}
+    path = folder / "dataset_info.json"
+    info = _read_object(path)
+    try:
+        for split in info.get("splits", []):
+            lengths = split.get("shardLengths", [])
+            for number, length in enumerate(lengths):
+                name = f"{info.get('name')}-{split.get('name')}.tfrecord-{number:05d}-of-{len(lengths):05d}"
+                counts[name] = int(length)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise SourceError(f"{path}: splits are not such as TFDS writes ({error}); fetch it again") from error
+    return counts
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """Reads a JSON object; an empty one if there is no file."""
+    content = read_json(path) if exists(path) else {}
+    if not isinstance(content, dict):
+        raise SourceError(f"{path}: is a {type(content).__name__}, should be an object; fetch it again")
+    return content

@@ -1,0 +1,266 @@
+"""Reads robomimic HDF5 files: ``data/demo_i`` has ``actions`` and ``obs/<key>``; ``mask/<filter>`` lists demos.
+
+``obs[t]`` was recorded before ``actions[t]``, which led to ``obs[t + 1]``. robosuite's own demos have no ``obs``, and
+robomimic's downloads have no pictures in it: both are rendered from their simulator states, if the installed robosuite
+has the models (:mod:`rsjax.tools.ingest.formats.rendered`). LIBERO's files have the same layout with other conventions
+(:mod:`rsjax.tools.ingest.formats.libero`), so this module reads both, each by its :class:`Convention`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.clip import words_of
+from rsjax.errors import did_you_mean
+from rsjax.files import safe_id
+from rsjax.tools.ingest.actions import Layout, align_actions, continuous_signs
+from rsjax.tools.ingest.episode import (
+    LEAVE_OUT,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    fingerprint,
+)
+from rsjax.tools.ingest.formats.demo_settings import fps_of, instruction_of, kind_of, settings_of
+from rsjax.tools.ingest.formats.files import broken, inside, location_of
+from rsjax.tools.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
+from rsjax.tools.ingest.formats.rendered import CURE, Pictures, rendered
+
+
+@dataclass(frozen=True)
+class Convention:
+    """The differences between the data sets of this layout.
+
+    Attributes:
+        name: name of the format.
+        endings: endings of the pictures' keys below ``obs``, after the camera's name.
+        states: keys below ``obs`` that make up the state, as far as a file has them.
+        quaternions: those of these keys that are a quaternion, whose sign is made continuous.
+        after: whether ``obs[t]`` was recorded after ``actions[t]``.
+        stored: as in :class:`rsjax.tools.ingest.formats.hdf5.H5Frames`.
+        fps: frames per second if the file does not say.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    states: tuple[str, ...]
+    quaternions: tuple[str, ...] = ()
+    after: bool = False
+    stored: Stored = "upright"
+    fps: float = 20.0
+
+
+ROBOMIMIC = Convention(
+    "robomimic",
+    ("_image",),
+    ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
+    ("robot0_eef_quat",),
+)
+
+
+def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 128) -> "DemoSource":
+    """Opens a robomimic data set.
+
+    Args:
+        path: an HDF5 file, or a folder of HDF5 files.
+        filter: read only demos that ``mask/<filter>`` lists, such as ``train``.
+        depth: read ``obs/<camera>_depth`` as metres. Rendered demos always have depth.
+        size: side of rendered pictures in pixels, 8 to 1024.
+
+    Raises:
+        SourceError: there are no files, none has pictures or can be rendered, or an option is impossible.
+    """
+    if not 8 <= size <= 1024:
+        raise SourceError(f"robomimic: option size is {size}; choose one from 8 to 1024")
+    return open_demos(path, ROBOMIMIC, filter, depth, size)
+
+
+def open_demos(path: Path, convention: Convention, filter: str, depth: bool, size: int = 0) -> "DemoSource":
+    """Opens a data set of this layout. Arguments and errors as in :func:`open_source`."""
+    folder, files = path.parent, [path]
+    if not path.is_file():
+        folder = path
+        files = sorted({file for ending in ("hdf5", "h5") for file in path.glob(f"**/*.{ending}") if file.is_file()})
+    if not files:
+        raise SourceError(f"{path}: no *.hdf5 files; give the {convention.name} file, or the folder with them")
+    names = tuple(str(file.relative_to(folder)) for file in files)
+    source = DemoSource(folder, names, convention, filter, depth, convention.name, size)
+    for file in files:  # if the first demo that can be read has no pictures, none has
+        try:
+            demos = source.demos(file)
+            with open_file(file) as content:
+                if demos:
+                    _check_pictures(source, content[f"data/{demos[0]}"], file)
+            break
+        except (EpisodeError, KeyError):
+            continue  # its episodes are still listed, and refused one by one
+    return source
+
+
+def _check_pictures(source: "DemoSource", group: Any, path: Path) -> None:
+    """Raises :class:`SourceError` if a demo has no pictures and cannot be rendered."""
+    if not _picture_keys(group.get("obs", {}), source.convention):
+        try:
+            source.pictures(group, path)
+        except EpisodeError as error:
+            raise SourceError(str(error)) from error
+
+
+@dataclass
+class DemoSource:
+    """See :class:`rsjax.tools.ingest.episode.EpisodeSource`.
+
+    Attributes:
+        folder: the folder to which the files' names are relative.
+        files: the files, in order.
+        convention: how to read them.
+        filter: name of a filter of demos; "": all.
+        depth: whether depth maps are read.
+        name: the convention's name.
+        size: side of rendered pictures in pixels.
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    convention: Convention
+    filter: str
+    depth: bool
+    name: str
+    size: int = 0
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses."""
+        for file in self.files:
+            path, stem = self.folder / file, file.rpartition(".")[0].replace("/", "-")
+            try:
+                demos = self.demos(path)
+            except EpisodeError as error:
+                yield broken(safe_id(stem), str(error))
+                continue
+            for demo in demos:
+                mark = fingerprint([path], demo, asdict(self.convention), self.depth)
+                yield EpisodeRef(safe_id(f"{stem}-{demo}"), mark, {"file": file, "demo": demo})
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one demo."""
+        location = location_of(ref)
+        path, demo = inside(self.folder, location["file"]), location["demo"]
+        with open_file(path) as file:
+            group = member(file, f"data/{demo}", path)
+            if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group | None):
+                raise EpisodeError.at(path, f"has no group data/{demo}", LEAVE_OUT)
+            return checked(self._episode(ref, path, group, settings_of(file["data"], path)), f"{path}: data/{demo}")
+
+    def _episode(self, ref: EpisodeRef, path: Path, group: Any, settings: dict[str, Any]) -> Episode:
+        how = self.convention
+        commands = rows(group, "actions", path)
+        samples = attribute(group, "num_samples")
+        if samples is not None and int(samples) != len(commands):
+            problem = f"{group.name}/actions has {len(commands)} rows, num_samples says {int(samples)}"
+            raise EpisodeError.at(path, problem)
+        cameras, depth = self.pictures(group, path)
+        fps = fps_of(settings, path) or how.fps
+        states, flipped = _states(group.get("obs", {}), how, path)
+        named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
+        width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
+        grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
+        return Episode(
+            id=ref.id,
+            fingerprint=ref.fingerprint,
+            task=instruction_of(group, settings) or (named if how.after else words_of(settings.get("env_name"))),
+            fps=fps,
+            timestamps=np.arange(len(commands)) / fps,
+            actions=align_actions(commands, how.after),
+            states=states,
+            cameras=cameras,
+            depth=depth,
+            meta={
+                "source": how.name,
+                "file": ref.location["file"],
+                "demo": ref.location["demo"],
+                "environment": words_of(settings.get("env_name")),
+                "notes": {"flipped": flipped} if flipped else {},
+                "actions": Layout(kind_of(settings), held=grippers).to_json(),
+            },
+        )
+
+    def pictures(self, group: Any, path: Path) -> Pictures:
+        """Returns the pictures and depth maps of a demo by camera, rendered if it has none.
+
+        Raises:
+            EpisodeError: pictures have another shape or type, or a demo without pictures cannot be rendered.
+        """
+        observed, stored = group.get("obs", {}), self.convention.stored
+        keys = _picture_keys(observed, self.convention)
+        if not keys and self.size:
+            return rendered(group, path, self.size)
+        if not keys:
+            raise EpisodeError.at(path, f"{group.name}/obs has no *{self.convention.endings[0]}", CURE)
+        maps = [f"{camera}_depth" for camera in keys if self.depth and f"{camera}_depth" in observed]
+        return (
+            {camera: H5Frames(path, f"{observed.name}/{key}", stored) for camera, key in keys.items()},
+            {key.removesuffix("_depth"): H5Frames(path, f"{observed.name}/{key}", stored, depth=True) for key in maps},
+        )
+
+    def demos(self, path: Path) -> list[str]:
+        """Returns the demos of a file in the order of their numbers.
+
+        Raises:
+            SourceError: the file has no such filter.
+            EpisodeError: the file cannot be read.
+        """
+        with open_file(path) as file:
+            data = member(file, "data", path)
+            if not isinstance(data, h5py.Group):
+                name = self.convention.name
+                raise EpisodeError.at(path, f"has no group data, so it is no {name} file", "take it away")
+            if not len(data):
+                raise EpisodeError.at(path, "its group data has no demos", "take it away or fetch it again")
+            if not self.filter:
+                return sorted(data, key=_number)
+            masks = file.get("mask", {})
+            if self.filter not in masks:
+                hint = did_you_mean(self.filter, masks)
+                raise SourceError(f"{path}: no mask/{self.filter}{hint}; it has {', '.join(masks) or 'no filters'}")
+            listed = masks[self.filter][()]
+        return sorted((name.decode() if isinstance(name, bytes) else str(name) for name in listed), key=_number)
+
+
+def _picture_keys(observed: Any, how: Convention) -> dict[str, str]:
+    """Returns the key of each camera's pictures in a group ``obs``, by the camera's name."""
+    return {
+        key.removesuffix(ending): key
+        for ending in how.endings
+        for key in observed
+        if key.endswith(ending) and isinstance(observed[key], h5py.Dataset)
+    }
+
+
+def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndarray, "N S"] | None, dict[str, int]]:
+    """Returns the measured states, and in how many rows of which field the sign of a quaternion was flipped back."""
+    parts, flipped = [], {}
+    for key in (key for key in how.states if key in observed):
+        part = rows(observed, key, path)
+        if key in how.quaternions and part.shape[1] == 4:
+            mended = continuous_signs(part)
+            if count := int((mended != part).any(1).sum()):
+                flipped[key] = count
+            part = mended
+        parts.append(part)
+        if len(part) != len(parts[0]):
+            problem = f"states below {observed.name} have {len(parts[0])} and {len(part)} rows"
+            raise EpisodeError.at(path, problem, "leave it out", "length")
+    return np.concatenate(parts, axis=1) if parts else None, flipped
+
+
+def _number(demo: str) -> tuple[int, str]:
+    """Returns a key by which ``demo_10`` is sorted after ``demo_9``."""
+    digits = demo.rpartition("_")[2]
+    return (int(digits) if digits.isdecimal() else -1), demo

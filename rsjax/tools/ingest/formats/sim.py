@@ -1,0 +1,165 @@
+"""Reads a store of clips that this project's simulators (``rsjax.tools.sim``) made; each clip is an episode.
+
+A clip's actions, depth (if it is in metres) and task are taken unchanged; its exact keypoint tracks stay in the store,
+and ``meta["clip"]`` says where. Any other store of clips is read in the same way for checks.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.clip import UNKNOWN, words_of
+from rsjax.data.store import Record, Store, StoreError, open_store
+from rsjax.errors import did_you_mean
+from rsjax.tools.ingest.actions import Kind, Layout
+from rsjax.tools.ingest.dimensions import layout_of
+from rsjax.tools.ingest.episode import (
+    LEAVE_OUT,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    SourceError,
+    checked,
+    fingerprint,
+)
+from rsjax.tools.ingest.pictures import ArrayFrames
+
+FPS = 5.0  # assumed for a clip that does not say how it was made
+_CURE = f"make the store again or {LEAVE_OUT}"
+
+
+def open_source(
+    path: Path, split: str = "", kind: Kind | None = None, held: Sequence[int] | None = None
+) -> "StoreSource":
+    """Opens a store of clips.
+
+    Args:
+        path: the store's directory.
+        split: the only split to read; "": all.
+        kind: kind of the actions in clips that no simulator of this project made; see
+            :class:`rsjax.tools.ingest.actions.Layout`.
+        held: dimensions of these actions that stay in force, such as a gripper's; None: not declared.
+
+    Raises:
+        SourceError: ``path`` is not a complete store of clips, or has no such split.
+    """
+    try:
+        store = open_store(path)
+    except StoreError as error:
+        raise SourceError(str(error)) from error
+    if store.manifest.get("kind") != "clips":
+        raise SourceError(f"{path}: a store of {store.manifest.get('kind')}; give one of clips")
+    if split and split not in store.splits:
+        raise SourceError(f"{path}: no split {split!r}{did_you_mean(split, store.splits)}; it has {list(store.splits)}")
+    return StoreSource(store, (split,) if split else store.splits, kind, None if held is None else tuple(held))
+
+
+@dataclass(frozen=True)
+class StoreSource:
+    """See :class:`rsjax.tools.ingest.episode.EpisodeSource`.
+
+    Attributes:
+        store: the store of clips.
+        splits: the splits that are read.
+        kind: kind of undeclared actions; see :func:`open_source`.
+        held: likewise.
+    """
+
+    name = "sim"
+    store: Store
+    splits: tuple[str, ...]
+    kind: Kind | None = None
+    held: tuple[int, ...] | None = None
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists every clip of every split, in the store's order."""
+        declared = (self.kind, self.held)
+        key = fingerprint(
+            (),
+            self.store.manifest.get("key"),
+            self.store.manifest["splits"],
+            *([declared] if declared != (None, None) else []),
+        )
+        for split in self.splits:
+            for number in range(len(self.store.source(split))):
+                location = {"split": split, "record": number}
+                yield EpisodeRef(f"{split}-{number:06d}", fingerprint((), key, split, number), location)
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one clip."""
+        split, number = ref.location["split"], ref.location["record"]
+        try:
+            source = self.store.source(split)
+            record, place = source[number], source.locate(number)
+        except (StoreError, IndexError) as error:
+            raise EpisodeError(f"{self.store.path}: {split} record {number}: {error}") from error
+        where = f"{self.store.path / place['file']}: {split} record {number}"
+        try:
+            _check_arrays(record, where)
+            return checked(self._episode(ref, record, place), where)
+        except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError) as error:
+            detail = " ".join(str(error).split())[:200]
+            raise EpisodeError.at(where, f"provenance or settings are wrong ({detail})", _CURE) from error
+
+    def _episode(self, ref: EpisodeRef, record: Record, place: dict[str, Any]) -> Episode:
+        provenance = record.get("provenance", {})
+        camera = str(provenance.get("camera", "camera"))
+        steps = int((self.store.manifest.get("config") or {}).get("control_steps", 1))
+        fps, timestamps = _times(provenance, len(record["rgb"]), steps)
+        width = record["actions"].shape[1]
+        layout = layout_of(record["actions"], self.kind, self.held, (), (), None)
+        if "control_hz" in provenance:  # a simulator's own: the last dimension of each control step is the gripper
+            last = width // steps - 1 if width % steps == 0 else width
+            layout = Layout("delta", held=tuple(range(last, width, width // steps or 1)))
+        measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
+        return Episode(
+            id=ref.id,
+            fingerprint=ref.fingerprint,
+            task="" if record.get("task") == UNKNOWN else words_of(record.get("task")),
+            fps=fps,
+            timestamps=timestamps,
+            actions=record["actions"].astype(np.float32),
+            states=None,
+            cameras={camera: ArrayFrames(record["rgb"])},
+            depth={camera: ArrayFrames(record["depth"].astype(np.float32))} if measured else {},
+            meta={
+                "source": self.store.manifest.get("source", "sim"),
+                "clip": place,
+                "provenance": provenance,
+                "actions": layout.to_json(),
+                "success": np.asarray(record.get("success", []), bool).tolist(),
+            },
+        )
+
+
+def _times(provenance: dict[str, Any], count: int, steps: int) -> tuple[float, Float[np.ndarray, " N"]]:
+    """Returns frames per second and each frame's time, by a simulator's clock or by the times in the recording."""
+    if "control_hz" in provenance:
+        fps = float(provenance["control_hz"]) / steps
+    elif count > 1 and len(provenance.get("frames", ())) == count:
+        seconds = provenance.get("times") or np.array(provenance["frames"]) / float(provenance["fps"])
+        times = np.asarray(seconds, np.float64) - seconds[0]
+        return 1 / max(float(np.median(np.diff(times))), 1e-6), times
+    else:
+        fps = FPS
+    return fps, np.arange(count) / fps
+
+
+def _check_arrays(record: Record, where: str) -> None:
+    """Raises :class:`EpisodeError` if a record's arrays do not have the types and shapes of a clip."""
+    if not np.isfinite(record.get("tracks", 0.0)).all():
+        raise EpisodeError.at(where, "tracks are not all finite", _CURE)
+    wanted = {"rgb": (np.uint8, 4), "actions": (np.floating, 2)}
+    if record.get("depth") is not None:
+        wanted["depth"] = (np.floating, 3)
+    for name, (kind, axes) in wanted.items():
+        array = record.get(name)
+        if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, kind) or array.ndim != axes:
+            actual = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise EpisodeError.at(where, f"{name} is {actual}, should have {axes} axes of {kind.__name__}", _CURE)
+    if record["rgb"].shape[3] != 3 or not record["rgb"].size:
+        raise EpisodeError.at(where, f"rgb has the shape {record['rgb'].shape}, should be (T, H, W, 3)", _CURE)

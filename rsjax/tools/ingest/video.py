@@ -1,0 +1,213 @@
+"""Reads pictures of video files by number or by time with PyAV (H.264, AV1 and any other codec of FFmpeg).
+
+Reading seeks to the key frame before the picture (``video_index.py`` lists the key frames) and decodes
+from there, or continues from the current position if that is nearer. Each process keeps a few files open and closes the
+least recently used one first.
+"""
+
+import contextlib
+import itertools
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from jaxtyping import Float, Int64, UInt8
+
+from rsjax.tools.ingest.episode import EpisodeError
+from rsjax.tools.ingest.pictures import stack_pictures
+from rsjax.tools.ingest.video_index import OPEN_FILES, VideoIndex, decoded, open_decoder, scan
+
+_COMPARED = 64  # seeking is checked among this many first frames of a file
+
+
+class VideoFrames:
+    """A video, or some of its frames, as :class:`rsjax.tools.ingest.episode.Frames`.
+
+    Args:
+        path: the file.
+        numbers: the file's frames that belong to the video, in order; None: all.
+    """
+
+    def __init__(self, path: Path, numbers: Int64[np.ndarray, " n"] | None = None) -> None:
+        self.path, self._numbers = Path(path), numbers
+
+    def __len__(self) -> int:
+        return len(scan(self.path).stamps) if self._numbers is None else len(self._numbers)
+
+    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
+        """Returns these pictures, 0–255, RGB, rotated as the file's display matrix says.
+
+        Raises:
+            EpisodeError: the file is damaged at one of them.
+        """
+        chosen = np.asarray(indices, np.int64).reshape(-1)
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self)):
+            raise IndexError(f"{self.path}: frames {chosen.min()} … {chosen.max()} of {len(self)}")
+        wanted, order = np.unique(chosen if self._numbers is None else self._numbers[chosen], return_inverse=True)
+        with _opened(self.path) as decoder:
+            return stack_pictures((f"{self.path}: frame {number}", decoder.picture(int(number))) for number in wanted)[
+                order
+            ]
+
+
+def misread(path: Path, count: int = 5) -> int | None:
+    """Returns the first checked frame whose picture differs between decoding in order and seeking; None if none does.
+
+    Args:
+        count: frames to check, spread over the first few dozen of the file.
+
+    Raises:
+        EpisodeError: the file cannot be read.
+    """
+    index = scan(path)
+    last = min(len(index.labels), _COMPARED) - 1
+    chosen, known = np.unique(np.linspace(0, last, count).astype(int)).tolist(), set(index.labels.tolist())
+    sought = dict[int, UInt8[np.ndarray, "H W 3"]]()
+    with contextlib.closing(_Decoder(path, index)) as decoder:
+        for number in reversed(chosen):  # in this order each read seeks
+            with contextlib.suppress(EpisodeError):
+                sought[number] = decoder.picture(number)
+    with open_decoder(path) as container, contextlib.suppress(av.FFmpegError):  # reading frames reports damage
+        frames = (frame for frame in decoded(container) if frame.pts in known)
+        for number, frame in enumerate(itertools.islice(frames, last + 1)):
+            if number in chosen and not (number in sought and np.array_equal(sought[number], _upright(frame))):
+                return number
+    return None
+
+
+def at_times(path: Path, seconds: Float[np.ndarray, " n"], tolerance: float) -> VideoFrames:
+    """Returns the frames of a video that are shown at these times on the file's own clock.
+
+    Args:
+        seconds: the times, increasing.
+        tolerance: largest distance of a frame from its time, in seconds.
+
+    Raises:
+        EpisodeError: a time has no frame that near, or one frame is nearest to two of the times.
+    """
+    times = scan(path).times()
+    after = np.clip(np.searchsorted(times, seconds), min(1, len(times) - 1), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    numbers = np.where(np.abs(times[before] - seconds) <= np.abs(times[after] - seconds), before, after)
+    away = np.abs(times[numbers] - seconds)
+    if (far := np.flatnonzero(~(away <= tolerance))).size:
+        first = far[0]
+        raise EpisodeError.at(
+            path,
+            f"no frame at {seconds[first]:.4f} s, row {first} of the table: the nearest is {away[first]:.2g} s away, "
+            f"{tolerance:.2g} s are allowed",
+            kind="time",
+        )
+    if (twice := np.flatnonzero(np.diff(numbers) <= 0)).size:
+        raise EpisodeError.at(path, f"rows {twice[0]} and {twice[0] + 1} of the table show the same frame", kind="time")
+    return VideoFrames(path, numbers.astype(np.int64))
+
+
+_decoders: "OrderedDict[str, _Decoder]" = OrderedDict()
+_lock = threading.RLock()
+_inherited: list[object] = []
+
+
+def _set_aside() -> None:
+    """Makes a forked process open its own files: reading the parent's would move the parent's position in them.
+
+    This also runs between the fork and the exec of a command that is started with a ``preexec_fn``, as Ray's commands
+    are. So it frees nothing: freeing a decoder waits for FFmpeg's threads, and a fork does not copy threads.
+    """
+    global _decoders, _lock
+    _inherited.append(_decoders)
+    _decoders, _lock = OrderedDict(), threading.RLock()  # another thread of the parent may have held the lock
+
+
+os.register_at_fork(after_in_child=_set_aside)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator["_Decoder"]:
+    """Lends the file's decoder to this thread alone; a decoder that failed is not kept."""
+    index = scan(path)
+    with _lock:
+        decoder = _decoders.pop(str(path), None)
+    if decoder is not None and decoder.index is not index:  # the file has changed
+        decoder.close()
+        decoder = None
+    decoder = decoder or _Decoder(path, index)
+    try:
+        yield decoder
+    except BaseException:
+        decoder.close()
+        raise
+    with _lock:
+        if (other := _decoders.pop(str(path), None)) is not None:
+            other.close()
+        _decoders[str(path)] = decoder
+        while len(_decoders) > OPEN_FILES:
+            _decoders.popitem(last=False)[1].close()
+
+
+class _Decoder:
+    """An open file and the current decoding position in it."""
+
+    def __init__(self, path: Path, index: VideoIndex) -> None:
+        self.path, self.index = path, index
+        self._container = open_decoder(path)
+        self._stream = self._container.streams.video[0]
+        self._starts = np.flatnonzero(index.keys)
+        self._numbers = {label: number for number, label in enumerate(index.labels.tolist())}
+        self._frames: Iterator[Any] = iter(())
+        self._next = len(index.labels)  # number of the frame that comes next; at the end, so the first read seeks
+
+    def close(self) -> None:
+        self._frames = iter(())
+        self._container.close()
+
+    def picture(self, number: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Decodes one frame of the file."""
+        return _upright(self._decode(number))
+
+    def _decode(self, number: int) -> Any:
+        """Decodes a frame from the current position if that is nearest, else from a key frame before the frame.
+
+        In an open group of pictures the first frames depend on the previous group. So if the nearest key frame is not
+        enough, decoding starts at the one before it, and then at the first frame.
+        """
+        near = self._start(number)
+        attempts: list[int | None] = [near, self._start(max(0, near - 1)), 0]
+        reason: object = "the decoder leaves it out"
+        for start in dict.fromkeys([None, *attempts] if near <= self._next <= number else attempts):
+            try:
+                if start is not None:
+                    self._container.seek(int(self.index.labels[start]), stream=self._stream, backward=True)
+                    self._frames = decoded(self._container)
+                if (frame := self._decode_until(number)) is not None:
+                    return frame
+            except (av.FFmpegError, OSError) as error:
+                reason = error
+        seconds = float(self.index.stamps[number] * self.index.time_base)
+        raise EpisodeError.at(self.path, f"frame {number} (at {seconds:.3f} s) cannot be decoded: {reason}")
+
+    def _start(self, number: int) -> int:
+        """Returns the nearest frame at or before this one at which decoding can begin."""
+        place = int(np.searchsorted(self._starts, number, side="right")) - 1
+        return int(self._starts[place]) if place >= 0 else 0
+
+    def _decode_until(self, number: int) -> Any:
+        """Continues decoding up to this frame; returns None if the decoder skips it."""
+        for frame in self._frames:
+            if (place := self._numbers.get(frame.pts)) is None:
+                continue
+            self._next = place + 1
+            if place >= number:
+                return frame if place == number and not frame.is_corrupt else None
+        return None
+
+
+def _upright(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+    """Returns a decoded frame as RGB, rotated as the file's display matrix says."""
+    picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
+    return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture

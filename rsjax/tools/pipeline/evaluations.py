@@ -1,0 +1,232 @@
+"""Evaluates runs by protocols. Each result is a folder, ``RUN/evaluations/LABEL``, with ``result.json``."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rsjax
+from rsjax.config import Config, EvalConfig, content_key, to_dict
+from rsjax.data.clips import frame_rate
+from rsjax.data.store import Store, open_store
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.metrics.physics_iq import THRESHOLD
+from rsjax.evaluation.protocols import Protocol, find, label, of_run
+from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result, result_of, write_result
+from rsjax.files import FileError, disk_guard, lock, safe_id
+from rsjax.models.load_run import load, load_config
+from rsjax.models.trained import TrainedModel
+from rsjax.progress import note
+from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
+from rsjax.tools.pipeline.run import RECIPE, Run
+from rsjax.tools.pipeline.run_clips import relocated
+from rsjax.tools.pipeline.validation_clips import chosen_splits, held_out_store, with_second_takes
+from rsjax.tools.pipeline.videos import resampled
+from rsjax.tools.sim import retakes
+from rsjax.training.distributed import barrier, is_lead, on_lead
+
+FOLDER = "evaluations"
+NOT_OF_METRICS = ("clips", "repetitions", "action_draws", "loss_clips", "batch_size", "report_clips")
+
+
+@dataclass(frozen=True)
+class Request:
+    """The settings of an evaluation.
+
+    Attributes:
+        protocol: the protocol's name.
+        changes: fields of the protocol to change.
+        settings: fields of :class:`rsjax.config.EvalConfig` to change, such as paths of weights.
+        data: a store with the clips to score; None: the run's own.
+        splits: splits of that store; empty: the protocol's.
+        store: the new path of the run's store of ingested clips, if it was moved.
+        overwrite: whether to replace results that are up to date.
+        retakes: whether to simulate the scored clips once more, for Physics-IQ's score.
+    """
+
+    protocol: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    data: Path | None = None
+    splits: tuple[str, ...] = ()
+    store: Path | None = None
+    overwrite: bool = False
+    retakes: bool = False
+
+
+def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path]:
+    """Evaluates one run, each split by itself; skips results that are up to date. All processes call it together.
+
+    Args:
+        data: the directory of simulated data sets.
+
+    Yields:
+        The folder of each result.
+
+    Raises:
+        UserError: the run, its data, a split or a file of weights is missing; the clips do not fit the protocol, or
+            second takes of them cannot be simulated.
+    """
+    config = load_config(directory)
+    config = relocated(config, request.store) if request.store else config
+    config = replace(config, eval=replace(config.eval, **request.settings))
+    evaluation.check_files(config.eval)
+    standard = find(request.protocol, config)
+    protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
+    trained = _sampling(replace(load(directory), config=config), protocol)
+    run = Run(config, directory, data)
+    store = run.open_clips()
+    held_out = open_store(request.data) if request.data else held_out_store(run, store, protocol)
+    for split in chosen_splits(held_out, protocol.splits):
+        parts = [label(protocol, standard), *([split] if split != "test" else [])]
+        key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # a key may be unsafe as a path
+        name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
+        chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
+        if request.retakes:
+            name, chosen = f"{name},second-takes", with_second_takes(chosen, config.sim.workers)
+        folder = directory / FOLDER / name
+        evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
+        yield folder
+
+
+def evaluate_own(run: Run) -> Evaluation:
+    """Evaluates a run by its own configuration, in its evaluation stage; only the lead process calls it."""
+    trained, store = load(run.directory), run.open_clips()
+    held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
+    folder = run.directory / "evaluation"
+    return _evaluate(folder, held_out.protocol.name, _key(trained, store, held_out), trained, run, store, held_out)
+
+
+def evaluate_into(
+    folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut, overwrite: bool
+) -> None:
+    """Evaluates into a folder unless its result is up to date. Several processes share the work."""
+    key = _key(trained, store, held_out)
+    parts, skipped = _parts(folder, key), f"{folder}: up to date, skipped (--overwrite evaluates again)"
+    alone = partial(lock, folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here")
+    if not overwrite and _key_of(folder) == key:
+        if is_lead():
+            note(skipped)
+        barrier("evaluation")
+        return
+
+    def clear() -> None:
+        with alone():
+            shutil.rmtree(parts, ignore_errors=True)
+
+    if overwrite:  # an interrupted evaluation's batches may be from another version
+        on_lead("old batches", clear)
+    if jax.process_count() > 1:
+        with disk_guard(parts):
+            plan = evaluation.plan(trained, store, held_out, parts)
+            plan.make(jax.process_index(), jax.process_count())
+        barrier("generation")
+
+    def finish() -> None:
+        with alone():
+            if overwrite or _key_of(folder) != key:
+                _evaluate(folder, name, key, trained, run, store, held_out)
+            else:  # another process made it while this one waited
+                note(skipped)
+                shutil.rmtree(parts, ignore_errors=True)
+
+    on_lead("evaluation", finish)
+
+
+def _evaluate(
+    folder: Path, name: str, key: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut
+) -> Evaluation:
+    parts = _parts(folder, key)
+    with disk_guard(folder):
+        for old in folder.glob("parts-*"):
+            if old != parts:  # from an evaluation with other settings that never finished
+                shutil.rmtree(old, ignore_errors=True)
+        found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts)
+        about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
+        about |= _described(trained, run, store, held_out)
+        write_result(folder, result_of(found, **about), found.kept)
+        shutil.rmtree(parts, ignore_errors=True)
+    return found
+
+
+def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
+    """Returns the entries of ``result.json`` on protocol, sampling, data, model and machine."""
+    config, (frames, size) = trained.config, held_out.clips.rgb.shape[1:3]
+    rate = frame_rate(held_out.records[0], held_out.store.manifest)
+    data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
+    return {
+        "protocol": held_out.protocol.described(),
+        "sampling": _sample_settings(config),
+        "settings": _settings(config.eval) | _take_settings(held_out),
+        "data": data | {"split": held_out.split, "frames": frames, "image_size": size, "fps": rate},
+        "model": {
+            "run": str(run.directory),
+            "preset": config.name,
+            "family": config.model.family,
+            "settings": to_dict(config.model),
+            "training": training_settings(config),
+            "seed": config.train.seed,
+            "parameters": sum(x.size for x in jax.tree.leaves(trained.params)),
+            "weights_sha256": _weights(trained),
+            "trained_on": store.manifest.get("key"),
+        },
+        "made": {"time": datetime.now(UTC).isoformat(timespec="seconds"), "machine": machine()},
+    }
+
+
+def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
+    """Returns a hash of everything that determines the scores, except the code."""
+    data = [
+        (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, held_out.store)
+    ]
+    protocol = json.dumps([held_out.protocol.described(), _sample_settings(trained.config), data, held_out.split])
+    takes = [] if held_out.retakes is None else [json.dumps([retakes.RECIPE, retakes.JITTER])]
+    return content_key(RECIPE, "evaluation", protocol, _weights(trained), by_content(trained.config.eval), *takes)
+
+
+def _weights(trained: TrainedModel) -> str:
+    return fingerprint((trained.params, trained.assets.tokenizer))
+
+
+def _key_of(folder: Path) -> str:
+    try:
+        return read_result(folder).key if (folder / NAME).exists() else ""
+    except FileError:
+        return ""
+
+
+def _parts(folder: Path, key: str) -> Path:
+    return folder / f"parts-{key}"
+
+
+def _settings(settings: EvalConfig) -> dict[str, Any]:
+    """Returns what the metrics depend on: the settings, with files by content, and the threshold of motion masks."""
+    values = {name: value for name, value in to_dict(by_content(settings)).items() if name not in NOT_OF_METRICS}
+    return values | {"physics_iq_threshold": THRESHOLD}
+
+
+def _take_settings(held_out: HeldOut) -> dict[str, Any]:
+    return {} if held_out.retakes is None else {"second_take_jitter": retakes.JITTER}
+
+
+def _sample_settings(config: Config) -> dict[str, Any]:
+    settings = getattr(config.model, "sample", None)
+    return to_dict(settings) if is_dataclass(settings) else {}
+
+
+def _sampling(trained: TrainedModel, protocol: Protocol) -> TrainedModel:
+    """Returns the model with the protocol's sampling settings; a note names those that its family does not have."""
+    settings = getattr(trained.config.model, "sample", None)
+    known = {each.name for each in fields(settings)} if is_dataclass(settings) else set()
+    if missing := ", ".join(sorted(protocol.sampling.keys() - known)):
+        note(
+            f"a model of family {trained.config.model.family!r} has no {missing}, which {protocol.name} fixes; left out"
+        )
+    return resampled(trained, {name: value for name, value in protocol.sampling.items() if name in known})

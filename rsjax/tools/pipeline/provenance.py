@@ -1,0 +1,169 @@
+"""Records the configuration, code, packages, machine and data of every start of a run in ``run.json``."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import socket
+import subprocess
+from contextlib import suppress
+from dataclasses import fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import rsjax
+from rsjax.config import Config, LoopConfig, to_dict
+from rsjax.config.config_fields import leaves
+from rsjax.data.store import MANIFEST
+from rsjax.files import FileError, parse_json, read_json, write_json
+from rsjax.tools.pipeline.run import Run
+
+NAME = "run.json"
+BY_SEED = ("seed", "start_from")  # settings of a training loop that differ between the seeds of one kind of run
+DECIDE = ("code", "packages", "data")  # entries that may change results under the same configuration
+
+
+def read_starts(directory: Path) -> list[dict[str, Any]]:
+    """Reads every start of a run, oldest first.
+
+    Returns:
+        Dicts of ``time`` (ISO 8601, UTC), ``command``, ``config`` (resolved), ``keys`` (of the stages), ``code``,
+        ``packages``, ``machine`` and ``data``. Empty if the run was never started.
+
+    Raises:
+        FileError: the file is damaged.
+    """
+    path = directory / NAME
+    starts = read_json(path, list) if path.exists() else []
+    for number, start in enumerate(starts):
+        if not isinstance(start, dict) or not all(isinstance(start.get(name, {}), dict) for name in DECIDE):
+            raise FileError(f"{path}: entry {number} is not a start of this run; restore the file, or delete it")
+    return starts
+
+
+def record_start(run: Run, command: str) -> list[str]:
+    """Appends this start to ``run.json``. The lead process calls it once, after device setup, in an existing directory.
+
+    Args:
+        command: the command that started the run.
+
+    Returns:
+        The entries of ``DECIDE`` that changed since the last start; added data and packages do not count.
+
+    Raises:
+        FileError: the file is damaged, or the disk is full.
+    """
+    now: dict[str, Any] = {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "config": to_dict(run.config),
+        "keys": run.keys(),
+        "code": code_version(Path(rsjax.__file__).resolve().parents[1]),
+        "packages": dict(sorted((each.metadata["Name"], each.version) for each in importlib.metadata.distributions())),
+        "machine": machine(),
+        "data": data_fingerprints(run),
+    }
+    starts = read_starts(run.directory)
+    write_json(run.directory / NAME, [*starts, now])
+    before = starts[-1] if starts else {}
+    return [name for name in DECIDE if any(_differ(old, now[name].get(k)) for k, old in before.get(name, {}).items())]
+
+
+def _differ(before: Any, now: Any) -> bool:
+    """Returns whether two entries differ in more than the path of the data."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        return before | {"path": ""} != now | {"path": ""}
+    return before != now
+
+
+def record_data(run: Run) -> None:
+    """Adds the data that the run has made since its last start to that start's entry."""
+    starts = read_starts(run.directory)
+    if starts:
+        write_json(run.directory / NAME, [*starts[:-1], starts[-1] | {"data": data_fingerprints(run)}])
+
+
+def data_fingerprints(run: Run) -> dict[str, Any]:
+    """Returns path, content key, manifest hash and split sizes of every existing data set.
+
+    The manifest lists all files with their sizes and numbers of records, so its hash changes when these do.
+    """
+    stores = {"clips": run.clips, "tokens": run.output("tokens")}
+    loops = (run.config.tokenizer_train, run.config.train)
+    stores |= {
+        p.store: Path(p.store) for loop in loops for stage in loop.curriculum for p in stage.components if p.store
+    }
+    return {name: data_fingerprint(path) for name, path in stores.items() if (path / MANIFEST).is_file()}
+
+
+def data_fingerprint(path: Path) -> dict[str, Any]:
+    """Returns path, content key, manifest hash and split sizes of a store; fewer entries if it is damaged."""
+    known: dict[str, Any] = {"path": str(path.absolute())}
+    # The stage that reads the store reports the damage.
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        raw = (path / MANIFEST).read_bytes()
+        known["manifest_sha256"] = hashlib.sha256(raw).hexdigest()
+        manifest = parse_json(raw)
+        files = {name: split["files"] for name, split in manifest["splits"].items()}
+        splits = {name: {of: sum(file[of] for file in files[name]) for of in ("count", "bytes")} for name in files}
+        known |= {"key": manifest.get("key"), "splits": splits}
+    return known
+
+
+def code_version(root: Path) -> dict[str, Any]:
+    """Returns version, git revision, whether the checkout at ``root`` has changes, and the hash of ``git diff HEAD``.
+
+    Without a checkout, everything but the version is null. The diff does not include new files.
+    """
+    code: dict[str, Any] = {"version": rsjax.__version__, "revision": None, "dirty": None, "diff_sha256": None}
+    # rsjax may be installed inside another project's checkout.
+    if _git(root, "rev-parse", "--show-toplevel") != str(root.resolve()):
+        return code
+    status, diff = _git(root, "status", "--porcelain"), _git(root, "diff", "HEAD")
+    return code | {
+        "revision": _git(root, "rev-parse", "HEAD"),
+        "dirty": None if status is None else bool(status),
+        "diff_sha256": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
+    }
+
+
+def _git(root: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def training_settings(config: Config) -> dict[str, Any]:
+    """Returns the settings, other than seeds, that determine the weights: of the training loops and the tokenizer."""
+    parts = {each.name: getattr(config, each.name) for each in fields(config)}
+    trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
+    if config.model.uses_tokenizer:
+        trained["tokenizer"] = config.tokenizer
+    return {name: _without_runtime(part) for name, part in trained.items()}
+
+
+def _without_runtime(part: Any) -> dict[str, Any]:
+    skipped = {name for name, leaf in leaves(part).items() if leaf.runtime or name in BY_SEED}
+    return {name: value for name, value in to_dict(part).items() if name not in skipped}
+
+
+def machine() -> dict[str, Any]:
+    """Returns host, system, Python and devices."""
+    devices = jax.local_devices()
+    return {
+        "host": socket.gethostname(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "cpu_cores": os.cpu_count(),
+        "device_kind": devices[0].device_kind,
+        "platform": devices[0].platform,
+        "local_devices": len(devices),
+        "devices": jax.device_count(),
+        "processes": jax.process_count(),
+        "environment": {k: v for k, v in sorted(os.environ.items()) if k.startswith(("JAX_", "XLA_"))},
+    }

@@ -1,0 +1,284 @@
+"""A run directory: its stages, the configuration that made them, and their durations.
+
+The content key of a stage covers everything that its output depends on. A stage is skipped if its mark (``stage.json``)
+has this key and says "finished"; a mark with another key was made by another configuration.
+"""
+
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rsjax.config import Config, ConfigError, EvalConfig, content_key, from_dict, sampling_settings, to_dict
+from rsjax.data.store import MANIFEST, Store, StoreError, open_store
+from rsjax.data.token_sets import tokenizer_key, tokens_key
+from rsjax.errors import UserError
+from rsjax.files import FileError, holder, lock, read_json, write_json
+from rsjax.tools.sim.collect import collection_key
+
+STAGES = ("collect", "tokenizer", "tokens", "world_model", "evaluation", "report")
+TRAINED = ("tokenizer", "world_model")  # replaced only with --overwrite
+DECIDED_BY = {  # sections of the configuration that a trained stage depends on
+    "tokenizer": ("sim", "data", "tokenizer", "tokenizer_train"),
+    "world_model": ("sim", "data", "tokenizer", "tokenizer_train", "model", "prompt_frames", "train"),
+}
+OUTPUTS = {  # in the run directory; clips are elsewhere, and "tokens" is a link
+    "tokenizer": "tokenizer/weights",
+    "tokens": "tokens/store",
+    "world_model": "world_model/weights",
+    "evaluation": "evaluation/result.msgpack",
+    "report": "report.html",
+}
+MARK = "stage.json"
+RECIPE = 1  # increase it when the same configuration gives new results
+
+
+class RunError(UserError):
+    """A run directory belongs to another configuration, or another process is working in it."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: its configuration, its directory, and the directory of simulated data sets."""
+
+    config: Config
+    directory: Path
+    data_directory: Path
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of this run; a model without tokens needs no tokenizer."""
+        return tuple(stage for stage in STAGES if stage != "tokenizer" or self.config.model.uses_tokenizer)
+
+    @property
+    def clips(self) -> Path:
+        """The path of the store of clips, which all runs on the same episodes share."""
+        return Path(self.config.data.store or self.data_directory / f"{self.config.sim.env}-{self._collect_key}")
+
+    def open_clips(self) -> Store:
+        """Opens the store of clips.
+
+        Raises:
+            StoreError: the store is missing or damaged, or another store is in its place.
+        """
+        key = self.config.data.key
+        if key and not (self.clips / MANIFEST).exists():
+            raise StoreError(f"{self.clips}: the store is missing; if it was moved, name its new path with --store")
+        store = open_store(self.clips)
+        if key and store.manifest.get("key") != key:
+            raise StoreError(
+                f"{self.clips}: is not the store that the run began with (key {store.manifest.get('key')}, not {key}); "
+                f"train on it in another --run-dir, or restore the old one"
+            )
+        return store
+
+    def open_prepared(self) -> Store:
+        """Opens the store that the world model trains on: tokens, or the clips themselves.
+
+        Raises:
+            StoreError: the store is missing or damaged, or was made from other clips.
+        """
+        store = open_store(self.output("tokens").resolve())
+        if not self._made_of_these_clips(store.manifest):
+            raise StoreError(f"{store.path}: holds tokens of other clips; the train command of this run makes its own")
+        return store
+
+    def _made_of_these_clips(self, prepared: dict[str, Any]) -> bool:
+        """Returns whether a store with this manifest was made from the run's clips, which may have moved."""
+        key = self.config.data.key
+        if not key or not self.config.model.uses_tokenizer:
+            return not key or prepared.get("key") == key
+        shifts = prepared.get("shifts", ())
+        tokenizer = tokenizer_key(self.config.autoencoder, str(prepared.get("tokenizer")), *shifts)
+        return prepared.get("key") == tokens_key(key, tokenizer)
+
+    def keys(self) -> dict[str, str]:
+        """Returns each stage's content key, a hash of its settings and the previous stage's key."""
+        cfg, key = self.config, self._collect_key
+        keys = {"collect": key}
+        settings: dict[str, tuple[Any, ...]] = {
+            "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),
+            "tokens": cfg.model.token_shifts,
+            "world_model": (cfg.model, cfg.prompt_frames, cfg.train),
+            "evaluation": (sampling_settings(cfg.model), _by_content(cfg.eval)),
+            "report": (),
+        }
+        for stage, parts in settings.items():
+            if stage not in self.stages:
+                continue
+            key = keys[stage] = content_key(RECIPE, stage, key, *parts)
+        return keys
+
+    @property
+    def _collect_key(self) -> str:
+        cfg = self.config
+        return content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
+
+    @property
+    def lock_file(self) -> Path:
+        """The lock that a process holds while it makes stages here."""
+        return self.directory / ".lock"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps other processes from making stages here; processes that only read are not locked out.
+
+        Raises:
+            RunError: another process is making stages here; the message names it.
+        """
+        with lock(self.lock_file, required=False) as free:
+            if not free:
+                raise RunError(
+                    f"{self.directory}: {holder(self.lock_file)} is training here; wait for it, stop it, or choose "
+                    f"another --run-dir"
+                )
+            yield
+
+    def prepare(self, overwrite: bool) -> None:
+        """Makes the directory, or checks that it fits this configuration, and writes ``config.json``.
+
+        Args:
+            overwrite: whether to delete trained stages of another configuration instead of refusing.
+
+        Raises:
+            RunError: the directory contains a trained stage of another configuration; the message names the fields.
+        """
+        for stage in (stage for stage in TRAINED if stage in self.stages):
+            aside = self.directory / f"{stage}.old"
+            shutil.rmtree(aside, ignore_errors=True)  # left by a command that was killed here
+            if self._key_of_content(stage) not in (None, self.keys()[stage]):
+                if not overwrite:
+                    raise RunError(
+                        f"{self.directory} holds a {stage.replace('_', ' ')} of another configuration "
+                        f"({self._differences(stage)}); choose another --run-dir, or train it again with --overwrite"
+                    )
+                os.replace(self.directory / stage, aside)  # atomic, because half a stage might be resumed
+                shutil.rmtree(aside)
+        write_json(self.directory / "config.json", to_dict(self.config))
+
+    def _key_of_content(self, stage: str) -> str | None:
+        """Returns the key of the trained stage in the directory, from its mark, or from config.json without a mark."""
+        if key := self.mark(stage).get("key"):
+            return str(key)
+        if not (self.directory / stage / "checkpoints").exists():
+            return None
+        try:
+            return replace(self, config=self._saved_config()).keys().get(stage, "")
+        except (ConfigError, FileError, TypeError):
+            return ""
+
+    def _saved_config(self) -> Config:
+        return from_dict(Config, read_json(self.directory / "config.json"))
+
+    def _differences(self, stage: str) -> str:
+        """Describes the fields that differ from the saved stage's, except fields without effect on results."""
+        try:
+            saved = self._saved_config()
+        except ConfigError as error:
+            return f"of another version: {error}"
+        except (FileError, TypeError):
+            return "its config.json is missing or damaged"
+        there, here = (
+            {name: value for part in DECIDED_BY[stage] for name, value in _deciding(*_section(config, part))}
+            for config in (saved, self.config)
+        )
+        pairs = {name: (there.get(name, "not set"), here.get(name, "not set")) for name in here | there}
+        return "; ".join(f"{name} is {a} there, {b} here" for name, (a, b) in pairs.items() if a != b) or "older code"
+
+    def output(self, stage: str) -> Path:
+        """Returns the path of the stage's output, a file or directory that is written atomically."""
+        return self.clips if stage == "collect" else self.directory / OUTPUTS[stage]
+
+    def finished(self, stage: str) -> bool:
+        """Returns whether the stage's output exists and was made by this configuration."""
+        mark = self.mark(stage)
+        marked = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
+        done = marked and self.output(stage).exists()
+        if not done or stage != "tokens":
+            return done
+        try:
+            manifest = read_json(self.output("tokens") / MANIFEST)
+        except FileError:
+            return True  # the stage that reads the clips reports the damage
+        return self._made_of_these_clips(manifest)
+
+    def mark(self, stage: str) -> dict[str, Any]:
+        """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started or the mark is damaged."""
+        with suppress(FileError):
+            mark = read_json(self.directory / stage / MARK)
+            seconds = mark.get("seconds")
+            sound = type(mark.get("key")) is str and type(mark.get("finished")) is bool
+            if sound and type(seconds) in (int, float) and math.isfinite(seconds):
+                return mark
+        return {}
+
+    @contextmanager
+    def stage(self, stage: str) -> Iterator[Path]:
+        """Marks a stage as begun and, after its work, as finished, with its duration; yields its directory.
+
+        Durations add up over interruptions, except those of killed processes.
+        """
+        folder, began = self.directory / stage, time.monotonic()
+        mark = self.mark(stage)
+        before = mark.get("seconds", 0.0) if mark.get("key") == self.keys()[stage] else 0.0
+        finished = False
+        self._write_mark(stage, before, finished)
+        try:
+            yield folder
+            finished = True
+        finally:
+            self._write_mark(stage, before + time.monotonic() - began, finished)
+
+    def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
+        content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
+        write_json(self.directory / stage / MARK, content)
+
+
+def _by_content(settings: EvalConfig) -> EvalConfig:
+    """Returns the settings with paths of weights replaced by content hashes; unchanged if a file cannot be read."""
+    try:
+        return _hashed(settings)
+    except UserError:
+        return settings  # the evaluation reports what is wrong
+
+
+@cache  # hashing large files takes seconds
+def _hashed(settings: EvalConfig) -> EvalConfig:
+    from rsjax.evaluation.results import by_content  # here, because it loads jax
+
+    return by_content(settings)
+
+
+def _section(config: Config, part: str) -> tuple[Any, str]:
+    """Returns a section of the configuration and its dotted name; the tokenizer may be the model's own autoencoder."""
+    own = config.model.own_autoencoder if part == "tokenizer" else None
+    return (getattr(config, part), part) if own is None else (own, "model.autoencoder")
+
+
+def _deciding(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yields the fields that affect results, by dotted name such as ``train.curriculum.0.epochs``."""
+    if isinstance(value, tuple) and any(map(is_dataclass, value)):
+        for i, item in enumerate(value):
+            yield from _deciding(item, f"{name}.{i}")
+    elif is_dataclass(value):
+        decide = [field.name for field in fields(value) if not field.metadata.keys() & {"runtime", "sampling"}]
+        for key in ["family"] * hasattr(value, "family") + decide:
+            yield from _deciding(getattr(value, key), f"{name}.{key}")
+    else:
+        yield name, "empty" if value == "" else value
+
+
+def link(target: Path, at: Path) -> None:
+    """Makes ``at`` a link to ``target``, atomically; replaces what was at that path."""
+    temporary = at.with_name(f"{at.name}.{os.getpid()}.tmp")
+    temporary.unlink(missing_ok=True)
+    if at.is_dir() and not at.is_symlink():  # a copied run contains the tokens themselves
+        shutil.rmtree(at)
+    temporary.symlink_to(target)
+    os.replace(temporary, at)

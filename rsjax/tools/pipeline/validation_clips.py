@@ -1,0 +1,99 @@
+"""Finds the clips that an evaluation scores: a run's own, longer episodes, unseen scenes, and second takes."""
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from typing import TypeVar
+
+import numpy as np
+
+from rsjax.clip import Video
+from rsjax.config import SimConfig
+from rsjax.data.codec import Record
+from rsjax.data.store import Store, StoreError, open_store
+from rsjax.errors import UserError
+from rsjax.evaluation.evaluate import HeldOut
+from rsjax.evaluation.protocols import Protocol
+from rsjax.progress import Progress
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.sim import retakes
+from rsjax.tools.sim.collect import Report, collect, collection_key
+from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
+from rsjax.training.distributed import on_lead
+
+LONGER_SEED = 1_000_000  # added to a run's seed, so that longer episodes differ from the run's own
+LONGER_TRAIN = 2  # episodes in the train split of longer episodes, which nothing uses
+T = TypeVar("T")
+
+
+def chosen_splits(store: Store, wanted: tuple[str, ...]) -> list[str]:
+    """Returns the store's splits with these names; a name that ends in ``*`` stands for all with that beginning."""
+    if lacking := _lacking(store.splits, wanted):
+        raise StoreError(
+            f"{store.path}: no split {lacking[0]!r}; it has {', '.join(store.splits)}: choose with --split, or name "
+            f"another store with --data"
+        )
+    return [split for split in store.splits if any(fnmatchcase(split, pattern) for pattern in wanted)]
+
+
+def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
+    """Returns the wanted names or patterns that match no split."""
+    return [pattern for pattern in wanted if not any(fnmatchcase(split, pattern) for split in splits)]
+
+
+def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
+    """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
+    sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
+    if run.config.data.key:
+        return store
+    if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
+        count = min(protocol.clips, sim.test_episodes)
+        return _simulated(
+            f"scenes never seen, {count} episodes of each kind",
+            lambda report: collect_unseen(sim, store, count, report),
+        )
+    known = not _lacking(store.splits, protocol.splits)
+    if needed <= sim.frames or not known or chosen_splits(store, protocol.splits) != ["test"]:
+        return store
+    longer = longer_episodes(sim, needed, protocol.clips)
+    path = run.data_directory / f"{sim.env}-{collection_key(longer)}"
+
+    def make(report: Report) -> Store:
+        collect(longer, path, report)
+        return open_store(path)
+
+    return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
+
+
+def with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
+    """Adds second takes of all clips, which are simulated if necessary."""
+    protocol, clips = held_out.protocol, held_out.clips
+    if protocol.reference != "recorded":
+        raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
+
+    def make(report: Report) -> list[Record]:
+        return retakes.collect_second_takes(held_out.store, held_out.split, clips.index.tolist(), workers, report)
+
+    takes = _simulated(f"second takes of {len(clips.rgb)} clips", make)
+    return replace(held_out, retakes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
+
+
+def _simulated(what: str, make: Callable[[Report], T]) -> T:
+    """Returns clips that the lead process makes unless they exist; the other processes then find them."""
+    with Progress(f"simulating {what}", 0, "episodes") as progress:
+
+        def report(done: int, total: int) -> None:
+            progress.total = total
+            progress.update(done)
+
+        def work() -> None:
+            make(report)
+
+        on_lead("simulation", work)
+        return make(report)
+
+
+def longer_episodes(sim: SimConfig, frames: int, clips: int) -> SimConfig:
+    """Returns the configuration of held-out episodes that are longer than a run's, with a seed other than the run's."""
+    seed = (sim.seed + LONGER_SEED) % 2**32
+    return replace(sim, frames=frames, seed=seed, episodes=clips + LONGER_TRAIN, test_episodes=clips)

@@ -1,0 +1,159 @@
+"""One thread that generates the frames of all sessions, several in one pass if their settings agree."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.clip import Video
+from rsjax.models.branch_states import Branching, Decoding, Moment
+from rsjax.models.trained import TrainedModel
+
+Say = Callable[[str, bool], None]  # a line for the person who waits, and whether work goes on
+
+
+@dataclass(eq=False)
+class Work:
+    """One frame to generate.
+
+    Attributes:
+        moment: the frame before; generating the next frame uses up its memory.
+        has_depth: whether the clip has depth.
+        say: called, in the engine's thread, when a program is compiled for this frame.
+    """
+
+    moment: Moment
+    action: Float32[np.ndarray, " A"]
+    decoding: Decoding
+    has_depth: bool
+    say: Say
+    done: "Future[Moment]" = field(default_factory=Future)
+
+    @property
+    def key(self) -> tuple[bool, tuple[int, int, bool]]:
+        """The settings that frames generated in one pass have in common."""
+        return self.has_depth, self.decoding.program
+
+
+class Engine:
+    """Generates frames, in the order of the requests.
+
+    Args:
+        model: a model whose family implements ``branching``.
+        lanes: frames in one pass, at most. On an accelerator, results for different values differ in
+            their last bits.
+
+    Attributes:
+        frames: number of frames generated so far.
+
+    Raises:
+        UserError: the family cannot generate frame by frame.
+    """
+
+    def __init__(self, model: TrainedModel, lanes: int = 1) -> None:
+        self.lanes, self.frames = lanes, 0
+        self._model = model
+        self._branching: dict[bool, Branching] = {}
+        self._waiting: deque[Work] = deque()
+        self._compiled: set[tuple[bool, tuple[int, int, bool]]] = set()
+        self._wake, self._closed = threading.Condition(), False
+        self.branching(False)
+        self._thread = threading.Thread(target=self._run, name="play-engine", daemon=True)
+        self._thread.start()
+
+    def branching(self, has_depth: bool) -> Branching:
+        """Returns the generator of clips with or without depth."""
+        with self._wake:
+            if has_depth not in self._branching:
+                inputs = (self._model.params, self._model.assets, has_depth, self.lanes)
+                self._branching[has_depth] = self._model.model.branching(*inputs)
+            return self._branching[has_depth]
+
+    def begin(self, first: Video) -> Moment:
+        """Returns a clip's first frame, (1, 1, …), with depth or without."""
+        return self.branching(first.depth is not None).begin(first)
+
+    def submit(self, work: Work) -> "Future[Moment]":
+        """Requests a frame."""
+        with self._wake:
+            if self._closed:
+                raise RuntimeError("the engine is closed")
+            self._waiting.append(work)
+            self._wake.notify()
+        return work.done
+
+    def close(self) -> None:
+        """Ends the thread and cancels waiting frames."""
+        with self._wake:
+            self._closed = True
+            waiting = list(self._waiting)
+            self._waiting.clear()
+            self._wake.notify()
+        for work in waiting:
+            work.done.cancel()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while works := self._next():
+            works = [work for work in works if work.done.set_running_or_notify_cancel()]
+            if not works:
+                continue
+            try:
+                moments = self._advance(works)
+            except Exception as error:  # a bug, or out of memory: only the sessions of this pass fail
+                for work in works:
+                    work.done.set_exception(error)
+                continue
+            self.frames += len(works)
+            for work, moment in zip(works, moments, strict=True):
+                work.done.set_result(moment)
+
+    def _next(self) -> list[Work]:
+        """Waits for work and returns the work of the next pass; an empty list once the engine is closed."""
+        with self._wake:
+            self._wake.wait_for(lambda: self._waiting or self._closed)
+            if self._closed:
+                return []
+            key = self._waiting[0].key
+            works = [work for work in self._waiting if work.key == key][: self.lanes]
+            for work in works:
+                self._waiting.remove(work)
+            return works
+
+    def _advance(self, works: list[Work]) -> list[Moment]:
+        key, fresh = works[0].key, works[0].key not in self._compiled
+        if fresh:
+            _tell(works, f"compiling for {_count(key[1][0], 'decoding step')} …", True)
+        try:
+            inputs = ([work.moment for work in works], np.stack([work.action for work in works]))
+            return self.branching(key[0]).advance(*inputs, [work.decoding for work in works])
+        finally:
+            if fresh:
+                self._compiled.add(key)
+                _tell(works, "", False)
+
+
+def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> float:
+    """Compiles the program for these settings and returns the seconds that a frame takes afterwards."""
+    moment, seconds = engine.begin(first), 0.0
+    for _ in range(2):
+        began = time.monotonic()
+        work = Work(moment, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None)
+        moment, seconds = engine.submit(work).result(), time.monotonic() - began
+    return seconds
+
+
+def _tell(works: list[Work], text: str, busy: bool) -> None:
+    for work in works:
+        with suppress(RuntimeError):  # the server has stopped
+            work.say(text, busy)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -1,0 +1,152 @@
+"""The run that sessions play: its model, clips, controls and simulator."""
+
+import hashlib
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rsjax.clip import Video
+from rsjax.config import SimConfig, from_dict
+from rsjax.data.clips import frame_rate
+from rsjax.data.codec import Record
+from rsjax.data.store import Source, Store, StoreError
+from rsjax.errors import UserError, first_line
+from rsjax.models.trained import TrainedModel
+from rsjax.tools.play.controls import Controls, controls_of_run
+from rsjax.tools.play.errors import Refused
+from rsjax.tools.policies.policy import Policy
+from rsjax.tools.policies.run_data import RunData
+
+SIMULATED = ("robosuite/Lift", "metaworld/")  # sources of clips whose simulator is available here
+FPS = 5.0  # for runs whose clips have no frame rate
+
+
+@dataclass(frozen=True)
+class PlayRun:
+    """The data that all sessions share.
+
+    Attributes:
+        data: the run and where its clips are.
+        split: the clips to begin with.
+        policy: a policy that can act, or None.
+        out: the directory of the files that viewers save.
+    """
+
+    data: RunData
+    split: str = "test"
+    policy: Policy | None = None
+    out: Path = Path("play")
+
+    @cached_property
+    def trained(self) -> TrainedModel:
+        return self.data.trained
+
+    @cached_property
+    def store(self) -> Store | None:
+        """The run's clips; None if they are missing, so that sessions can begin only with uploaded pictures."""
+        try:
+            store = self.data.clips
+            return store if self.split in store.splits else None
+        except UserError:
+            return None
+
+    @cached_property
+    def missing(self) -> str:
+        """Why there are no clips; "" if there are some."""
+        try:
+            store = self.data.clips
+        except UserError as error:
+            return first_line(error)
+        return "" if self.split in store.splits else f"{store.path}: has no split {self.split}"
+
+    @cached_property
+    def source(self) -> Source | None:
+        return None if self.store is None else self.store.source(self.split)
+
+    @property
+    def clips(self) -> int:
+        """The number of clips to begin with."""
+        return 0 if self.source is None else len(self.source)
+
+    def clip(self, number: int) -> Record:
+        """Returns a clip; raises :class:`Refused` if there is no clip with this number, or it is damaged."""
+        if self.source is None or not 0 <= number < self.clips:
+            has = f"has 0 to {self.clips - 1}" if self.clips else f"is missing: {self.missing}"
+            raise Refused("no_clip", f"there is no clip {number}; the {self.split} split {has}")
+        try:
+            return self.source[number]
+        except StoreError as error:
+            raise Refused("no_clip", first_line(error)) from error
+
+    @cached_property
+    def has_depth(self) -> bool:
+        """Whether the model generates depth."""
+        model = self.trained
+        return model.config.model.uses_depth and model.assets.normalization.depth_range is not None
+
+    def first(self, clip: Record) -> Video:
+        """Returns a clip's first frame, with depth if the model and the clip have it."""
+        depth = clip["depth"][None, :1] if self.has_depth and clip["depth"] is not None else None
+        return Video(clip["rgb"][None, :1], depth)
+
+    @cached_property
+    def controls(self) -> Controls:
+        names = self.store.manifest.get("action_dimensions") if self.store else None
+        return controls_of_run(self.data.config, self.trained.assets.normalization, names or ())
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the clips, from the first clip."""
+        if self.store is not None:
+            with suppress(Refused):  # the clip is damaged
+                return frame_rate(self.clip(0), self.store.manifest) or FPS
+        return FPS
+
+    @cached_property
+    def simulator(self) -> SimConfig | None:
+        """The simulator that the clips are from; None for recordings."""
+        source = str(self.store.manifest.get("source") or "") if self.store else ""
+        if self.store is None or not source.startswith(SIMULATED):
+            return None
+        return from_dict(SimConfig, self.store.manifest["config"])
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A hash of the weights, 16 hexadecimal digits: a link works for runs with the same fingerprint."""
+        digest = hashlib.sha256(repr(self.trained.config.model).encode())
+        for leaf in jax.tree.leaves((self.trained.params, self.trained.assets.tokenizer)):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return digest.hexdigest()[:16]
+
+    @property
+    def bits(self) -> int:
+        """The most entropy that a token can have."""
+        return int(self.trained.config.tokenizer.code_bits)
+
+    def describe(self) -> dict[str, Any]:
+        """Returns the description of the run for a page."""
+        config, model = self.data.config, self.trained
+        near_far = model.assets.normalization.depth_range if self.has_depth else None
+        return {
+            "name": self.data.run.absolute().name,
+            "family": config.model.family,
+            "preset": config.name,
+            "fingerprint": self.fingerprint,
+            "frames": config.clips.frames,
+            "image_size": config.clips.image_size,
+            "grid": config.grid,
+            "has_depth": self.has_depth,
+            "depth_range": list(near_far) if near_far else None,
+            "fps": self.fps if math.isfinite(self.fps) else FPS,
+            "split": self.split,
+            "clips": self.clips,
+            "missing": self.missing,
+            "source": str(self.store.manifest.get("source") or "") if self.store else "",
+            "device": jax.devices()[0].device_kind if jax.default_backend() != "cpu" else "cpu",
+        }

@@ -1,0 +1,200 @@
+"""One viewer's session: a start, settings, and a tree of branches that grows frame by frame."""
+
+import asyncio
+import secrets
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32
+
+from rsjax.clip import Video
+from rsjax.data.codec import Record
+from rsjax.models.branch_states import Decoding, Moment
+from rsjax.tools.play.engine import Engine, Work
+from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.memory import Memories
+from rsjax.tools.play.pictures import Upload
+from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.settings import MOST_SEED, first_settings, settings_limits
+from rsjax.tools.play.tree import Branch, Node, Tree
+
+MOST_BRANCHES = 32
+MOST_FRAMES = 4096
+FRAME_BYTES = 256 * 2**20  # of a session's pictures; for large pictures this lowers the number of frames
+
+
+class Outbox(Protocol):
+    """The destination of a session's messages."""
+
+    def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None: ...
+    async def room(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Start:
+    """The beginning of a session's branches: a clip of the run, or an uploaded picture.
+
+    Attributes:
+        number: the clip's number.
+        clip: the clip.
+    """
+
+    number: int | None
+    clip: Record | None
+    upload: Upload | None
+
+    def describe(self) -> dict[str, Any]:
+        """Returns the description of the start for a page."""
+        if self.clip is None:
+            assert self.upload is not None
+            return {"start": {"upload": self.upload.describe()}, "task": "", "clip_frames": None}
+        facts = {"start": {"clip": self.number}, "task": str(self.clip["task"])}
+        return facts | {"clip_frames": len(self.clip["rgb"])}
+
+
+class Session:
+    """One viewer's session. Its coroutines run one after another, in the order of the viewer's messages.
+
+    Args:
+        run: the run to play.
+        engine: generates the session's frames.
+        memories: the memories of all sessions.
+
+    Attributes:
+        name: a name that nobody can guess.
+        out: the destination of messages; None while no page is connected.
+        watched: kinds of pictures that are sent with each new frame.
+        used: when the last message came or the last frame was made, in seconds of :func:`time.monotonic`.
+    """
+
+    def __init__(self, run: PlayRun, engine: Engine, memories: Memories) -> None:
+        self.name, self.used = secrets.token_urlsafe(16), time.monotonic()
+        self.run, self.engine = run, engine
+        self.out: Outbox | None = None
+        self.watched: list[str] = []
+        self.settings, self.seed = first_settings(run.data.config), 0
+        self.upload: Upload | None = None
+        self.start: Start | None = None
+        self.tree: Tree | None = None
+        self._memories = memories
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """The limits of a session."""
+        frame = 3 * self.run.data.config.clips.image_size**2
+        most = {"frames": min(MOST_FRAMES, FRAME_BYTES // frame), "branches": MOST_BRANCHES}
+        return settings_limits(self.run.data.config) | most
+
+    @property
+    def grown(self) -> Tree:
+        """The tree; raises :class:`Refused` before the first start."""
+        if self.tree is None:
+            raise Refused("no_start", "begin with a clip or a picture first")
+        return self.tree
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the session's frames have depth."""
+        return self.tree is not None and "depth" in self.grown.node(0, 0).moment.tokens
+
+    def describe(self) -> dict[str, Any]:
+        """Returns the description of a session that has a start, for a page."""
+        assert self.start is not None
+        facts = self.start.describe() | {"seed": self.seed, "settings": self.settings.describe()}
+        branches = [branch.describe() for branch in self.grown.branches.values()]
+        return facts | {"session": self.name, "has_depth": self.has_depth, "branches": branches}
+
+    def send(self, item: bytes | dict[str, Any], droppable: bool = False) -> None:
+        """Sends a message, unless no page is connected."""
+        if self.out is not None:
+            self.out.put(item, droppable)
+
+    async def begin(self, start: Start, seed: int) -> None:
+        """Begins a new tree; the old one is forgotten."""
+        if start.clip is not None:
+            first, draw = self.run.first(start.clip), int(start.number or 0)
+        else:
+            assert start.upload is not None
+            first, draw = Video(start.upload.rgb[None, None]), 0
+        moment = await asyncio.to_thread(self.engine.begin, first)
+        self.forget()
+        self.start, self.seed = start, seed
+        self.tree = Tree(Node(moment), draw)
+
+    def clip_start(self, number: int) -> Start:
+        """Returns a clip as a start."""
+        return Start(number, self.run.clip(number), None)
+
+    def upload_start(self) -> Start:
+        """Returns the last uploaded picture as a start."""
+        if self.upload is None:
+            raise Refused("no_upload", "send a picture first")
+        return Start(None, None, self.upload)
+
+    def fork(self, number: int, frame: int, fresh: bool) -> Branch:
+        """Makes a branch; if ``fresh``, it has its own random draws."""
+        if len(self.grown.branches) >= MOST_BRANCHES:
+            raise Refused("full", f"a session can have {MOST_BRANCHES} branches; drop one")
+        draw = secrets.randbelow(MOST_SEED) if fresh else None
+        return self.grown.fork(number, frame, draw)
+
+    def drop(self, number: int) -> None:
+        """Removes a branch from which no other branch forks."""
+        branch = self.grown.branch(number)
+        self.grown.drop(number)
+        if len(branch.nodes) - 1 > int(branch.fork or 0):  # otherwise the parent has its last frame
+            self._memories.forget(branch.nodes[-1])
+            branch.nodes[-1].moment = self._lighten(branch.nodes[-1].moment)
+
+    async def step(self, number: int, action: Float32[np.ndarray, " A"], decoding: Decoding | None = None) -> int:
+        """Generates a branch's next frame and returns its number.
+
+        Args:
+            action: the action, within limits.
+            decoding: None: according to the session's settings.
+        """
+        tree = self.grown
+        branch = tree.branch(number)
+        if tree.frames >= self.limits["frames"]:
+            raise Refused("full", f"a session can have {self.limits['frames']} frames; begin again, or drop a branch")
+        how = decoding or self.settings.decoding(self.seed, branch.draw)
+        await self._recall(branch.nodes)
+        moment = await self._advance(branch.nodes[-1], action, how)
+        node = Node(moment, action, how)
+        self._memories.note(node, self._lighten)
+        return tree.append(number, node)
+
+    def forget(self) -> None:
+        """Forgets the start and the tree, and frees its memory."""
+        if self.tree is not None:
+            for branch in self.tree.branches.values():
+                for node in branch.nodes:
+                    self._memories.forget(node)
+        self.tree = self.start = None
+
+    async def _recall(self, nodes: list[Node]) -> None:
+        """Restores the last frame's memory, by generating the frames again from the nearest one that has its memory."""
+        known = len(nodes) - 1
+        while nodes[known].moment.memory is None:
+            known -= 1
+        for before, node in zip(nodes[known:], nodes[known + 1 :], strict=False):
+            assert node.action is not None and node.decoding is not None
+            node.moment = await self._advance(before, node.action, node.decoding)
+
+    async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> Moment:
+        moment, loop = node.moment, asyncio.get_running_loop()
+        self._memories.forget(node)
+        node.moment = self._lighten(moment)
+
+        def say(text: str, busy: bool) -> None:
+            loop.call_soon_threadsafe(self.send, {"type": "status", "text": text, "busy": busy})
+
+        work = Work(moment, action, how, self.has_depth, say)
+        made = await asyncio.wrap_future(self.engine.submit(work))
+        self.used = time.monotonic()
+        return made
+
+    def _lighten(self, moment: Moment) -> Moment:
+        return self.engine.branching(self.has_depth).lightened(moment)

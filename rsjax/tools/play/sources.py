@@ -1,0 +1,124 @@
+"""Sources of actions other than a person: a clip, random draws, a policy, a planner.
+
+Axes: A action dimensions, S×S pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.errors import UserError
+from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import choice, whole
+from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.session import Session
+from rsjax.tools.play.tree import Branch, Node
+from rsjax.tools.policies.judge import FILE
+from rsjax.tools.policies.judging import FOLDER
+from rsjax.tools.policies.planning import PlanSettings, actors
+
+KINDS = ("clip", "random", "policy", "planner")
+Act = Callable[[dict[str, np.ndarray]], Any]
+
+
+@dataclass
+class Acting:
+    """A policy or planner that acts in one branch, because it remembers earlier frames.
+
+    Attributes:
+        last: the frame that its last action led to; after any other frame, a new policy or planner takes over.
+    """
+
+    kind: str
+    act: Act
+    last: Node | None = None
+
+
+@dataclass
+class Sources:
+    """The sources of actions in one session; each branch has its own policy or planner."""
+
+    run: PlayRun
+    acting: dict[int, Acting] = field(default_factory=dict)
+
+    def action(self, session: Session, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
+        """Returns the action that leads to a branch's next frame. This may be slow: a planner tries many actions.
+
+        Raises:
+            Refused: the source is missing, or has no action for this frame.
+        """
+        kind, frame = choice(source, "kind", KINDS), len(branch.nodes)
+        if reason := reasons(self.run)[kind]:
+            raise Refused("no_source", reason)
+        if kind == "clip":
+            return self._of_clip(session, source, frame)
+        if kind == "random":
+            return self.run.controls.random(np.random.default_rng([session.seed, branch.draw, frame]))
+        acting = self.acting.get(branch.number)
+        if acting is None or acting.kind != kind or acting.last is not branch.nodes[-1]:
+            acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
+        return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)
+
+    def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
+        """Notes that an action of this source (None: a person) led to the branch's last frame."""
+        acting = self.acting.get(branch.number)
+        if acting is not None and source is not None and source["kind"] == acting.kind:
+            acting.last = branch.nodes[-1]
+
+    def _of_clip(self, session: Session, source: dict[str, Any], frame: int) -> Float[np.ndarray, " A"]:
+        if "clip" in source:
+            actions = self.run.clip(whole(source, "clip", 0, 2**31))["actions"]
+            return actions[1 + (frame - 1) % (len(actions) - 1)]
+        if session.start is None or session.start.clip is None:
+            raise Refused("no_action", "a picture has no actions of its own; choose a clip's")
+        actions = session.start.clip["actions"]
+        if frame >= len(actions):
+            raise Refused("no_action", f"the clip ends after {len(actions)} frames")
+        return actions[frame]
+
+    def _actor(self, kind: str, session: Session, branch: Branch) -> Act:
+        if kind == "policy":
+            assert self.run.policy is not None
+            act = self.run.policy.actor(session.seed)
+            return lambda seen: act(seen["rgb"][None])[0]
+        settings = PlanSettings(methods=("cem",))
+        planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
+        return planner(session.seed, branch.nodes[0].moment.rgb)
+
+
+def reasons(run: PlayRun) -> dict[str, str]:
+    """Returns, for each kind of source, why it is missing; "" if it is there."""
+    config = run.data.config
+    why = {"stick": "", "clip": run.missing, "random": "", "policy": "", "planner": ""}
+    if run.policy is None:
+        why["policy"] = "no policy was named with --policy"
+    if config.data.key or config.sim.env != "lift":
+        why["planner"] = "planning needs a run on the simulated Lift"
+    elif not (run.data.run / FOLDER / FILE).exists():
+        why["planner"] = f"the run has no judge; python -m experiments.judge {run.data.run} trains one"
+    return why
+
+
+def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
+    """Returns a policy's observation of a frame."""
+    seen = {"rgb": node.moment.rgb}
+    if session.has_depth:
+        depth = session.engine.branching(True).depth(node.moment)
+        seen |= {} if depth is None else {"depth": depth}
+    return seen
+
+
+def check_policy(run: PlayRun) -> None:
+    """Raises :class:`UserError` if the policy's frames or actions differ in size from the run's."""
+    if run.policy is None:
+        return
+    clips = run.data.config.clips
+    own, wanted = (run.policy.model.image_size, run.policy.action_dim), (clips.image_size, clips.action_dim)
+    if own != wanted:
+        raise UserError(
+            f"--policy: the policy sees {own[0]} pixels and answers with {own[1]} numbers; the run has {wanted[0]} "
+            f"and {wanted[1]}"
+        )

@@ -1,0 +1,150 @@
+"""A session together with what its page sees."""
+
+import asyncio
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.data.codec import Record
+from rsjax.tools.play import shown
+from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.frames import Place
+from rsjax.tools.play.keep import Files
+from rsjax.tools.play.session import Session
+from rsjax.tools.play.shown import BACKLOG, Side
+from rsjax.tools.play.sources import Sources
+from rsjax.tools.play.tree import Branch, Node
+from rsjax.tools.play.truth import Follower, Truths
+
+_TRUTHS = {"truth", "truth_depth"}
+
+
+class Viewer:
+    """A session, its sources of actions, and the tasks that send pictures to its page.
+
+    Args:
+        side: the thread for work that may be late.
+        files: the files that sessions save.
+        truths: the simulators of all viewers.
+    """
+
+    def __init__(self, session: Session, side: Side, files: Files, truths: Truths) -> None:
+        self.session, self.side, self.files, self._truths = session, side, files, truths
+        self._follower: Follower | None = None
+        self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator shall reach
+        self._chase: object | None = None  # identifies the task that does this; a new start gets a new one
+        self.sources = Sources(session.run)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def describe(self) -> dict[str, Any]:
+        """Returns the description of the session for a page."""
+        start = self.session.start
+        has_truth = not self.no_truth and start is not None and start.clip is not None
+        return self.session.describe() | {"has_truth": has_truth}
+
+    @property
+    def no_truth(self) -> str:
+        """Why no simulator can run beside sessions; "" if one can."""
+        return "" if self._truths.make else "the clips are of no simulator that is here"
+
+    def begun(self) -> None:
+        """Forgets what belonged to the previous tree."""
+        self.sources.acting.clear()
+        self.rest()
+
+    def rest(self) -> None:
+        """Gives the simulator back, for other viewers."""
+        self._wanted = self._chase = None
+        if self._follower is not None:
+            self._follower.close()
+            self._follower = None
+
+    def close(self) -> None:
+        """Frees everything at the end of the session."""
+        for task in self._tasks:
+            task.cancel()
+        self.rest()
+        self.session.forget()
+
+    async def sourced(self, branch: Branch, source: dict[str, Any]) -> Float[np.ndarray, " A"]:
+        """Returns a source's action that leads to a branch's next frame."""
+        return await asyncio.to_thread(self.sources.action, self.session, branch, source)
+
+    async def show(self, number: int, frame: int, answered: int) -> None:
+        """Sends a new frame, and starts to compute what else the page watches."""
+        session = self.session
+        nodes = session.grown.branch(number).nodes
+        place, node = Place(number, frame, answered), nodes[frame]
+        shown.send_rgb(session, place, node)
+        if "uncertainty" in session.watched:
+            shown.send_uncertainty(session, place, node)
+        if "depth" in session.watched and session.has_depth and self.side.waiting < BACKLOG:
+            self._later(shown.send_depth(session, self.side, place, node))
+        if "points" in session.watched and self.side.waiting < BACKLOG:
+            self._later(shown.send_points(session, self.side, place, nodes[: frame + 1], "rgb"))
+        if _TRUTHS & set(session.watched):
+            self._follow(number, frame)
+
+    async def again(self, place: Place, nodes: list[Node], kinds: list[str]) -> None:
+        """Sends the wanted kinds of pictures of an older frame, the last of these nodes."""
+        session, node = self.session, nodes[-1]
+        if session.out is not None:
+            await session.out.room()
+        if "rgb" in kinds:
+            shown.send_rgb(session, place, node)
+        if "uncertainty" in kinds:
+            shown.send_uncertainty(session, place, node)
+        if "depth" in kinds and session.has_depth:
+            await shown.send_depth(session, self.side, place, node)
+        if "points" in kinds:
+            await shown.send_points(session, self.side, place, nodes, "rgb")
+            if node.truth is not None:
+                await shown.send_points(session, self.side, place, nodes, "truth")
+        if _TRUTHS & set(kinds):
+            if node.truth is None and _TRUTHS & set(session.watched):
+                self._follow(place.branch, place.frame)
+            shown.send_truth(session, place, node, kinds, shown.mean_psnr(nodes))
+
+    def _follow(self, number: int, frame: int) -> None:
+        """Sends the simulator to a frame, instead of one that it has not reached; frames on the way are shown too."""
+        start = self.session.start
+        if start is None or start.clip is None or self.no_truth:
+            return
+        self._wanted = number, frame
+        if self._chase is None:
+            self._chase = object()
+            self._later(self._catch_up(start.clip, self._chase))
+
+    async def _catch_up(self, clip: Record, chase: object) -> None:
+        session = self.session
+        try:
+            while self._wanted is not None:
+                (number, frame), self._wanted = self._wanted, None
+                nodes = session.grown.branch(number).nodes[: frame + 1]
+                if self._follower is None:
+                    task = str(clip["task"]) if session.run.simulator and session.run.simulator.train_tasks else ""
+                    self._follower = Follower(self._truths, clip["provenance"], task)
+                filled = await self._follower.follow(nodes)
+                if self._chase is not chase:  # these frames are of an earlier start
+                    return
+                for each in filled:
+                    place = Place(number, each, 0)
+                    shown.send_truth(session, place, nodes[each], session.watched, shown.mean_psnr(nodes[: each + 1]))
+                    if "points" in session.watched:
+                        await shown.send_points(session, self.side, place, nodes[: each + 1], "truth")
+        except Refused as error:
+            if self._chase is chase:
+                session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})
+        finally:
+            if self._chase is chase:
+                self._chase = None
+
+    def mean_bits(self, node: Node) -> float | None:
+        """Returns the mean entropy of a frame's tokens in bits."""
+        return None if node.moment.entropy is None else round(float(node.moment.entropy.mean() / np.log(2)), 4)
+
+    def _later(self, work: Any) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

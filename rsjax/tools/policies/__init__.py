@@ -1,0 +1,49 @@
+"""Robot policies and a world model: environments to act in, judges of success, a planner.
+
+Importing this package registers the environments with Gymnasium::
+
+    import gymnasium, rsjax.tools.policies
+
+    gymnasium.make("rsjax/WorldModel-v0", run="runs/tiny")
+    gymnasium.make_vec("rsjax/WorldModel-v0", num_envs=64, run="runs/tiny")
+    gymnasium.make("rsjax/Lift-v0")
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rsjax.tools.policies.env import WorldModelEnv
+    from rsjax.tools.policies.simulator import LiftEnv
+    from rsjax.tools.policies.vector_env import WorldModelVectorEnv
+
+__all__ = ["LiftEnv", "WorldModelEnv", "WorldModelVectorEnv", "register"]
+
+_WHERE = {"LiftEnv": "simulator", "WorldModelEnv": "env", "WorldModelVectorEnv": "vector_env"}
+_ENVIRONMENTS: dict[str, dict[str, Any]] = {
+    "rsjax/WorldModel-v0": {
+        "entry_point": "rsjax.tools.policies.env:WorldModelEnv",
+        "vector_entry_point": "rsjax.tools.policies.vector_env:WorldModelVectorEnv",
+    },
+    "rsjax/Lift-v0": {"entry_point": "rsjax.tools.policies.simulator:LiftEnv"},
+}
+
+
+def register() -> None:
+    """Registers the environments with Gymnasium, once. Making one imports its module."""
+    import gymnasium
+
+    for name, entries in _ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(name, **entries)
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public class, and with it jax or the simulator, at its first use."""
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"rsjax.tools.policies.{_WHERE[name]}"), name)
+
+
+register()

@@ -1,0 +1,150 @@
+"""Loads what the policy experiments take from a run: its clips, simulator, judge and world model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from rsjax.config import Config, SimConfig, from_dict
+from rsjax.data.clips import readable
+from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
+from rsjax.models.load_run import load, load_config
+from rsjax.models.trained import TrainedModel
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import relocated
+from rsjax.tools.policies.actions import check_takes_actions
+from rsjax.tools.policies.config import PolicyConfig, policy_preset
+from rsjax.tools.policies.demos import Demos, Only, load_demos
+from rsjax.tools.policies.episodes import action_range
+from rsjax.tools.policies.judge import load_judge
+from rsjax.tools.policies.judging import FOLDER
+from rsjax.tools.policies.rollouts import FirstFrame, Imagined
+from rsjax.tools.policies.verdicts import Judge
+
+TAKEN = {"policy", "simulator", "videos"}  # folders beside those of the runs, in the results of policy_evaluation
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run directory and where its clips are.
+
+    Attributes:
+        run: the directory.
+        data_dir: the directory of simulated data sets.
+        moved: the new path of the run's store of ingested clips, if it was moved.
+    """
+
+    run: Path
+    data_dir: Path = Path("data")
+    moved: Path | None = None
+
+    @cached_property
+    def config(self) -> Config:
+        config = load_config(self.run)
+        return relocated(config, self.moved) if self.moved else config
+
+    @cached_property
+    def clips(self) -> Store:
+        """The store that the run was trained on."""
+        return Run(self.config, self.run, self.data_dir).open_clips()
+
+    @cached_property
+    def trained(self) -> TrainedModel:
+        return load(self.run)
+
+    @property
+    def simulator(self) -> SimConfig:
+        """The simulator that the clips are from.
+
+        Raises:
+            UserError: the clips are recordings, or from another simulator.
+        """
+        source = str(self.clips.manifest.get("source") or "an unknown source")
+        if not source.startswith("robosuite/Lift"):
+            raise UserError(
+                f"{self.clips.path}: clips of {source}; policies are tried in the simulated Lift, so take a run on its "
+                f"clips"
+            )
+        return from_dict(SimConfig, self.clips.manifest["config"])
+
+    def world(self, count: int, judge: Path | None = None) -> Imagined:
+        """Returns the run's world model as a world of ``count`` episodes, with the run's judge or that in a folder.
+
+        Raises:
+            UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
+        """
+        check_takes_actions(self.config.model, f"{self.run}: the model")
+        low, high, _ = action_range(self.config, self.trained.assets.normalization)
+        return Imagined(self.trained, count, self.judge(judge), low, high)
+
+    def check_world(self, like: "RunData") -> None:
+        """Checks, without loading weights, that policies of another run's clips can act in this run's model.
+
+        Raises:
+            UserError: the run is unfinished, its model takes no actions, or frames or actions differ in size.
+        """
+        check_takes_actions(self.config.model, f"{self.run}: the model")
+        shapes = [(clips.image_size, clips.action_dim) for clips in (self.config.clips, like.config.clips)]
+        if shapes[0] != shapes[1]:
+            raise UserError(
+                f"{self.run}: frames of {shapes[0][0]} pixels and actions of {shapes[0][1]} numbers, {like.run} has "
+                f"{shapes[1][0]} and {shapes[1][1]}; compare runs on the same clips"
+            )
+        if not (self.run / "world_model" / "weights").exists():
+            raise UserError(f"{self.run}: its world model is not trained yet; the train command of this run goes on")
+
+    def judge(self, folder: Path | None = None) -> Judge:
+        """Returns the run's judge, or the one in another folder.
+
+        Raises:
+            UserError: there is no judge, or its frames differ in size from the run's.
+        """
+        return load_judge(folder or self.run / FOLDER, self.config.clips.image_size)
+
+    def first_frames(self, count: int, split: str = "train") -> list[FirstFrame]:
+        """Returns the first frames of ``count`` clips, with depth if the clips have it."""
+        source = self.clips.source(split)
+        chosen = readable(source, range(min(count, len(source))))
+        return [
+            FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number)
+            for number, clip in chosen
+        ]
+
+    def demos(self, only: Only = "success", seed: int = 0) -> Demos:
+        """Returns the run's training clips as demonstrations."""
+        return load_demos(self.clips, ["train"], only, seed)
+
+
+def synthetic_demos(path: Path, run: Path) -> Demos:
+    """Returns the demonstrations that ``experiments.synthesize`` made.
+
+    Raises:
+        UserError: there are none.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: not there; make synthetic demonstrations with python -m experiments.synthesize {run}")
+    return load_demos(open_store(path), ["train"])
+
+
+def sized_policy(size: str, steps: int) -> PolicyConfig:
+    """Returns the policy settings of a named size, with another number of training steps if one is given.
+
+    Raises:
+        ConfigError: there is no such size.
+    """
+    config = policy_preset(size)
+    return replace(config, train=replace(config.train, steps=steps)) if steps else config
+
+
+def named(runs: Sequence[Path]) -> dict[str, Path]:
+    """Names each run by the shortest end of its path that tells the runs apart, and from other folders of results.
+
+    Raises:
+        UserError: two runs are the same.
+    """
+    for parts in range(1, 8):
+        names = ["-".join(run.absolute().parts[-parts:]) for run in runs]
+        if len(set(names) - TAKEN) == len(names):
+            return dict(zip(names, runs, strict=True))
+    raise UserError(f"two of the runs {', '.join(map(str, runs))} are the same; name each once")

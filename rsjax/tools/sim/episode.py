@@ -1,0 +1,217 @@
+"""Simulates one episode, in either simulator, as a clip with exact depth and tracks."""
+
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int32
+
+from rsjax.clip import Clip
+from rsjax.config import SimConfig, to_dict
+from rsjax.config.metaworld import SIMPLE
+from rsjax.config.sim import CONTROLS
+from rsjax.tools.sim import expert as lift_expert
+from rsjax.tools.sim import lift, metaworld
+from rsjax.tools.sim.render import Camera, View
+from rsjax.tools.sim.scenery import SEEN, Change, Variation, draw_variation
+from rsjax.tools.sim.tracks import Snapshot, grid_pixels, object_pixels, track
+
+
+class Simulator(Protocol):
+    """The interface that an episode needs from a simulator; lengths in metres, in world coordinates."""
+
+    def reset(self, seed: int, variation: Variation = ..., /) -> None: ...
+    def step(self, action: Float[np.ndarray, " C"], /) -> None: ...
+    def render(self) -> View: ...
+    def segment(self) -> Int32[np.ndarray, "S S"]: ...
+    def body_poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 3 3"]]: ...
+    def close(self) -> None: ...
+
+    @property
+    def state(self) -> Any: ...  # what its expert observes
+    @property
+    def success(self) -> bool: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def movable(self) -> Bool[np.ndarray, " bodies"]: ...
+    @property
+    def object_bodies(self) -> Int32[np.ndarray, " N"]: ...
+    @property
+    def object_width(self) -> float: ...
+    @property
+    def places(self) -> dict[str, Float[np.ndarray, " 3"]]: ...  # positions of main object and gripper, in this order
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Recorded actions that an episode repeats instead of following an expert.
+
+    Attributes:
+        actions: the actions of a clip; those of frame 0 lead into no frame and are not repeated.
+        jitter: standard deviation of the noise added to each number; the sum is clipped to [-1, 1].
+    """
+
+    actions: Float[np.ndarray, "T A"]
+    jitter: float
+
+
+@dataclass(frozen=True)
+class EpisodePlan:
+    """Describes one episode to simulate.
+
+    Attributes:
+        name: name of the episode's file while a store is collected.
+        episode: its number; together with the seed it determines everything except the other fields.
+        task: the Meta-World task; empty in Lift.
+        change: what looks different from training.
+        replay: actions that replace the expert's.
+    """
+
+    name: str
+    episode: int
+    task: str = ""
+    change: Change | None = None
+    replay: Replay | None = None
+
+
+class Simulators:
+    """The simulators of all tasks, of which one is open at a time. Call :meth:`close` when done."""
+
+    def __init__(self, config: SimConfig) -> None:
+        self._config, self._task = config, ""
+        self._sim: Simulator | None = None
+
+    def __call__(self, task: str) -> Simulator:
+        """Returns the simulator of a task and closes that of any other task."""
+        if self._sim is None or task != self._task:
+            self.close()
+            cfg = self._config
+            lifts = cfg.env == "lift"
+            sim = lift.LiftSim if lifts else lambda *view: metaworld.MetaworldSim(task, *view)
+            self._sim, self._task = sim(cfg.camera, cfg.image_size), task
+        return self._sim
+
+    def close(self) -> None:
+        """Closes the open simulator."""
+        if self._sim is not None:
+            self._sim.close()
+        self._sim = None
+
+
+def task_of(config: SimConfig, episode: int) -> str:
+    """Returns the task of an episode; empty in Lift.
+
+    Successive episodes go through all training tasks in random order, then through all of them in a new order.
+    """
+    tasks = config.train_tasks
+    if not tasks:
+        return ""
+    order = np.random.default_rng([config.seed, episode // len(tasks), 3]).permutation(len(tasks))
+    return tasks[order[episode % len(tasks)]]
+
+
+def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
+    """Simulates one episode, which depends only on the configuration and the plan.
+
+    Frame 0 is the initial state; ``config.control_steps`` control steps lead to each later frame.
+    """
+    episode = plan.episode
+    rng = np.random.default_rng([config.seed, episode])
+    looks = draw_variation(plan.change, np.random.default_rng([config.seed, episode, 2])) if plan.change else SEEN
+    sim.reset(int(rng.integers(2**32)), looks)
+    act, manner = _expert(sim, rng)
+    if plan.replay:
+        act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))
+    views, shots, success, places = [], [], [], []
+    actions = np.zeros((config.frames, config.control_steps, CONTROLS[config.env]), np.float32)
+    for frame in range(config.frames):
+        for step in range(config.control_steps if frame else 0):
+            actions[frame, step] = act(sim.state)
+            sim.step(actions[frame, step])
+        views.append(sim.render())
+        shots.append(Snapshot(sim.camera, *sim.body_poses(), views[-1].fine_depth))
+        success.append(sim.success)
+        places.append(sim.places)
+        if frame == 0:
+            bodies = sim.segment()
+            pixels = _track_pixels(config, sim, bodies, np.random.default_rng([config.seed, episode, 1]))
+    tracks, visible = track(pixels, views[0].depth, bodies, shots)
+    provenance = _origin(config, episode) | {
+        "expert": to_dict(manner),
+        "objects": _in_the_image(shots[0].camera, places, sim.object_width),
+        "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
+    }
+    simple = plan.task in SIMPLE if plan.task else manner.mode in lift_expert.SIMPLE
+    provenance["difficulty"] = "simple" if simple else "difficult"
+    if plan.replay:
+        provenance["replay"] = {"jitter": plan.replay.jitter}
+    if plan.change:
+        provenance["unseen"] = {"what": plan.change} | to_dict(looks)
+    return Clip(
+        rgb=np.stack([view.rgb for view in views]),
+        depth=np.stack([view.depth for view in views]),
+        actions=actions.reshape(config.frames, -1),
+        tracks=tracks,
+        visible=visible,
+        success=np.array(success),
+        task=plan.task or (lift.ANY_TASK if plan.change == "color" else lift.TASK),
+        provenance=provenance,
+    )
+
+
+def source_name(config: SimConfig) -> str:
+    """Returns the name of the simulator and its robot."""
+    return "robosuite/Lift/Panda" if config.env == "lift" else "metaworld/Sawyer"
+
+
+def _packages(config: SimConfig) -> tuple[str, ...]:
+    return ("robosuite" if config.env == "lift" else "metaworld", "mujoco")
+
+
+def _origin(config: SimConfig, episode: int) -> dict[str, Any]:
+    return {
+        "source": source_name(config),
+        "seed": config.seed,
+        "episode": episode,
+        "camera": config.camera,
+        "control_hz": 20 if config.env == "lift" else metaworld.CONTROL_HZ,
+    }
+
+
+def _expert(sim: Any, rng: np.random.Generator) -> tuple[Callable[[Any], Float[np.ndarray, " C"]], Any]:
+    """Draws an episode's manner and returns the policy with it."""
+    if isinstance(sim, metaworld.MetaworldSim):
+        manner = metaworld.draw_manner(rng)
+        return metaworld.Expert(sim.policy, manner, rng).act, manner
+    lifts = lift_expert.draw_manner(rng)
+    return lift_expert.Expert(lifts, rng).act, lifts
+
+
+def _replayed(replay: Replay, controls: int, rng: np.random.Generator) -> Callable[[Any], Float[np.ndarray, " C"]]:
+    """Returns a policy that repeats recorded actions with jitter and ignores its observations."""
+    recorded = replay.actions[1:].reshape(-1, controls)
+    steps = iter(np.clip(recorded + replay.jitter * rng.standard_normal(recorded.shape), -1, 1))
+    return lambda state: next(steps)
+
+
+def _in_the_image(camera: Camera, places: list[dict[str, Float[np.ndarray, " 3"]]], width: float) -> dict[str, Any]:
+    """Returns (x, y) of object and gripper in each frame, in the units of tracks, and the object's width in frame 0."""
+    names = list(places[0])
+    xy, depth = camera.project(np.array([[place[name] for name in names] for place in places]))
+    seen = {name: xy[:, k].tolist() for k, name in enumerate(names)}
+    return seen | {f"{names[0]}_width": width / (camera.extent * float(depth[0, 0]))}
+
+
+def _track_pixels(
+    config: SimConfig, sim: Simulator, bodies: Int32[np.ndarray, "S S"], rng: np.random.Generator
+) -> Int[np.ndarray, "N 2"]:
+    """Returns the pixels to track.
+
+    ``rng`` serves this choice alone, so that the episode does not depend on where tracks start.
+    """
+    if config.track_points == "grid":
+        return grid_pixels(config.image_size, config.tracks, rng)
+    return object_pixels(bodies, sim.movable, sim.object_bodies, config.tracks, rng)

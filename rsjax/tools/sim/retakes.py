@@ -1,0 +1,83 @@
+"""Collects second takes of simulated clips: each starts like its clip and repeats the actions with slight jitter.
+
+Physics-IQ's score asks a model to come as close to a clip as its second take does, and no closer.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rsjax.config import SimConfig, content_key, from_dict
+from rsjax.data.codec import Record
+from rsjax.data.store import Store, open_store
+from rsjax.errors import UserError
+from rsjax.tools.sim.collect import Collection, Report, make_store
+from rsjax.tools.sim.episode import EpisodePlan, Replay, source_name
+from rsjax.tools.sim.unseen import UNITS
+
+FOLDER = "retakes"  # inside the store's directory, so that it moves with the store
+JITTER = 0.05  # standard deviation of the noise added to each number of an action, which lies in [-1, 1]
+RECIPE = 1  # raise when the same clips give different second takes
+MAX_START = 2.0  # grey levels: largest mean difference of frame 0; two OpenGL libraries differ by less
+
+
+def collect_second_takes(
+    clips: Store, split: str, numbers: Sequence[int], workers: int, report: Report
+) -> list[Record]:
+    """Collects a second take of each of these clips, unless it exists, and returns the takes in the clips' order.
+
+    Args:
+        clips: a store of simulated clips; the takes are stored in its directory.
+        numbers: indices of the clips in the split.
+        workers: processes that simulate; 0: one per core.
+        report: called as episodes finish.
+
+    Raises:
+        UserError: the clips were not simulated, the simulator fails on one, or a take starts differently from its clip;
+            also the errors of :func:`rsjax.tools.sim.collect.collect`.
+    """
+    config = _config(clips, workers)
+    records = [clips.source(split)[number] for number in numbers]
+    plans = tuple(_plan(config, split, record) for record in records)
+    key = content_key("second takes", RECIPE, str(clips.manifest.get("key")), split, tuple(map(int, numbers)), JITTER)
+    meta = {name: clips.manifest[name] for name in UNITS} | {
+        "retakes": {"of": clips.manifest.get("key"), "split": split, "jitter": JITTER}
+    }
+    out = clips.path / FOLDER / key
+    make_store(Collection(key, config, {split: plans}, meta), out, report)
+    made = open_store(out).source(split)
+    takes = {take["provenance"]["episode"]: take for take in map(made.__getitem__, range(len(made)))}
+    for record in records:
+        _check(record, takes.get(record["provenance"]["episode"]), f"{clips.path}, split {split}")
+    return [takes[record["provenance"]["episode"]] for record in records]
+
+
+def _config(clips: Store, workers: int) -> SimConfig:
+    """Returns the configuration that simulated a store's clips."""
+    manifest = clips.manifest
+    config = manifest.get("config")
+    if isinstance(config, dict) and "control_steps" in config and "episodes" in config:
+        found = from_dict(SimConfig, config | {"workers": workers})
+        if source_name(found) == manifest.get("source"):
+            return found
+    raise UserError(f"{clips.path}: these clips were not simulated, so there is no second take of them")
+
+
+def _plan(config: SimConfig, split: str, record: Record) -> EpisodePlan:
+    """Returns the plan of a clip's second take, with the same change of appearance if the clip has one."""
+    origin, task = record["provenance"], record["task"] if config.env == "metaworld" else ""
+    change = origin.get("unseen", {}).get("what")
+    replay = Replay(record["actions"], JITTER)
+    return EpisodePlan(f"{split}-{origin['episode']:06d}", origin["episode"], task, change, replay)
+
+
+def _check(record: Record, take: Record | None, where: str) -> None:
+    episode = record["provenance"]["episode"]
+    if take is None:
+        raise UserError(f"{where}: the simulator failed at the second take of episode {episode}; score without them")
+    apart = np.abs(take["rgb"][0].astype(np.float32) - record["rgb"][0]).mean()
+    if apart > MAX_START:
+        raise UserError(
+            f"{where}: the second take of episode {episode} starts otherwise than the clip ({apart:.1f} of 255 levels "
+            f"apart), so another version of the simulator made it; score without second takes, or simulate anew"
+        )

@@ -1,0 +1,209 @@
+"""Reads the groups of a comparison: runs that differ only in their seed, with their results under one protocol."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsjax.config import require
+from rsjax.config.config_fields import Leaf, leaves
+from rsjax.config.model import FAMILIES
+from rsjax.errors import UserError, did_you_mean
+from rsjax.evaluation.protocols import OWN
+from rsjax.evaluation.results import NAME, Result, read_result
+from rsjax.tools.pipeline.evaluations import FOLDER
+
+# What results must have in common, by field of :class:`Result`. Differences in NOTED are reported, not refused.
+ALIKE = {
+    "protocol": None,
+    "settings": None,
+    "data": ("key", "split", "frames", "image_size", "fps"),
+}
+MAYBE_UNKNOWN = ("fps", "physics_iq_threshold", "second_take_jitter")  # None, as in older results, fits any value
+SEEDED = ("family", "preset", "settings", "training")  # fields of a result's model that are equal within a group
+NOTED = {"sampling": None, "model": ("trained_on",), "code": ("revision", "diff_sha256")}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ only in their seed, with one result for each.
+
+    Attributes:
+        results: one for each run.
+        folders: the folders of the results, in the same order.
+    """
+
+    name: str
+    results: tuple[Result, ...]
+    folders: tuple[Path, ...]
+
+
+def parse_group(text: str) -> tuple[str, tuple[Path, ...]]:
+    """Returns the name and the run directories of ``NAME=RUN,RUN…``, or of one ``RUN``, whose directory is the name.
+
+    A run may be a pattern such as ``runs/grid/model.use_depth=True,*``. Directories may have commas in their names.
+
+    Raises:
+        ConfigError: a directory does not exist or is named twice, or a pattern matches no directory.
+    """
+    if Path(text).is_dir():
+        return Path(text).resolve().name, (Path(text),)
+    name, separator, runs = text.partition("=")
+    require(bool(separator and name), f"{text}: no run directory; write RUN, or NAME=RUN,RUN for several seeds")
+    pieces, found = runs.split(","), list[Path]()
+    while pieces:
+        whole = [",".join(pieces[:count]) for count in range(len(pieces), 0, -1)]
+        fitting = next(((each, paths) for each in whole if (paths := _directories(each))), None)
+        require(fitting is not None, f"{name}={runs}: no run directory {pieces[0]!r}; mend the path")
+        assert fitting is not None
+        found += fitting[1]
+        pieces = pieces[fitting[0].count(",") + 1 :]
+    repeated = [str(path) for path, count in Counter(path.resolve() for path in found).items() if count > 1]
+    require(not repeated, f"{name}: {', '.join(repeated)} is named twice; a group takes each run once")
+    return name, tuple(found)
+
+
+def _directories(pattern: str) -> list[Path]:
+    if not any(letter in pattern for letter in "*?["):
+        return [Path(pattern)] if pattern and Path(pattern).is_dir() else []
+    base = Path(pattern).anchor or "."
+    return sorted(path for path in Path(base).glob(str(Path(pattern).relative_to(base))) if path.is_dir())
+
+
+def read_groups(texts: Sequence[str], label: str | None) -> list[Group]:
+    """Reads the groups' results.
+
+    Args:
+        texts: groups as :func:`parse_group` takes them.
+        label: the results' label, such as ``paper``; None: the only label that all runs have in common, where "run"
+            counts only if there is no other.
+
+    Raises:
+        UserError: two groups have the same name, a run has no such result, results cannot be put side by side, or runs
+            of a group differ in more than their seed or are the same training.
+    """
+    named = [parse_group(text) for text in texts]
+    for name, count in Counter(name for name, _ in named).items():
+        require(count == 1, f"{count} groups are named {name}; name them: first=RUN second=RUN")
+    runs = [run for _, paths in named for run in paths]
+    label = label or _common(runs)
+    groups = []
+    for name, paths in named:
+        folders = tuple(_folder(run, label) for run in paths)
+        groups.append(Group(name, tuple(map(read_result, folders)), folders))
+    for group in groups:
+        check_seeds(group)
+    check_alike(groups)
+    return groups
+
+
+def results_of(run: Path) -> dict[str, Path]:
+    """Returns the folders of a run's results by label; "run" is the label of its evaluation stage."""
+    own = {OWN: run / "evaluation"} if (run / "evaluation" / NAME).exists() else {}
+    return own | {path.parent.name: path.parent for path in sorted((run / FOLDER).glob(f"*/{NAME}"))}
+
+
+def _common(runs: Sequence[Path]) -> str:
+    """Returns the label that all runs have in common."""
+    common = set.intersection(*(set(results_of(run)) for run in runs))
+    chosen = sorted(common - {OWN} or common)
+    labels = " ".join(map(str, runs))
+    require(bool(chosen), f"no protocol has evaluated all of them; python -m experiments.evaluate {labels}")
+    require(len(chosen) == 1, f"all of them have results of {' and of '.join(chosen)}; choose one with --protocol")
+    return chosen[0]
+
+
+def _folder(run: Path, label: str) -> Path:
+    found = results_of(run)
+    if parts := [each for each in found if each.startswith(f"{label},")] if label not in found else []:
+        raise UserError(f"{run}: no result {label}, but {' and '.join(parts)}; choose one of them with --protocol")
+    if label not in found:
+        has = f"it has {', '.join(found)}" if found else "it has none"
+        raise UserError(
+            f"{run}: no result of protocol {label}{did_you_mean(label, found)} ({has}); "
+            f"python -m experiments.evaluate {run} --protocol {label.partition(',')[0]}"
+        )
+    return found[label]
+
+
+def check_alike(groups: Sequence[Group]) -> None:
+    """Raises :class:`UserError` if numbers must not be put side by side; the message names the fields that differ."""
+    every = [(group.name, result) for group in groups for result in group.results]
+    name, first = every[0]
+    for other, result in every[1:]:
+        lines = differing(first, result, ALIKE)
+        if not lines and [clip["sha256"] for clip in first.clips] != [clip["sha256"] for clip in result.clips]:
+            lines = ["the scored clips differ in their content"]
+        if lines:
+            raise UserError(
+                f"{name} ({first.model['run']}) and {other} ({result.model['run']}) were not evaluated alike: "
+                f"{'; '.join(lines)}; evaluate both by one protocol on the same clips (python -m experiments.evaluate)"
+            )
+
+
+def check_seeds(group: Group) -> None:
+    """Raises :class:`UserError` if a group's runs differ in more than their seed, or two are the same training."""
+    first, trained = group.results[0].model, dict[str, str]()
+    for model in (result.model for result in group.results):
+        there, here = _deciding(first), _deciding(model)
+        pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some fields
+        lines = [f"model.{name} is {a} in the first, {b} in the other" for name, (a, b) in pairs.items() if a != b]
+        runs = f"{group.name}: {first['run']} and {model['run']}"
+        require(not lines, f"{runs} differ in more than their seed: {'; '.join(lines)}; make them groups of their own")
+        weights = str(model.get("weights_sha256") or len(trained))
+        same = f"{group.name}: {trained.get(weights)} and {model['run']} have the same weights"
+        require(weights not in trained, f"{same}; a group takes each training once")
+        trained[weights] = model["run"]
+
+
+def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the :data:`SEEDED` fields of a result's model that affect scores, by dotted name."""
+    known = _known(model)
+    later = {f"settings.{name}": leaf.value for name, leaf in known.items() if leaf.added}
+    named = later | _flat({name: model[name] for name in SEEDED if name in model})
+    runtime = {f"settings.{name}" for name, leaf in known.items() if leaf.runtime}
+    return {name: value for name, value in named.items() if name not in runtime}
+
+
+def _known(model: Mapping[str, Any]) -> dict[str, Leaf]:
+    """Returns a family's default settings by dotted name; a result lacks settings that were added after it was made."""
+    kind = FAMILIES.get(model["family"])
+    return leaves(kind()) if kind else {}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        out |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return out
+
+
+def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...] | None]) -> list[str]:
+    """Returns a line for each of the wanted fields in which two results are known to differ."""
+    lines = []
+    for section, names in wanted.items():
+        there, here = _section(first, section), _section(other, section)
+        for name in names or dict.fromkeys((*there, *here)):
+            values: tuple[Any, Any] = there.get(name), here.get(name)
+            unknown = name in MAYBE_UNKNOWN and None in values
+            if values[0] != values[1] and not unknown:
+                lines.append(f"{section}.{name} is {values[0]} in the first, {values[1]} in the other")
+    return lines
+
+
+def _section(result: Result, name: str) -> dict[str, Any]:
+    values: dict[str, Any] = getattr(result, name)
+    if name != "sampling":
+        return values
+    known = {each.removeprefix("sample."): leaf for each, leaf in _known(result.model).items() if "sample." in each}
+    return {each: leaf.value for each, leaf in known.items() if leaf.added} | values
+
+
+def noted(groups: Sequence[Group]) -> list[str]:
+    """Returns the differences between results that do not forbid a comparison, one per line."""
+    first, lines = groups[0].results[0], []
+    for group in groups:
+        found = dict.fromkeys(line for result in group.results for line in differing(first, result, NOTED))
+        lines += [f"{groups[0].name} and {group.name}: {line}" for line in found]
+    return lines

@@ -1,0 +1,185 @@
+"""Computes the numbers of a comparison: means over seeds, intervals over seeds and clips, differences and findings.
+
+Axes: S seeds, B clips.
+"""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.config import require
+from rsjax.errors import did_you_mean
+from rsjax.evaluation.registry import Metric, metrics
+from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
+from rsjax.tools.studies.ablation.table import Spread, spread
+from rsjax.tools.studies.compare.groups import Group
+
+BASELINES = {"_repeat_first": "first frame repeated", "_tokenizer": "tokenizer's reconstruction"}
+BEST = "_incl_ctx"  # the names of scores of the best of several samples end with this
+Finding = Literal["better", "worse", "cannot tell", "same"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A column of the comparison: a group's prediction, or a baseline of one.
+
+    Attributes:
+        suffix: the suffix of its scores' names: "" for the prediction, otherwise one of :data:`BASELINES`.
+    """
+
+    name: str
+    group: Group
+    suffix: str = ""
+
+    def score(self, metric: Metric) -> str:
+        """Returns the name of the entry's score in a result, such as ``psnr_tokenizer_second_half``."""
+        base = base_of(metric.name)
+        return f"{base}{self.suffix}{metric.name.removeprefix(base)}"
+
+    def seeds(self, metric: Metric) -> list[float]:
+        """Returns each seed's score over all clips; an empty list if any result has no score."""
+        values = [result.metrics.get(self.score(metric)) for result in self.group.results]
+        known = [float(value) for value in values if value is not None and math.isfinite(value)]
+        return known if len(known) == len(values) else []
+
+    def per_clip(self, metric: Metric) -> Float[np.ndarray, "S B"] | None:
+        """Returns the clips' scores; None if a result has none, or the results' numbers of scores differ."""
+        rows = [result.per_clip.get(self.score(metric), []) for result in self.group.results]
+        return np.array(rows) if rows[0] and len({len(row) for row in rows}) == 1 else None
+
+    def reason(self, metric: Metric) -> str:
+        """Returns why there is no score; "" if that is not recorded."""
+        base = base_of(metric.name)
+        return next((each.reasons[base] for each in self.group.results if base in each.reasons), "")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """An entry's score of a metric.
+
+    Attributes:
+        spread: mean and standard deviation over seeds; None without a score.
+        interval: the interval of this mean over seeds and clips; None for a score of the whole set.
+        reason: why there is no score.
+    """
+
+    spread: Spread | None
+    interval: Estimate | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An entry's score minus the reference's.
+
+    Attributes:
+        interval: over seeds and clips, paired; None if single clips have no scores.
+        welch: over seeds; None for baselines and with fewer than two seeds each.
+        finding: "better" or "worse" only if all existing intervals say so; "same" if they are all exactly 0.
+    """
+
+    interval: Estimate | None
+    welch: Welch | None
+    finding: Finding
+
+
+def entries_of(groups: Sequence[Group]) -> list[Entry]:
+    """Returns the groups' predictions and both baselines; a baseline appears once if it scores alike in all groups."""
+    entries = [Entry(group.name, group) for group in groups]
+    psnr = metrics()["psnr"]
+    for suffix, name in BASELINES.items():
+        found: list[Entry] = []
+        for group in groups:
+            entry = Entry(name, group, suffix)
+            if entry.seeds(psnr) and not any(set(entry.seeds(psnr)) == set(other.seeds(psnr)) for other in found):
+                found.append(entry)
+        entries += found if len(found) == 1 else [replace(each, name=f"{name}, {each.group.name}") for each in found]
+    return entries
+
+
+def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
+    """Returns the metrics to compare: those of tables with the protocol's depth scores, or those that match patterns.
+
+    Raises:
+        ConfigError: a pattern matches no metric of the results.
+    """
+    results = [result for group in groups for result in group.results]
+    names = dict.fromkeys(name for result in results for name in result.metrics)
+    depth = {f"depth_{each}{_depth_suffix(groups)}" for each in ("absrel", "delta1", "delta2")}
+    found = [
+        replace(each, column=each.column or each.name in depth) for each in metrics().values() if each.name in names
+    ]
+    found += _parts(names)
+    if not only:
+        other_depth = {each.name for each in found if each.name.startswith("depth_")} - depth
+        return [each for each in found if each.column and each.name not in other_depth]
+    known = [each.name for each in found]
+    for pattern in only:
+        fits = any(fnmatchcase(name, pattern) for name in known)
+        require(
+            fits, f"--only {pattern}: no metric of these results{did_you_mean(pattern, known)} ({', '.join(known)})"
+        )
+    return [each for each in found if any(fnmatchcase(each.name, pattern) for pattern in only)]
+
+
+def _depth_suffix(groups: Sequence[Group]) -> str:
+    protocol = groups[0].results[0].protocol
+    alignment, source = protocol["depth_alignment"], protocol["depth_source"]
+    return "" if alignment == "none" else f"_{alignment}_{source}"
+
+
+def base_of(score: str) -> str:
+    """Returns the registered metric that a score belongs to: the longest name that the score's begins with, or ""."""
+    return max((name for name in metrics() if f"{score}_".startswith(f"{name}_")), key=len, default="")
+
+
+def _parts(names: Collection[str]) -> list[Metric]:
+    """Returns metrics for scores such as ``delta_psnr_t4``; only those of the best of samples are table columns."""
+    found = []
+    for name in names:
+        base = base_of(name)
+        part, whole = name.removeprefix(base), name.rpartition("_")[0]
+        bound = part.endswith(("_low", "_high")) and whole in names
+        if base and part and not bound and not part.startswith(tuple(BASELINES)):
+            best = part.removeprefix("_best").removesuffix(BEST) if part.endswith(BEST) else ""
+            words = f"best of {best}, prompt included" if best else part[1:].replace("_", " ")
+            metric = metrics()[base]
+            found.append(replace(metric, name=name, title=f"{metric.title}, {words}", column=bool(best)))
+    return found
+
+
+def cell(entry: Entry, metric: Metric) -> Cell:
+    """Returns an entry's score of a metric."""
+    seeds, clips = entry.seeds(metric), entry.per_clip(metric)
+    if not seeds:
+        return Cell(None, None, entry.reason(metric))
+    interval = None if clips is None else paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
+    return Cell(spread(seeds), interval, "")
+
+
+def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | None:
+    """Compares an entry with the reference; None where one of them has no score."""
+    seeds, others = entry.seeds(metric), reference.seeds(metric)
+    if not seeds or not others:
+        return None
+    clips, base = entry.per_clip(metric), reference.per_clip(metric)
+    paired = clips is not None and base is not None and clips.shape[1] == base.shape[1]
+    interval = paired_bootstrap(clips, base, statistic=metric.statistic) if paired else None  # type: ignore[arg-type]
+    test = None if entry.suffix or reference.suffix else welch(np.array(seeds), np.array(others))
+    return Difference(interval, test, _finding(interval, test, metric))
+
+
+def _finding(interval: Estimate | None, test: Welch | None, metric: Metric) -> Finding:
+    intervals = [each for each in (interval, test.difference if test else None) if each is not None]
+    if intervals and all(each.value == each.low == each.high == 0 for each in intervals):
+        return "same"
+    verdicts = {verdict(each, metric.better) for each in intervals}
+    if len(verdicts) != 1:
+        return "cannot tell"
+    found: dict[Verdict, Finding] = {"holds": "better", "does not hold": "worse", "cannot tell": "cannot tell"}
+    return found[verdicts.pop()]

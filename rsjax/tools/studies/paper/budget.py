@@ -1,0 +1,203 @@
+"""Determines how large the cells of a budget are, and estimates how long they take.
+
+The constants were measured with ``tiny`` on 2 cores of an AMD EPYC on 2026-11-22. The sizes depend only on the budget
+and these constants, not on the machine at hand. So the same budget always means the same cells, and a command that is
+started again finds them.
+"""
+
+import re
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Literal
+
+import jax
+
+from rsjax.config import Config, LoopConfig, TokenizerConfig, TokenModelConfig, require
+from rsjax.config.config_fields import with_values
+from rsjax.models.base import create_autoencoder, create_model
+from rsjax.tokenizers.flops import tokenizer_flops
+
+EPISODE = 0.41  # seconds to simulate an episode
+TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
+STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations per second for the rest
+# Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
+TOKENIZER_RATE = 4.6e10
+START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
+EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds per evaluation, step of the localiser, and rollout
+
+COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # shares of a budget
+ROLLOUTS_SHARE, LOCALISER_SHARE = 0.12, 0.04  # shares of a cell
+# The number of trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with
+# three seeds, six of which are cheaper because they are without depth), and how it grows with the budget.
+CELLS, GROWTH = 13.7, 0.4
+LEAST_STEPS, LEAST_TOKENIZER_STEPS, LEAST_EPISODES, LEAST_CLIPS = 40, 100, 60, 2
+SEEDS = 3
+_UNITS = {"s": 1, "sec": 1, "min": 60, "m": 60, "h": 3600, "d": 86400}
+_TERM = re.compile(r"(\d+(?:\.\d+)?)\s*(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")\s*")
+HOUR = 3600.0
+
+
+def parse_duration(text: str) -> float:
+    """Returns the seconds of a duration such as ``30min``, ``3h`` or ``1h30min``.
+
+    Raises:
+        ConfigError: the text is no duration above 0.
+    """
+    text = text.strip()
+    found = list(_TERM.finditer(text))
+    seconds = sum(float(term[1]) * _UNITS[term[2]] for term in found)
+    whole = "".join(term[0] for term in found) == text
+    require(whole and seconds > 0, f"--budget {text}: not a duration; write 30min, 3h, 12h or 1h30min")
+    return seconds
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The sizes of all cells of a budget.
+
+    Attributes:
+        seconds: the budget.
+        base: the base preset at this size.
+    """
+
+    seconds: float
+    base: Config
+
+
+def scale(preset: Config, seconds: float) -> Scale:
+    """Returns the preset with as many episodes, steps and scored clips as the budget allows, at most its own."""
+    sim, tokenizer, evaluation = preset.sim, preset.tokenizer_train, preset.eval
+    each = SPENT_IN_CELLS * seconds / (CELLS * (seconds / (HOUR / 2)) ** GROWTH)
+    episodes = min(sim.episodes, max(LEAST_EPISODES, _round(COLLECT_SHARE * seconds / EPISODE)))
+    rollouts, draws = ROLLOUTS_SHARE * each / ROLLOUT, evaluation.action_draws
+    draws = draws if rollouts >= evaluation.clips * (1 + 2 * draws) else 1
+    clips = max(LEAST_CLIPS, min(_round(rollouts / (1 + 2 * draws)), episodes // 6))
+    clips = min(evaluation.clips, sim.test_episodes, clips)
+    per_step = tokenizer_step_seconds(preset)
+    tokenizer_steps = min(tokenizer.steps, max(LEAST_TOKENIZER_STEPS, _round(TOKENIZER_SHARE * seconds / per_step)))
+    values = {
+        "sim.episodes": episodes,
+        "sim.test_episodes": clips,
+        "tokenizer_train.steps": tokenizer_steps,
+        "eval.clips": clips,
+        "eval.batch_size": min(evaluation.batch_size, clips),
+        "eval.action_draws": draws,
+        "eval.localiser_steps": min(evaluation.localiser_steps, max(1, _round(LOCALISER_SHARE * each / LOCALISER))),
+        "train.curriculum": (),  # its epochs would determine the steps; a claim's arms have their own
+        "train.eval_every": 0,
+        "tokenizer_train.eval_every": 0,
+    }
+    base = with_values(preset, values)
+    steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
+    base = with_steps(base, min(preset.train.steps, max(LEAST_STEPS, _round(steps))))
+    return Scale(seconds, base)
+
+
+def with_steps(config: Config, steps: int) -> Config:
+    """Returns the configuration with a number of world-model steps; own frames begin at the same share of the steps."""
+    values = {"train.steps": steps}
+    if isinstance(config.model, TokenModelConfig):
+        values["model.mask.own_frames_after"] = config.model.mask.own_frames_after * steps // config.train.steps
+    return with_values(config, values)
+
+
+def _round(number: float) -> int:
+    """Rounds to two digits, so that sizes are readable."""
+    return int(float(f"{max(number, 0):.2g}"))
+
+
+def cut(config: Config, share: float) -> Config:
+    """Returns the configuration with each training loop cut to a share of its steps, at least one step."""
+    loops = {
+        field.name: replace(loop, steps=max(1, round(share * loop.steps)), eval_every=0)
+        for field in fields(config)
+        if isinstance(loop := getattr(config, field.name), LoopConfig)
+    }
+    return replace(config, **loops)  # type: ignore[arg-type]
+
+
+def train_flops(config: Config) -> int | None:
+    """Returns the operations of the world model's whole training; None for a family that does not count them."""
+    per_clip = create_model(config).flops(config.clips.frames).get("train")
+    if per_clip is None:
+        return None
+    # A step on own frames needs one more forward pass, a third of a step. It is counted from the first step on.
+    own = config.model.mask.own_frames / 3 if isinstance(config.model, TokenModelConfig) else 0.0
+    return round(config.train.steps * config.train.batch_size * per_clip * (1 + own))
+
+
+@cache
+def parameters(config: Config) -> tuple[int, int]:
+    """Returns the numbers of parameters of the world model and of its autoencoder."""
+    model = jax.eval_shape(create_model(config).init, jax.random.key(0))
+    autoencoder = create_autoencoder(config).shapes() if config.model.uses_tokenizer else {}
+    return tuple(sum(x.size for x in jax.tree.leaves(shapes)) for shapes in (model, autoencoder))  # type: ignore[return-value]
+
+
+def step_seconds(config: Config) -> float:
+    """Returns the seconds of a step of the world model; 0 for a family that does not count its operations."""
+    if config.model.step_seconds:
+        return config.model.step_seconds[1]
+    flops = train_flops(config)
+    return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
+
+
+def tokenizer_step_seconds(config: Config) -> float:
+    """Returns the seconds of a step of the tokenizer."""
+    if config.model.step_seconds:
+        return config.model.step_seconds[0]
+    loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
+    return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
+
+
+@cache
+def _image_flops(tokenizer: TokenizerConfig, image_size: int) -> int:
+    return sum(tokenizer_flops(tokenizer, image_size).values())
+
+
+def collect_seconds(config: Config) -> float:
+    """Returns the seconds of the simulation."""
+    return 0.0 if config.data.key else EPISODE * config.sim.episodes
+
+
+def tokenizer_seconds(config: Config) -> float:
+    """Returns the seconds of training the tokenizer or autoencoder and of making tokens."""
+    if not config.model.uses_tokenizer:
+        return 0.0
+    clips = config.sim.episodes * (1 + sum(config.model.token_shifts[:1]))
+    return START + config.tokenizer_train.steps * tokenizer_step_seconds(config) + TOKENS * clips
+
+
+def training_cost(config: Config, unit: Literal["seconds", "flops"]) -> tuple[float, float]:
+    """Returns the cost of training the autoencoder and the world model, in estimated seconds or in operations."""
+    loop = config.tokenizer_train
+    if unit == "seconds":
+        return loop.steps * tokenizer_step_seconds(config), config.train.steps * step_seconds(config)
+    images = loop.steps * loop.batch_size * loop.frames_per_clip
+    # Leave out what differs between arms and seeds: some families count by tracing their programs, and this is cached.
+    bare = replace(config, train=LoopConfig(), tokenizer_train=replace(loop, steps=1))
+    return 3.0 * images * _frame_flops(bare), float(train_flops(config) or 0)
+
+
+@cache
+def _frame_flops(config: Config) -> int:
+    """Returns the operations of encoding and decoding a frame."""
+    return sum(create_autoencoder(config).flops().values()) if config.model.uses_tokenizer else 0
+
+
+def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0) -> float:
+    """Returns the seconds of an evaluation and a report.
+
+    Args:
+        draws: draws of random actions; None: the configuration's number.
+        frames: frames per rollout; 0: the clips' number.
+    """
+    draws = config.eval.action_draws if draws is None else draws
+    draws = draws if config.model.takes_actions else 0
+    rollouts = config.eval.clips * (1 + 2 * draws) * (frames or config.clips.frames) / config.clips.frames
+    return EVALUATION + LOCALISER * config.eval.localiser_steps + ROLLOUT * rollouts
+
+
+def model_seconds(config: Config) -> float:
+    """Returns the seconds of the world model's training."""
+    return START + training_cost(config, "seconds")[1]

@@ -1,0 +1,216 @@
+"""Plans the cells that the claims need, in the order in which they run, as far as a budget allows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from rsjax.config import Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
+from rsjax.config.config_fields import with_values
+from rsjax.config.curriculum import parse_stage
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.sim import expert
+from rsjax.tools.studies.ablation.grid import SEED, Value, cell_name
+from rsjax.tools.studies.paper import budget
+from rsjax.tools.studies.paper.budget import Scale
+from rsjax.tools.studies.paper.claim import Arm, Claim
+from rsjax.tools.studies.paper.measurements import seconds_of
+
+SLACK = 1.05  # share of the budget that the estimates may take
+TOLD = 2  # seeds of each arm that a verdict needs
+KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A training and its evaluation.
+
+    Attributes:
+        name: the name of its directory; it ends with a content key, which keeps the cells of several budgets apart.
+        config: what is trained.
+        uses: each (claim, arm) for which it runs.
+    """
+
+    name: str
+    config: Config
+    uses: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A step of a plan: a cell's training with its evaluation, or a measurement of a trained cell.
+
+    Attributes:
+        cell: the cell's name.
+        measurement: the measurement's name; empty: the training.
+        claim: the first claim that needs the task.
+        seconds: the estimate; it includes a shared stage's seconds if the task is the first that needs this stage.
+    """
+
+    cell: str
+    measurement: str
+    claim: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cells and tasks that some claims need at a scale.
+
+    Attributes:
+        cells: by name, including those that the budget leaves out.
+        tasks: in the order in which they run.
+        left_out: tasks that the budget has no time for; they are known before anything runs.
+        absent: (claim, arm) → why the arm cannot be trained.
+    """
+
+    scale: Scale
+    claims: tuple[Claim, ...]
+    cells: Mapping[str, Cell]
+    tasks: tuple[Task, ...]
+    left_out: tuple[Task, ...]
+    absent: Mapping[tuple[str, str], str]
+
+    def of(self, claim: str, arm: str) -> tuple[Cell, ...]:
+        """Returns an arm's cells, one for each seed."""
+        return tuple(cell for cell in self.cells.values() if (claim, arm) in cell.uses)
+
+
+def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = budget.SEEDS) -> Plan:
+    """Returns the cells of claims, which share the budget, and the tasks in their order.
+
+    The sizes of the cells depend only on the budget, not on the claims.
+
+    Args:
+        data: the directory of simulated data sets.
+        seeds: the number of trainings of each arm.
+    """
+    absent: dict[tuple[str, str], str] = {}
+    cells: dict[str, Cell] = {}  # by content key
+    tasks: dict[tuple[str, str], Task] = {}
+    made = set[str]()
+    for claim, arm, seed in _ordered(claims, range(seeds)):
+        try:
+            config = arm_config(arm, scale, seed)
+        except ConfigError as error:
+            absent[claim.name, arm.name] = str(error)
+            continue
+        keys = Run(config, Path(), data).keys()
+        key, use = keys["evaluation"], (claim.name, arm.name)
+        if key not in cells:
+            cells[key] = Cell(f"{cell_name(_label(arm), seed)}-{key[:8]}", config, ())
+            seconds = _new_seconds(config, keys, made) + budget.evaluation_seconds(config)
+            tasks[key, ""] = Task(cells[key].name, "", claim.name, seconds)
+        cells[key] = replace(cells[key], uses=(*cells[key].uses, use))
+        for name in claim.measurements(arm.name):
+            task = Task(cells[key].name, name, claim.name, seconds_of(name, config))
+            tasks.setdefault((key, name), task)
+    fits, left_out, spent = list[Task](), list[Task](), 0.0
+    for number, task in enumerate(tasks.values()):
+        spent += task.seconds
+        (fits if spent <= SLACK * scale.seconds or not number else left_out).append(task)
+    named = {cell.name: cell for cell in cells.values()}
+    return Plan(scale, tuple(claims), named, tuple(fits), tuple(left_out), absent)
+
+
+def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> float:
+    """Returns the seconds of the stages that no earlier cell makes, and adds their keys to ``made``."""
+    parts = {
+        "collect": budget.collect_seconds,
+        "tokenizer": budget.tokenizer_seconds,
+        "world_model": budget.model_seconds,
+    }
+    new = [stage for stage in parts if stage in keys and keys[stage] not in made]
+    made.update(keys[stage] for stage in new)
+    return sum(parts[stage](config) for stage in new)
+
+
+def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
+    """Returns (claim, arm, seed) in order: rank 0 with all seeds; other claims with ``TOLD`` seeds; further seeds."""
+    first = [claim for claim in claims if not claim.rank]
+    others = [claim for claim in claims if claim.rank]
+    few, more = seeds[:TOLD], seeds[TOLD:]
+    return [
+        *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
+        *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
+        *((claim, arm, seed) for seed in more for claim in others for arm in claim.arms),
+    ]
+
+
+def _label(arm: Arm) -> dict[str, Value]:
+    """Returns the values that an arm varies, for the name of its directory."""
+    family = {"model": arm.model or arm.preset} if arm.model or arm.preset else {}
+    stages = {"curriculum": "+".join(arm.curriculum) + " mixed" * arm.mixed} if arm.curriculum else {}
+    shares = {name: f"{share:.2g}" for name, share in (("data", arm.data), ("rate", arm.rate)) if share != 1}
+    return {**family, **arm.values, **stages, **shares}
+
+
+def arm_config(arm: Arm, scale: Scale, seed: int) -> Config:
+    """Returns the configuration of an arm with a seed.
+
+    Raises:
+        ConfigError: there is no such preset, or the base preset lacks a field of the arm's.
+    """
+    base = scale.base
+    config = _small(arm, base) if arm.preset else base.with_family(arm.model) if arm.model else base
+    try:
+        config = with_values(config, {**arm.values, SEED: seed})
+    except (AttributeError, TypeError) as error:
+        raise ConfigError(f"the preset {config.name} has no such field ({error})") from error
+    if arm.equal != "steps":
+        config = _equal(config, base, arm.equal, alone=bool(arm.preset))
+    if arm.rate != 1:
+        rate = float(f"{arm.rate * config.train.optimizer.learning_rate:.2g}")
+        config = with_values(config, {"train.optimizer.learning_rate": rate})
+    stages = _stages(arm, config)
+    return with_values(config, {"train.curriculum": stages}) if stages else config
+
+
+def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alone: bool) -> Config:
+    """Returns a configuration whose trainings take as much as the base preset's.
+
+    Args:
+        alone: whether the autoencoder is its own, so that its training is scaled too; otherwise it is the base
+            preset's.
+    """
+    (tokenizer, model), whole = budget.training_cost(config, unit), sum(budget.training_cost(base, unit))
+    if alone:
+        return budget.cut(config, whole / (tokenizer + model))
+    steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
+    return budget.with_steps(config, steps)
+
+
+def _small(arm: Arm, base: Config) -> Config:
+    """Returns the small preset of an arm's family, with the base preset's clips and evaluation."""
+    name = f"{arm.preset}_tiny"
+    if name not in presets.PRESETS:
+        raise ConfigError(f"there is no preset {name} in this version")
+    config = replace(presets.get(name), **{field: getattr(base, field) for field in KEPT})
+    return replace(config, model=config.model.for_tasks(base.sim.train_tasks))
+
+
+def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
+    """Returns the stages of an arm's training, for about as many steps as the configuration has."""
+    clips, drawn = config.sim.episodes - config.sim.test_episodes, config.train.steps * config.train.batch_size
+    if arm.data < 1:
+        some = max(1, round(arm.data * clips))
+        return (parse_stage(f"all#{some}:{drawn / some!r}"),)
+    if not arm.curriculum:
+        return ()
+    simple = _simple_share(config.sim)
+    expected = {"simple": simple * clips, "difficult": (1 - simple) * clips}
+    epochs = {name: float(number) for name, _, number in (word.partition(":") for word in arm.curriculum)}
+    read = {name: number * expected[name] for name, number in epochs.items()}
+    factor = drawn / sum(read.values())
+    if arm.mixed:
+        parts = "+".join(f"{name}={number!r}" for name, number in read.items())
+        return (parse_stage(f"{parts}:{drawn / clips!r}"),)
+    return tuple(parse_stage(f"{name}:{number * factor!r}") for name, number in epochs.items())
+
+
+def _simple_share(sim: SimConfig) -> float:
+    """Returns the expected share of simple clips, from the tasks, which take turns, or the modes of Lift's expert."""
+    tasks = sim.train_tasks
+    if tasks:
+        return sum(task in metaworld.SIMPLE for task in tasks) / len(tasks)
+    return sum(expert.MODES[mode] for mode in expert.SIMPLE)

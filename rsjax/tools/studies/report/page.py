@@ -1,0 +1,174 @@
+"""Writes a run's HTML report: one self-contained page, whose only script plays the clips."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from rsjax.evaluation.frame_curves import Curves
+from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
+from rsjax.files import write_file
+from rsjax.progress import duration
+from rsjax.tools.studies.report.curves import curves_svg
+from rsjax.tools.studies.report.figures import ClipFigure, filmstrip, keypoints
+from rsjax.tools.studies.report.player import player_clip, player_script, player_style
+from rsjax.tools.studies.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg
+from rsjax.tools.studies.report.targets import judge
+from rsjax.tools.studies.report.video import webp_uri
+
+_FPS = 4  # the rate at which the player starts; one of its rates
+
+Row = tuple[str, str]
+Column = tuple[str, str, int]
+
+# Rows are (suffix, label), columns are (metric, header, decimals); a column's {} stands for the row's suffix.
+_SCORE_ROWS = tuple(SCENES.items())
+_PLACE_ROWS = tuple(PLACE_SCENES.items())
+_PLACE_ERRORS = ("cube_error_widths", "gripper_error_widths")
+_PLACES = (*_PLACE_ERRORS, "lifted_accuracy")  # metrics in a table of their own
+_DEPTH_ROWS = (
+    ("", "depth branch, in metres"),
+    ("_median_branch", "depth branch, median scale"),
+    ("_affine_disparity_branch", "depth branch, scale and shift of 1/depth"),
+    ("_l1_scale_branch", "depth branch, L1 scale"),
+    ("_median_estimator", "estimator, median scale"),
+    ("_affine_disparity_estimator", "estimator, scale and shift of 1/depth"),
+    ("_l1_scale_estimator", "estimator, L1 scale"),
+)
+_DEPTH_COLUMNS = (("depth_absrel{}", "AbsRel ↓", 4), ("depth_delta1{}", "δ₁ ↑", 3), ("depth_delta2{}", "δ₂ ↑", 3))
+_CONTROL_ROWS = (("", "another clip's actions"), ("_uniform", "uniform random actions"))
+_CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
+
+
+@dataclass(frozen=True)
+class Report:
+    """The contents of a page; the page leaves out the sections of empty fields.
+
+    Attributes:
+        preset: the run's preset.
+        metrics: flat, as in metrics.json; ``name_low`` and ``name_high`` bound the 95 % interval of ``name``. The page
+            lists all of them, and its tables show those of their columns.
+        reasons: why a metric is absent, by name; the cells of absent metrics refer to them in footnotes.
+        clips: test clips; the player at the top of the page opens with the first one.
+        curves: scores at each predicted frame, as in curves.json.
+        per_clip: the scores of single clips by name; only the errors of places are drawn.
+        logs: scalar logs by name ("tokenizer", "world model"): dicts with "step" and numbers.
+        config: nested settings, JSON-ready.
+        versions: library → version.
+        seconds: stage → duration.
+        command: the command that reproduces the run.
+        show_targets: judge the run by :data:`rsjax.tools.studies.report.targets.TARGETS`.
+    """
+
+    preset: str
+    metrics: Mapping[str, float]
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    clips: Sequence[ClipFigure] = ()
+    curves: Curves = field(default_factory=dict)
+    per_clip: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    logs: Mapping[str, Sequence[dict[str, Any]]] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    command: str = ""
+    show_targets: bool = True
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Writes the page atomically.
+
+    Raises:
+        ValueError: a log has no numbers.
+        FileError: the disk is full or the directory is not writable.
+    """
+    environment = template_environment()
+    environment.filters["duration"] = duration
+    shown = [metric for metric in metrics().values() if metric.column]
+    places = [metrics()[name] for name in _PLACES]
+    further = [metric for metric in metrics().values() if not (metric.column or metric.name.startswith("depth_"))]
+    notes = Footnotes()
+    html = environment.get_template("page.html.j2").render(
+        report=report,
+        gallery={"rate": _FPS, "clips": [player_clip(clip) for clip in report.clips]},
+        player_script=Markup(player_script()),
+        player_style=Markup(player_style()),
+        clips=[_clip_pictures(clip) for clip in report.clips],
+        scores=_table(report, notes, _SCORE_ROWS, _columns(metric for metric in shown if metric not in places)),
+        depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
+        further=_table(report, notes, _SCORE_ROWS, _columns(further)),
+        control=_table(report, notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
+        places=_table(report, Footnotes(), _PLACE_ROWS, _columns(places)),
+        place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
+        frame_curves=Markup(frame_curves_svg(report.curves, [*shown, *further])),
+        notes=notes.texts,
+        verdicts=judge(report.metrics) if report.show_targets else [],
+        training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
+        settings=_settings(report.config),
+    )
+    write_file(path, html.encode())
+
+
+def template_environment(package: str = "rsjax.tools.studies.report") -> jinja2.Environment:
+    """Returns the environment of a package's templates; they may include those of the report, such as its style."""
+    loaders = [jinja2.PackageLoader(name, ".") for name in dict.fromkeys((package, "rsjax.tools.studies.report"))]
+    return jinja2.Environment(
+        loader=jinja2.ChoiceLoader(loaders),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+
+
+def _columns(shown: Iterable[Metric]) -> list[Column]:
+    return [(f"{metric.name}{{}}", metric.heading, metric.decimals) for metric in shown]
+
+
+def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
+    has_depth = clip.true_depth is not None or clip.predicted_depth is not None
+    return {
+        "title": clip.title,
+        "filmstrip": webp_uri(filmstrip(clip)),
+        "keypoints": None if clip.tracks is None else webp_uri(keypoints(clip)),
+        "depth_range": clip.depth_range() if has_depth else None,
+    }
+
+
+def _table(report: Report, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
+    """Returns the header and the cells of rows and columns that have a metric or a reason; None without any metric."""
+    if not any(key.format(suffix) in report.metrics for key, _, _ in columns for suffix, _ in rows):
+        return None
+    known = {*report.metrics, *report.reasons}
+    columns = [column for column in columns if any(column[0].format(suffix) in known for suffix, _ in rows)]
+    rows = [row for row in rows if any(key.format(row[0]) in known for key, _, _ in columns)]
+    return {
+        "header": [header for _, header, _ in columns],
+        "rows": [
+            {"label": label, "cells": [_cell(report, notes, key, suffix, digits) for key, _, digits in columns]}
+            for suffix, label in rows
+        ],
+    }
+
+
+def _cell(report: Report, notes: Footnotes, key: str, suffix: str, digits: int) -> dict[str, str]:
+    name = key.format(suffix)
+    value = report.metrics.get(name)
+    if value is None:
+        reason = report.reasons.get(name) or report.reasons.get(key.format(""))
+        return {"value": ABSENT + notes.mark(reason), "interval": ""}
+    bounds = [report.metrics.get(f"{name}_{side}") for side in ("low", "high")]
+    interval = "" if None in bounds else " – ".join(f"{bound:.{digits}f}" for bound in bounds)
+    return {"value": f"{value:.{digits}f}", "interval": interval}
+
+
+def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tuple[str, Any]]]:
+    """Returns section → (field, value); a nested mapping becomes a section, named by its path."""
+    fields = [(key, value) for key, value in config.items() if not isinstance(value, Mapping)]
+    sections = {name: fields} if fields else {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            sections |= _settings(value, key if name == "run" else f"{name}.{key}")
+    return sections

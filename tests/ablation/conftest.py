@@ -1,3 +1,0 @@
-from tests.pipeline.conftest import command, debug, shared
-
-__all__ = ["command", "debug", "shared"]

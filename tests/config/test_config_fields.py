@@ -1,0 +1,86 @@
+import dataclasses
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsjax.config import Config, ConfigError, from_dict, presets, to_dict
+from rsjax.config.config_fields import leaves, with_values
+
+DEBUG = presets.debug()
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted names and values of a configuration's JSON."""
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        out |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return out
+
+
+def test_the_leaves_are_the_configurations_json_by_dotted_names() -> None:
+    known = leaves(DEBUG)
+    values = {name: list(leaf.value) if isinstance(leaf.value, tuple) else leaf.value for name, leaf in known.items()}
+    saved = flat(to_dict(DEBUG))
+    assert values == {name: saved[name] for name in values}
+    assert set(saved) - set(values) == {"model.family"}
+    assert known["train.log_every"].runtime
+    assert not known["train.steps"].runtime
+
+
+@given(
+    st.fixed_dictionaries(
+        {},
+        optional={
+            "prompt_frames": st.integers(1, 5),
+            "model.loss.gamma": st.floats(0, 100),
+            "model.loss.depth_weight": st.floats(0, 10),
+            "model.use_depth": st.booleans(),
+            "train.optimizer.learning_rate": st.floats(1e-6, 1),
+            "train.seed": st.integers(0, 2**31),
+            "model.sample.unmask": st.sampled_from(["random", "greedy"]),
+        },
+    )
+)
+def test_values_reach_their_fields_and_no_other(values: dict[str, Any]) -> None:
+    expected = to_dict(DEBUG)
+    for name, value in values.items():
+        *path, last = name.split(".")
+        section = expected
+        for part in path:
+            section = section[part]
+        section[last] = value
+    changed = with_values(DEBUG, values)
+    assert changed == from_dict(Config, expected)
+    assert all(leaves(changed)[name].value == value for name, value in values.items())
+
+
+def test_fields_that_only_fit_together_are_set_together() -> None:
+    changed = with_values(DEBUG, {"model.width": 33, "model.heads": 3})
+    known = leaves(changed)
+    assert (known["model.width"].value, known["model.heads"].value) == (33, 3)
+    for alone in ({"model.width": 33}, {"tokenizer.code_bits": 9}):
+        with pytest.raises(ConfigError):
+            with_values(DEBUG, alone)
+
+
+@dataclasses.dataclass(frozen=True)
+class Base:
+    width: int = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Family(Base):
+    gamma: float = 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Whole:
+    model: Base = Family()
+
+
+def test_the_fields_of_a_section_are_those_of_its_own_class() -> None:
+    assert list(leaves(Whole())) == ["model.width", "model.gamma"]
+    assert list(leaves(Whole(Base()))) == ["model.width"]
+    assert with_values(Whole(), {"model.gamma": 2.0}) == Whole(Family(gamma=2.0))

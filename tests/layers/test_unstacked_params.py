@@ -1,0 +1,49 @@
+"""Blocks that are taken apart for a loop give what stacked ones give."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from rsjax.config import SampleConfig
+from rsjax.layers.unstacked_params import apart, together
+from rsjax.models.ivideogpt.rollout import sample
+from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
+from tests.models.ivideogpt import toy
+from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
+
+
+def test_stacking_what_was_taken_apart_changes_nothing() -> None:
+    params = random_params(DUAL)
+    parts = apart(params["blocks"], DUAL.blocks, unroll=DUAL.blocks)
+    assert len(parts) == DUAL.blocks
+    jax.tree.map(np.testing.assert_array_equal, together(parts), params["blocks"])
+
+
+def test_a_scan_that_is_not_fully_unrolled_keeps_its_stacks() -> None:
+    params = random_params(DUAL)
+    assert apart(params, DUAL.blocks, DUAL.blocks - 1) is params and together(params) is params
+
+
+def test_a_rollout_is_the_same() -> None:
+    params, (tokens, actions) = random_params(DUAL), given(DUAL, 2)
+    settings = SampleConfig(steps=2)
+    stacked = rollout(DUAL, settings, params, tokens, actions, KEY)
+    unrolled = replace(DUAL, unroll=DUAL.blocks)
+    whole = rollout(unrolled, settings, params, tokens, actions, KEY)
+    prompt = encode_prompt(unrolled, settings, params, tokens, actions[:, :2])
+    resumed = rollout_from(unrolled, settings, params, prompt, actions[:, 2:], KEY)
+    for name, grid in stacked.items():
+        np.testing.assert_array_equal(whole[name], grid)
+        np.testing.assert_array_equal(resumed[name], grid)
+
+
+def test_ivideogpt_draws_the_same_tokens() -> None:
+    config = replace(toy.MODEL, sample=replace(toy.MODEL.sample, temperature=0.0))
+    archs = [replace(toy.ARCH, config=replace(config, unroll=unroll)) for unroll in (1, toy.MODEL.blocks)]
+    begin = np.random.default_rng(2).integers(0, 32, (BATCH, toy.ARCH.layout.first_slot), np.int32)
+    actions = np.random.default_rng(3).normal(size=(BATCH, 3, 3)).astype(np.float32)
+    keys = jax.random.split(KEY, BATCH)
+    stacked, unrolled = (sample(arch, toy.llama_params(), begin, actions, keys) for arch in archs)
+    assert np.ptp(np.asarray(stacked)) > 0
+    np.testing.assert_array_equal(stacked, unrolled)

@@ -1,0 +1,127 @@
+"""The commands for IRASim and for SDXL's autoencoder, from files to files."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import KLConfig
+from rsjax.models.irasim.autoencoder import init
+from rsjax.tools.convert.directory import load_irasim, load_kl_autoencoder
+from rsjax.tools.convert.files import write_safetensors
+from rsjax.tools.convert.kl_autoencoder import to_public
+from tests.models.irasim import public, toy
+from tests.tools.convert.test_commands import GENIE, assert_same, convert, refused
+
+NET = public.Network()
+SMALL = KLConfig(channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    path = tmp_path / "in.safetensors"
+    write_safetensors(path, public.random_weights(NET), {})
+    return path
+
+
+@pytest.fixture
+def vae(tmp_path: Path) -> Path:
+    params = toy.drawn(jax.eval_shape(lambda key: init(SMALL, key), jax.random.key(0)))
+    params["latents"] = {"mean": np.zeros(4, np.float32), "log_deviation": np.full(4, np.log(1 / 0.2), np.float32)}
+    tensors, settings = to_public(SMALL, params)
+    (tmp_path / "vae").mkdir()
+    path = tmp_path / "vae" / "in.safetensors"
+    write_safetensors(path, tensors, {})
+    (tmp_path / "vae" / "config.json").write_text(json.dumps(settings))
+    return path
+
+
+def test_irasim_comes_back_to_the_bit(weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = weights.parent
+    convert("irasim", weights, folder / "own", "--heads", NET.heads)
+    assert "left aside: 2 tensors of fixed positions" in capsys.readouterr().out
+    convert("irasim", folder / "own", folder / "out.safetensors")
+    expected = public.random_weights(NET)
+    assert_same(folder / "out.safetensors", expected)
+    convert("irasim", folder / "out.safetensors", folder / "again")
+    assert load_irasim(folder / "again")[0] == load_irasim(folder / "own")[0]
+
+
+def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    convert("sdxl", vae, vae.parent / "own")
+    printed = capsys.readouterr().out
+    assert (
+        "left aside: no tensors" in printed
+        and "have the factor 0.2; the public IRASim needs SDXL's, 0.13025" in printed
+    )
+    config, params = load_kl_autoencoder(vae.parent / "own")
+    assert config == SMALL
+    np.testing.assert_allclose(np.exp(-params["latents"]["log_deviation"]), 0.2, rtol=1e-5)
+    (vae.parent / "out").mkdir()
+    convert("sdxl", vae.parent / "own", vae.parent / "out" / "x.safetensors")
+    assert json.loads((vae.parent / "out" / "config.json").read_text())["scaling_factor"] == 0.2
+
+
+def test_one_directory_holds_both_networks(weights: Path, vae: Path) -> None:
+    convert("irasim", weights, weights.parent / "own", "--heads", NET.heads)
+    convert("sdxl", vae, weights.parent / "own")
+    assert load_kl_autoencoder(weights.parent / "own")[0] == SMALL
+    assert load_irasim(weights.parent / "own")[0].width == NET.width
+
+
+def test_files_of_something_else_are_refused(
+    weights: Path, vae: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_safetensors(tmp_path / "genie.safetensors", GENIE, {})
+    assert "genie.safetensors: holds no weights of an IRASim" in refused(
+        capsys, "irasim", tmp_path / "genie.safetensors", tmp_path / "o"
+    )
+    assert "holds no AutoencoderKL" in refused(capsys, "sdxl", weights, tmp_path / "o")
+    assert "of width 32, which is none of the public sizes; set --heads" in refused(
+        capsys, "irasim", weights, tmp_path / "o"
+    )
+    tensors = public.random_weights(NET)
+    del tensors["blocks.1.mlp.fc2.bias"]
+    tensors["extra"] = np.zeros(1, np.float32)
+    write_safetensors(weights, tensors, {})
+    message = refused(capsys, "irasim", weights, tmp_path / "o", "--heads", 2)
+    assert "missing: blocks.1.mlp.fc2.bias; unexpected: extra" in message
+    (vae.parent / "config.json").write_text('{"_class_name": "AutoencoderTiny"}')
+    assert "describes AutoencoderTiny, not AutoencoderKL" in refused(capsys, "sdxl", vae, tmp_path / "o")
+
+
+def test_a_trained_autoencoder_has_no_public_form(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="cannot express model.autoencoder.network 'magvit2'"):
+        to_public(toy.AUTOENCODER, toy.autoencoder_params(toy.config()))
+    params = toy.drawn(jax.eval_shape(lambda key: init(SMALL, key), jax.random.key(0)))
+    with pytest.raises(Exception, match="one factor for all latent channels"):
+        to_public(replace(SMALL, kl_weight=0.0), params)
+
+
+@pytest.mark.parametrize(
+    ("options", "scale", "line"),
+    [
+        ((), 1.0, "read from the file's key ema\n"),
+        (("--weights", "raw"), 2.0, "read from the file's key model\n"),
+        ((), 2.0, "read from the file's key model, as it has no ema\n"),
+    ],
+)
+def test_training_checkpoints_are_read_without_running_them(
+    options: tuple[str, ...], scale: float, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch = pytest.importorskip("torch")
+    ema = {name: torch.from_numpy(x) for name, x in public.random_weights(NET).items()}
+    raw = {f"module.{name}": 2 * x for name, x in ema.items()}
+    moments = {number: {"exp_avg": x} for number, x in enumerate(ema.values())}
+    networks = {"model": raw} if "no ema" in line else {"model": raw, "ema": ema}
+    torch.save(networks | {"opt": {"state": moments}, "args": None}, tmp_path / "0300000.pt")
+    convert("irasim", tmp_path / "0300000.pt", tmp_path / "own", "--heads", NET.heads, *options)
+    said = capsys.readouterr().out
+    assert line in said
+    for key in (networks.keys() | {"opt"}) - {"ema" if scale == 1 else "model"}:
+        assert f"left aside: {len(ema)} tensors of the file's key {key}\n" in said
+    kernel = load_irasim(tmp_path / "own")[1]["final"]["kernel"]
+    np.testing.assert_allclose(kernel, scale * public.random_weights(NET)["final_layer.linear.weight"].T)

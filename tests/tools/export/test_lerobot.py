@@ -1,0 +1,218 @@
+"""A store exported as a LeRobotDataset, read back by our own reader of that format and by pandas."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rsjax
+from rsjax.data.merge import merge
+from rsjax.data.store import Store, StoreError
+from rsjax.errors import UserError
+from rsjax.tools.export import lerobot_layouts
+from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
+from rsjax.tools.ingest.ingest import ingest
+from rsjax.tools.ingest.options import IngestOptions, make_plan
+from rsjax.tools.ingest.windows import WindowConfig
+from tests.tools.ingest.formats.reading import read_all
+
+TASKS = ("pick", "place the lid", "pick")
+
+
+def toy_store(path: Path, count: int = 5, frames: int = 6, size: int = 32, width: int = 3, **fields: Any) -> Store:
+    """Clips whose pictures are smooth and differ in each frame, so that a codec changes them little."""
+    rng = np.random.default_rng(count)
+
+    def clips() -> Any:
+        for number in range(count):
+            ramp = np.linspace(0, 120, size)[:, None, None] + 10 * number + 5 * np.arange(frames)[:, None, None, None]
+            rgb = np.broadcast_to(ramp + np.array([0, 20, 40]), (frames, size, size, 3)).astype(np.uint8)
+            actions = rng.normal(size=(frames, width)).astype(np.float32)
+            actions[0] = 0
+            yield {"rgb": rgb, "actions": actions, "task": TASKS[number % 3], "fps": 5.0} | fields
+
+    return rsjax.write_store(path, clips(), test_share=0.2)
+
+
+def records(store: Store, split: str = "train") -> list[Any]:
+    source = store.source(split)
+    return [source[number] for number in range(len(source))]
+
+
+def assert_near(one: np.ndarray, other: np.ndarray) -> None:
+    """Pictures are equal but for what a codec loses."""
+    assert np.abs(one.astype(int) - other).mean() < 3
+
+
+@settings(max_examples=6)
+@given(
+    st.sampled_from(["v3.0", "v2.1"]),
+    st.integers(2, 4),
+    st.integers(2, 7),
+    st.sampled_from([16, 18, 48]),
+    st.sampled_from([1, 3]),
+    st.sampled_from([2.0, 5.0, 12.5, 30.0]),
+    st.sampled_from(["zeros", "command", "none"]),
+)
+def test_what_is_exported_is_read_back(
+    tmp_path_factory: Any, version: Any, count: int, frames: int, size: int, width: int, fps: float, state: Any
+) -> None:
+    folder = tmp_path_factory.mktemp("lerobot")
+    store = toy_store(folder / "store", count, frames, size, width, fps=fps)
+    export_lerobot(store, folder / "out", LeRobotOptions(version, state=state, codec="h264", crf=1))
+    clips, episodes = records(store), read_all("lerobot", folder / "out")
+    assert len(clips) == len(episodes)
+    for clip, episode in zip(clips, episodes, strict=True):
+        np.testing.assert_array_equal(episode.actions, clip["actions"])
+        assert_near(episode.cameras["image"].read(range(frames)), clip["rgb"])
+        assert (episode.task, episode.fps) == (clip["task"], fps)
+        states = {"zeros": np.zeros((frames, 2), np.float32), "command": clip["actions"], "none": None}[state]
+        np.testing.assert_array_equal(episode.states, states) if state != "none" else None
+        assert (episode.states is None) == (state == "none")
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> None:
+    store = toy_store(tmp_path / "store")
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(version, crf=1))
+    off = dict.fromkeys(("shots", "motion", "depth", "tracks", "semantics"), "none")
+    windows = WindowConfig(frames=6, rate=0, hop=6)
+    options = IngestOptions(out=tmp_path / "again", windows=windows, image_size=32, test_share=0.0, **off)  # type: ignore[arg-type]
+    ingest(make_plan("lerobot", tmp_path / "out", options))
+    for old, new in zip(records(store), records(rsjax.open_store(tmp_path / "again")), strict=True):
+        np.testing.assert_array_equal(new["actions"], old["actions"])
+        assert_near(new["rgb"], old["rgb"])
+        assert new["task"] == old["task"]
+
+
+def test_large_data_sets_fill_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = toy_store(tmp_path / "store", 5)
+    for name in ("DATA_MEGABYTES", "VIDEO_MEGABYTES"):
+        monkeypatch.setattr(lerobot_layouts, name, 0)
+    for name, value in (("CHUNK", 2), ("BUFFERED", 2)):
+        monkeypatch.setattr(lerobot_layouts, name, value)
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"))
+    assert len(list((tmp_path / "out").glob("data/chunk-*/*"))) == 4
+    assert (tmp_path / "out/data/chunk-001/file-001.parquet").exists()
+    for clip, episode in zip(records(store), read_all("lerobot", tmp_path / "out"), strict=True):
+        np.testing.assert_array_equal(episode.actions, clip["actions"])
+        assert_near(episode.cameras["image"].read(range(6)), clip["rgb"])
+
+
+@pytest.mark.parametrize("fps", [24000 / 1001, 29.9712 * 15 / 113])
+def test_a_videos_frames_are_where_the_timestamps_are_however_long_it_is(tmp_path: Path, fps: float) -> None:
+    info = export_lerobot(toy_store(tmp_path / "store", fps=fps), tmp_path / "out", LeRobotOptions(codec="h264"))
+    with av.open(next((tmp_path / "out").glob("videos/*/*/*.mp4"))) as video:
+        assert float(video.streams.video[0].average_rate) == info["fps"]  # type: ignore[arg-type]
+    assert info["fps"] == pytest.approx(fps, rel=1e-6) and (info["fps"] == fps or fps < 20)
+
+
+def test_clips_of_several_cameras_are_named_after_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stores = [toy_store(tmp_path / name, 2, provenance={"camera": name}) for name in ("front", "wrist")]
+    merge([store.path for store in stores], tmp_path / "both")
+    info = export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "out", LeRobotOptions(codec="h264"))
+    assert "observation.images.front" in info["features"]
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "clips of the cameras front, wrist; all are in observation.images.front" in said
+
+
+def test_statistics_are_those_of_all_rows(tmp_path: Path) -> None:
+    store = toy_store(tmp_path / "store")
+    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264", split="all"))
+    clips = records(store, "train") + records(store, "test")
+    actions = np.concatenate([np.concatenate([clip["actions"][1:], clip["actions"][-1:]]) for clip in clips])
+    pixels = np.concatenate([clip["rgb"].reshape(-1, 3) for clip in clips]) / 255
+    stats = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    for rows, own, count in (
+        (actions, stats["action"], len(actions)),
+        (pixels, stats["observation.images.image"], len(actions)),
+    ):
+        for name in ("min", "max", "mean", "std"):
+            np.testing.assert_allclose(np.ravel(own[name]), getattr(rows, name)(0), rtol=1e-5, atol=1e-6)
+        assert own["count"] == [count]
+        assert (
+            np.diff([np.ravel(own[name]) for name in ("min", "q01", "q10", "q50", "q90", "q99", "max")], axis=0) >= 0
+        ).all()
+    assert np.shape(stats["observation.images.image"]["mean"]) == (3, 1, 1)
+    assert info["splits"] == {"train": "0:4", "test": "4:5"} and info["total_frames"] == 30
+    assert set(stats) == set(info["features"])
+
+
+def test_v21_has_a_line_for_each_episode(tmp_path: Path) -> None:
+    info = export_lerobot(toy_store(tmp_path / "store"), tmp_path / "out", LeRobotOptions("v2.1", codec="h264"))
+    lines = {
+        name: [json.loads(line) for line in (tmp_path / f"out/meta/{name}.jsonl").read_text().splitlines()]
+        for name in ("tasks", "episodes", "episodes_stats")
+    }
+    assert [row["length"] for row in lines["episodes"]] == [6] * 4
+    assert [row["task_index"] for row in lines["tasks"]] == list(range(info["total_tasks"]))
+    assert all(set(row["stats"]) == set(info["features"]) for row in lines["episodes_stats"])
+    assert all(
+        set(each) == {"min", "max", "mean", "std", "count"} for each in lines["episodes_stats"][0]["stats"].values()
+    )
+    assert (info["total_videos"], info["total_chunks"]) == (4, 1)
+
+
+def test_pandas_finds_the_tasks_by_their_text(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="pandas is in requirements-extras.txt (make extras)")
+    export_lerobot(toy_store(tmp_path / "store"), tmp_path / "out", LeRobotOptions(codec="h264"))
+    frame = pandas.read_parquet(tmp_path / "out/meta/tasks.parquet")
+    for number, task in enumerate(frame.index):
+        assert frame.loc[task].task_index == number and task in TASKS
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+@pytest.mark.parametrize("width", [1, 3])
+def test_columns_have_the_types_that_lerobot_casts_to(tmp_path: Path, version: Any, width: int) -> None:
+    """Lists of the feature's length, and scalars where its shape is [1]."""
+    store = toy_store(tmp_path / "store", width=width)
+    info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, codec="h264"))
+    schema = pq.read_schema(next((tmp_path / "out").glob("data/*/*.parquet")))
+    for name in schema.names:
+        shape, kind = info["features"][name]["shape"], schema.field(name).type
+        assert pa.types.is_fixed_size_list(kind) == (shape != [1])
+        assert shape == [1] or shape == [kind.list_size]
+    assert info["features"]["action"]["shape"] == [width]
+    assert info["features"]["observation.state"]["shape"] == [2]
+    assert {str(schema.field(name).type) for name in ("frame_index", "index", "task_index")} == {"int64"}
+
+
+def test_an_export_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = toy_store(tmp_path / "store")
+
+    def fail(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"), fail)
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith("out")]
+    export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"))
+    with pytest.raises(UserError, match=r"out: exists; choose another"):
+        export_lerobot(store, tmp_path / "out")
+
+
+def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="do not say how many frames a second have; give --fps"):
+        export_lerobot(toy_store(tmp_path / "still", fps=None), tmp_path / "a")
+    with pytest.raises(UserError, match="33 × 33 pixels"):
+        export_lerobot(toy_store(tmp_path / "odd", size=33), tmp_path / "b")
+    for fps in (float("inf"), -1.0, 1e-9):
+        with pytest.raises(UserError, match=r"32 × 32 pixels at .* Hz; videos need even sides and 0.001 to 1000 Hz"):
+            export_lerobot(toy_store(tmp_path / f"{fps}"), tmp_path / "f", LeRobotOptions(fps=fps))
+    for fields in ({"crf": 64}, {"crf": 52, "codec": "h264"}, {"crf": -3}):
+        with pytest.raises(UserError, match=r"export.crf is .*; it must be 0 … "):
+            LeRobotOptions(**fields)  # type: ignore[arg-type]
+    fast, slow = toy_store(tmp_path / "fast"), toy_store(tmp_path / "slow", fps=2.0)
+    merge([fast.path, slow.path], tmp_path / "both")
+    with pytest.raises(StoreError, match=r"has clips of 5 and 2 frames a second .* or give --fps"):
+        export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "d")
+    with pytest.raises(StoreError, match="no split 'val'"):
+        export_lerobot(toy_store(tmp_path / "store"), tmp_path / "c", LeRobotOptions(split="val"))  # type: ignore[arg-type]

@@ -1,0 +1,160 @@
+"""Whatever happens to one file of a data set, each episode is read or reported in one line, and all are counted."""
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsjax.errors import UserError
+from rsjax.tools.ingest.formats import open_source
+from tests.tools.ingest.formats import (
+    test_agibot,
+    test_bair,
+    test_folder,
+    test_lerobot,
+    test_libero,
+    test_npz,
+    test_sim,
+)
+from tests.tools.ingest.formats.toy_demos import demo, write_demos
+from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
+from tests.tools.ingest.formats.videos import close_videos
+
+
+def write_sim(root: Path) -> None:
+    root.rmdir()
+    test_sim.write(root, *(test_sim.clip(number) for number in range(3)))
+
+
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "lerobot v2": test_lerobot.write_v2,
+    "lerobot v3": test_lerobot.write_v3,
+    "agibot": test_agibot.write_agibot,
+    "folder": test_folder.write_episode,
+    "robomimic": lambda root: write_demos(root / "a.hdf5", {f"demo_{number}": demo() for number in range(3)}),
+    "libero": lambda root: write_demos(root / "a_demo.hdf5", {"demo_0": test_libero.libero_demo()}),
+    "rlds": lambda root: write_bridge(root, [bridge_episode(3), bridge_episode(4)]),
+    "bair": lambda root: test_bair.write(root, *[test_bair.episode_bytes()] * 2),
+    "npz": lambda root: [test_npz.write(root / f"{number}.npz", bool(number)) for number in range(2)],
+    "sim": write_sim,
+}
+
+
+def read_everything(name: str, root: Path) -> tuple[int, list[str]]:
+    """How many episodes are listed, and the messages of errors."""
+    listed, messages = 0, []
+    try:
+        source = open_source(name.partition(" ")[0], root)
+        for ref in source.episodes():
+            listed += 1
+            try:
+                episode = source.read(ref)
+                for pictures in (*episode.cameras.values(), *episode.depth.values()):
+                    pictures.read([0, len(pictures) - 1])
+            except UserError as error:
+                messages.append(str(error))
+    except UserError as error:
+        messages.append(str(error))
+    return listed, messages
+
+
+@pytest.fixture(scope="module", params=WRITERS)
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    root = tmp_path_factory.mktemp("whole") / "set"
+    root.mkdir()
+    WRITERS[request.param](root)
+    return request.param, root
+
+
+@settings(max_examples=25)
+@given(data=st.data())
+def test_damage_to_one_file(whole: tuple[str, Path], data: st.DataObject) -> None:
+    name, root = whole
+    count, messages = read_everything(name, root)
+    assert not messages
+    files = [path.relative_to(root) for path in sorted(root.rglob("*")) if path.is_file()]
+    path = root / data.draw(st.sampled_from(files))
+    payload = path.read_bytes()
+    share = data.draw(st.floats(0, 0.99))
+    place = int(share * len(payload))
+    made = {
+        "truncated": payload[:place],
+        "overwritten": payload[:place] + data.draw(st.binary(min_size=1, max_size=40)) + payload[place + 40 :],
+        "something else": data.draw(st.binary(max_size=100)),
+    }
+    try:
+        path.write_bytes(made[data.draw(st.sampled_from(sorted(made)))])
+        listed, messages = read_everything(name, root)
+    finally:
+        path.write_bytes(payload)
+    assert all("\n" not in message for message in messages)
+    assert listed == count or messages
+
+
+@contextlib.contextmanager
+def forbidden(path: Path) -> Iterator[None]:
+    """Nobody may read it, not even root, who reads as somebody else."""
+    mode, user = path.stat().st_mode, os.geteuid()
+    path.chmod(0)
+    try:
+        if user == 0:
+            os.seteuid(65534)
+        yield
+    finally:
+        os.seteuid(user)
+        path.chmod(mode)
+
+
+def test_what_may_not_be_read(whole: tuple[str, Path]) -> None:
+    name, written = whole
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own folders are closed to others
+        root = shutil.copytree(written, Path(folder) / "set")
+        Path(folder).chmod(0o755)
+        read_everything(name, root)  # libraries import parts of themselves at first use
+        for path in [root, *sorted(root.rglob("*"))]:
+            close_videos()
+            with forbidden(path):
+                _, messages = read_everything(name, root)
+            assert messages or "depth" in path.parts, path
+            assert all("\n" not in message for message in messages)
+
+
+def test_a_folder_in_place_of_a_file(whole: tuple[str, Path], tmp_path: Path) -> None:
+    name, root = whole[0], shutil.copytree(whole[1], tmp_path / "set")
+    for path in [path for path in root.rglob("*") if path.is_file() and path.suffix != ".json"]:
+        path.unlink()
+        path.mkdir()
+    _, messages = read_everything(name, root)
+    assert messages
+    assert all("\n" not in message for message in messages)
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+PAGE = b'\n<!DOCTYPE html>\n<html lang="en"><head><title>Sign in</title></head></html>\n'
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(POINTER, "fetch it with git lfs pull"), (PAGE, "a web page in place of the file")],
+    ids=["pointer", "page"],
+)
+def test_what_a_download_left_in_place_of_a_file_is_named(
+    whole: tuple[str, Path], tmp_path: Path, content: bytes, words: str
+) -> None:
+    name, root = whole[0], shutil.copytree(whole[1], tmp_path / "set")
+    for path in [path for path in sorted(root.rglob("*")) if path.is_file()]:
+        payload = path.read_bytes()
+        path.write_bytes(content)
+        close_videos()
+        _, messages = read_everything(name, root)
+        named = any(f"{path.name}: " in message and words in message for message in messages)
+        assert named or "depth" in path.parts, (path, messages)
+        assert all("\n" not in message for message in messages)
+        path.write_bytes(payload)

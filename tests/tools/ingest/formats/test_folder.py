@@ -1,0 +1,302 @@
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rsjax.data.codec import decode, encode
+from rsjax.tools.ingest.actions import ActionConfig, Layout, sampled_actions
+from rsjax.tools.ingest.episode import Episode, EpisodeError, SourceError
+from rsjax.tools.ingest.formats import open_source
+from tests.tools.ingest.formats.reading import error_of, read_all, read_first
+from tests.tools.ingest.formats.videos import numbers_of, picture, write_video
+
+COUNT = 8
+ACTIONS = np.stack([np.arange(COUNT), np.full(COUNT, 5.0)], 1).astype(np.float32)
+
+
+def write_csv(path: Path, rows: int = COUNT) -> None:
+    lines = [f"{row / 10},{row},5,{row}.5" for row in range(rows)]
+    path.write_text("\n".join(["timestamp,action_x,action_grip,state_x", *lines]) + "\n")
+
+
+def write_episode(root: Path, name: str = "one") -> Path:
+    """Two cameras at 10 fps, pictures 0 … 7 and 20 … 27, action (t, 5) given at frame t."""
+    write_video(root / name / "front.mp4", range(COUNT), 10)
+    write_video(root / name / "wrist.mp4", range(20, 20 + COUNT), 10)
+    write_csv(root / name / "actions.csv")
+    return root / name
+
+
+def test_a_name_that_is_no_text_is_kept(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9")
+    write_episode(tmp_path, name)
+    (episode,) = read_all("folder", tmp_path)
+    assert episode.id.isascii() or episode.id == name
+    assert decode(encode({"id": episode.id, "n": np.zeros(1)}))["id"] == episode.id
+    write_episode(tmp_path, os.fsdecode(b"caf\xea"))
+    assert len({episode.id for episode in read_all("folder", tmp_path)}) == 2
+
+
+def test_an_episode_in_a_folder(tmp_path: Path) -> None:
+    write_episode(tmp_path)
+    segments = [{"start": 3, "end": 8, "text": "put"}, {"start": 0, "end": 3, "text": "take", "skill": "pick"}]
+    (tmp_path / "one/episode.json").write_text(json.dumps({"task": "tidy up", "segments": segments}))
+    (episode,) = read_all("folder", tmp_path, kind="absolute", held=[1])
+    assert (episode.id, episode.task, list(episode.cameras)) == ("one", "tidy up", ["front", "wrist"])
+    assert episode.fps == pytest.approx(10)
+    assert numbers_of(episode.cameras["front"].read(range(COUNT))) == list(range(COUNT))
+    assert numbers_of(episode.cameras["wrist"].read([7, 0])) == [27, 20]
+    np.testing.assert_array_equal(episode.actions[1:], ACTIONS[:-1])  # given at t, led into t + 1
+    assert not episode.actions[0].any()
+    assert episode.states is not None
+    np.testing.assert_array_equal(episode.states[:, 0], np.arange(COUNT) + 0.5)
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
+    assert [(s.start, s.end, s.text, s.skill) for s in episode.segments] == [(0, 3, "take", "pick"), (3, 8, "put", "")]
+    assert episode.meta["action_names"] == ["action_x", "action_grip"]
+    assert Layout.from_json(episode.meta["actions"]) == Layout("absolute", held=(1,))
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npy", "one row less"])
+def test_flat_episodes_with_any_table(tmp_path: Path, kind: str) -> None:
+    write_video(tmp_path / "a b.mp4", range(COUNT), 10)
+    columns = {"x": ACTIONS[:, 0], "grip": ACTIONS[:, 1]}
+    if kind == "csv":
+        lines = ["x,grip", *(f"{x},{grip}" for x, grip in ACTIONS)]
+        (tmp_path / "a b.csv").write_text("\n".join(lines))
+    elif kind == "parquet":
+        pq.write_table(pa.table(columns), tmp_path / "a b.parquet")
+    else:
+        np.save(tmp_path / "a b.npy", ACTIONS[: -1 if kind == "one row less" else None])
+    (tmp_path / "a b.json").write_text('{"task": "go"}')
+    (episode,) = read_all("folder", tmp_path)
+    np.testing.assert_array_equal(episode.actions[1:], ACTIONS[:-1])
+    assert (episode.task, list(episode.cameras), episode.states) == ("go", ["main"], None)
+    assert episode.id.startswith("a-b-")
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
+
+
+def test_rows_that_led_into_their_frame(tmp_path: Path) -> None:
+    write_episode(tmp_path)
+    (tmp_path / "dataset.json").write_text('{"after": true, "task": "go"}')
+    (episode,) = read_all("folder", tmp_path)
+    np.testing.assert_array_equal(episode.actions[1:], ACTIONS[1:])
+    assert not episode.actions[0].any()
+    assert episode.task == "go"
+
+
+def test_pictures_and_depth_maps(tmp_path: Path) -> None:
+    for name in ("top", "top.depth"):
+        (tmp_path / "one" / name).mkdir(parents=True)
+    for number in range(12):  # 10 comes after 9 though it is written without zeros before it
+        cv2.imwrite(str(tmp_path / f"one/top/{number}.png"), picture(number)[..., ::-1])
+        cv2.imwrite(str(tmp_path / f"one/top.depth/{number}.png"), np.full((4, 6), 1000 + number, np.uint16))
+    np.save(tmp_path / "one/actions.npy", np.zeros((12, 3)))
+    assert "how fast are its pictures" in error_of("folder", tmp_path)
+    (episode,) = read_all("folder", tmp_path, fps=5)
+    assert numbers_of(episode.cameras["top"].read([11, 2])) == [11, 2]
+    depth = episode.depth["top"].read([10, 0])
+    assert (depth.dtype, depth.shape) == (np.float32, (2, 4, 6))
+    np.testing.assert_allclose(depth[:, 0, 0], [1.01, 1.0])
+    (tmp_path / "one/top.depth/5.png").unlink()
+    assert "depth top has 11 rows, timestamps 12" in error_of("folder", tmp_path, fps=5)
+
+
+def test_a_picture_that_claims_to_be_enormous(tmp_path: Path) -> None:
+    (tmp_path / "one/top").mkdir(parents=True)
+    png = bytearray(cv2.imencode(".png", picture(0))[1].tobytes())
+    png[16:24] = (2**30).to_bytes(4, "big") * 2
+    (tmp_path / "one/top/0.png").write_bytes(png)
+    np.save(tmp_path / "one/actions.npy", np.zeros((1, 3)))
+    (episode,) = read_all("folder", tmp_path, fps=5)
+    with pytest.raises(EpisodeError, match=r"0.png: its header says 1073741824 × 1073741824 pixels"):
+        episode.cameras["top"].read([0])
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("", "actions.csv: cannot be read"),
+        ("0,1\n1,2\n", "its first line must name the columns"),
+        ("x,x\n1,2\n", "each once"),
+        ("timestamp,state_x\n1,2\n", "has no column of actions"),
+        ("timestamp,x\n" + "".join(f"{row / 10},left\n" for row in range(COUNT)), "column 'x' .* is not rows of"),
+        ("timestamp,x\n" + "".join(f"{row / 10},{row}\n" for row in range(3)), "3 timestamps for 8 pictures"),
+        ("x\n" + "1\n" * 3, "3 rows of actions for 8 pictures"),
+        ("timestamp,x\n" + "".join(f"{abs(4 - row)},{row}\n" for row in range(COUNT)), "timestamps do not increase"),
+        ("x\n" + "1\n" * 7 + "nan\n", "actions .* not finite|is not rows of as many numbers"),
+    ],
+)
+def test_a_wrong_table_is_named(tmp_path: Path, table: str, message: str) -> None:
+    write_episode(tmp_path)
+    (tmp_path / "one/actions.csv").write_text(table)
+    if "nan" in table:  # the last row leads nowhere unless it says so
+        (tmp_path / "dataset.json").write_text('{"after": true}')
+    with pytest.raises(EpisodeError, match=message):
+        read_first("folder", tmp_path)
+
+
+def test_what_an_episode_lacks_is_named(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    np.save(place / "more.npy", ACTIONS)
+    several = "needs one table of actions (.csv, .parquet, .npy), there is actions.csv, more.npy"
+    assert several in error_of("folder", tmp_path)
+    (place / "more.npy").unlink()
+    (place / "episode.json").write_text('{"segments": [{"start": 0, "end": 99, "text": "far"}]}')
+    assert "episode.json: segment 0 is 0 … 99, there are 8 frames" in error_of("folder", tmp_path)
+    (place / "episode.json").write_text('{"fps": "fast"}')
+    assert "episode.json: task, fps or segments are wrong" in error_of("folder", tmp_path)
+    (place / "episode.json").write_text("{")
+    assert "episode.json: cannot be read" in error_of("folder", tmp_path)
+    (place / "episode.json").unlink()
+    write_video(place / "wrist.mp4", range(5), 10)
+    assert "camera wrist has 5 rows, timestamps 8" in error_of("folder", tmp_path)
+    for name in ("front", "wrist"):
+        (place / f"{name}.mp4").unlink()
+    assert "has no video" in error_of("folder", tmp_path)
+
+
+def test_arrays_that_are_none(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    (place / "actions.csv").unlink()
+    for array, message in (
+        (np.array([{}]), "actions.npy: cannot be read"),
+        (np.array(["left"]), "no table of numbers"),
+        (np.zeros(3), "shape \\(3,\\), should be"),
+    ):
+        np.save(place / "actions.npy", array)
+        with pytest.raises(EpisodeError, match=message):
+            read_all("folder", tmp_path)
+
+
+def test_links_that_lead_to_themselves(tmp_path: Path) -> None:
+    write_episode(tmp_path)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    source = open_source("folder", tmp_path)
+    one, loop = source.episodes()
+    assert (loop.id, one.id) == ("loop", "one")
+    with pytest.raises(EpisodeError, match=r"loop: cannot be listed \(Too many levels of symbolic links\)"):
+        source.read(loop)
+    (tmp_path / "loop").unlink()
+    (tmp_path / "one/loop.mp4").symlink_to(tmp_path / "one/loop.mp4")
+    assert "loop.mp4: not a readable video (Too many levels of symbolic links)" in error_of("folder", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["one/front.mp4", "one/actions.csv", "one/episode.json", "one/top/0.png"])
+def test_a_pipe_among_the_files_is_reported_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    write_episode(tmp_path)
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    assert "a pipe or device, not a file" in (message := error_of("folder", tmp_path)) and path.name in message
+
+
+def test_a_flat_pipe_is_reported_and_not_waited_for(tmp_path: Path) -> None:
+    write_csv(tmp_path / "one.csv")
+    os.mkfifo(tmp_path / "one.mp4")
+    assert "one.mp4: cannot be read (a pipe or device, not a file)" in error_of("folder", tmp_path)
+
+
+def test_dimensions_that_actions_do_not_have_are_reported(tmp_path: Path) -> None:
+    write_episode(tmp_path)
+    message = error_of("folder", tmp_path, held=[2])
+    assert "actions.csv: held names dimension 2, but actions have 2" in message
+
+
+def sampled(episode: Episode, step: int) -> np.ndarray:
+    layout = Layout.from_json(json.loads(json.dumps(episode.meta["actions"])))
+    return sampled_actions(episode.actions, np.arange(0, COUNT, step), ActionConfig(), layout)
+
+
+def test_rows_of_actions_are_not_combined_before_somebody_says_what_they_are(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    lines = [f"{row / 10},{0.1 * (-1) ** row},{int(row > 1)}" for row in range(COUNT)]
+    (place / "actions.csv").write_text("\n".join(["timestamp,action_x,action_switch", *lines]))
+    switch = r"dimension 1 \(action_switch\) is never anything but 0 or 1"
+    undeclared = read_first("folder", tmp_path)
+    np.testing.assert_array_equal(sampled(undeclared, 1), undeclared.actions)  # as recorded
+    with pytest.raises(EpisodeError, match=f"2 recorded rows become one.* --option kind=delta .*: {switch}") as raised:
+        sampled(undeclared, 2)
+    assert raised.value.option == "--option kind"
+    with pytest.raises(EpisodeError, match=rf"but {switch}; .*--option 'held=\[…\]'") as raised:
+        sampled(read_first("folder", tmp_path, kind="delta"), 2)
+    assert raised.value.option == "--option held"
+    # What is declared is believed.
+    assert sampled(read_first("folder", tmp_path, kind="delta", held=[1]), 2)[:, 1].max() == 1
+    assert sampled(read_first("folder", tmp_path, kind="delta", held=[]), 2)[:, 1].max() == 2
+    assert sampled(read_first("folder", tmp_path, kind="absolute"), 2)[:, 1].max() == 1
+
+
+def test_columns_that_count_rows_or_time_are_no_actions_unless_asked_for(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    names = ["", "Unnamed: 0", "time", "Frame", "index", "frame_index", "episode_id", "t", "x", "frameless"]
+    lines = [",".join(str(row) for _ in names) for row in range(COUNT)]
+    (place / "actions.csv").write_text("\n".join([",".join(names), *lines]))
+    episode = read_first("folder", tmp_path, fps=10)
+    assert episode.meta["action_names"] == ["x", "frameless"]
+    assert episode.meta["notes"] == {"not_taken_for_actions": names[:-2]}
+    assert read_first("folder", tmp_path, fps=10, action=["x", "time"]).meta["action_names"] == ["x", "time"]
+    with pytest.raises(EpisodeError, match=r"has no column 'tme'; did you mean 'time'"):
+        read_first("folder", tmp_path, fps=10, action=["tme"])
+
+
+def test_a_folder_of_nothing_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(SourceError, match=f"^{tmp_path}: has no episode"):
+        list(open_source("folder", tmp_path).episodes())
+
+
+@pytest.mark.parametrize("fps", [-1, 10_001, float("nan"), 10**400])
+def test_a_rate_that_no_camera_has_is_reported_before_anything_is_read(tmp_path: Path, fps: float) -> None:
+    with pytest.raises(SourceError, match=r": fps is .*, should be a number from 0 to 10000; mend it"):
+        open_source("folder", tmp_path, fps=fps)
+
+
+def test_settings_that_cannot_be(tmp_path: Path) -> None:
+    for text, message in (
+        ('{"afer": true}', "no field 'afer'; did you mean 'after'"),
+        ('{"kind": "relative"}', "kind is 'relative', should be absolute or delta"),
+        ('{"after": null}', "after is None, should be true or false"),
+        ('{"held": "2"}', "held is '2', should be a list of whole numbers"),
+        ('{"held": [true]}', "held is .True., should be a list of whole numbers"),
+        ('{"fps": true}', "fps is True, should be a number"),
+        ("[]", "should be an object"),
+        ("{", "dataset.json: cannot be read"),
+    ):
+        (tmp_path / "dataset.json").write_text(text)
+        with pytest.raises(SourceError, match=message):
+            open_source("folder", tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SourceError, match="not a folder"):
+        open_source("folder", tmp_path / "file")
+    with pytest.raises(SourceError, match="not there"):
+        open_source("folder", tmp_path / "gone")
+
+
+def test_cameras_that_drift_apart_are_reported(tmp_path: Path) -> None:
+    for name, fps in (("front", 10), ("wrist", 5)):
+        write_video(tmp_path / f"one/{name}.mp4", range(COUNT), fps)
+    np.save(tmp_path / "one/actions.npy", ACTIONS)
+    assert "wrist: its frame 7 is shown 0.7 s away from that of front; give" in error_of("folder", tmp_path)
+    (episode,) = read_all("folder", tmp_path, fps=10)
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10)
+
+
+def test_times_that_count_from_1970(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    lines = ["timestamp,x", *(f"{1.7e9 + row / 10:.3f},{row}" for row in range(COUNT))]
+    (place / "actions.csv").write_text("\n".join(lines))
+    (episode,) = read_all("folder", tmp_path)
+    assert episode.fps == pytest.approx(10, rel=1e-3)
+    np.testing.assert_allclose(episode.timestamps, np.arange(COUNT) / 10, atol=1e-4)
+
+
+def test_times_that_stand_still_are_reported(tmp_path: Path) -> None:
+    place = write_episode(tmp_path)
+    (place / "actions.csv").write_text("timestamp,x\n" + "5,1\n" * COUNT)
+    assert "timestamps do not increase at frame 1" in error_of("folder", tmp_path)

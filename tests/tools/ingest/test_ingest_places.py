@@ -1,0 +1,175 @@
+import errno
+import hashlib
+import json
+import os
+import pickle
+import re
+import tracemalloc
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from rsjax.data.codec import Record
+from rsjax.data.store import StoreError
+from rsjax.files import FileError, lock
+from rsjax.tools.ingest import packing
+from rsjax.tools.ingest.annotate import Annotators
+from rsjax.tools.ingest.clips import ClipConfig
+from rsjax.tools.ingest.episode import EpisodeRef
+from rsjax.tools.ingest.ingest import LOCK
+from rsjax.tools.ingest.windows import WindowConfig
+from rsjax.tools.ingest.work_items import EpisodeWork, run_episode, run_item
+from tests.tools.ingest.toy import CONFIG, Source, clip_plan, ingested
+
+
+@dataclass
+class Hostile(Source):
+    """Ids that are paths."""
+
+    def episodes(self) -> Sequence[EpisodeRef]:  # type: ignore[override]
+        return [
+            EpisodeRef(name, "0" * 16, {"number": 0}) for name in ("../../escaped", "/tmp/x", "..", "a\0b", "x" * 300)
+        ]
+
+
+def test_an_id_leads_nowhere_but_into_the_folder(tmp_path: Path) -> None:
+    summary = ingested(clip_plan(tmp_path / "inner", Hostile(0)))
+    assert summary is not None and summary.done == 5
+    assert [path.name for path in tmp_path.iterdir()] == ["inner"]
+    assert sorted(path.name for path in (tmp_path / "inner").iterdir()) == ["store", "store.work"]
+
+
+def test_what_is_no_store_of_this_data_set_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "thesis.txt").write_text("years of work")
+    with pytest.raises(StoreError, match=r"exists and is not a store"):
+        ingested(clip_plan(tmp_path, Source(2)))
+    ingested(clip_plan(tmp_path / "inner", Source(2)))
+    with pytest.raises(StoreError, match=r"holds clips of toy, not what this makes of other"):
+        ingested(clip_plan(tmp_path / "inner", Source(2, name="other")))
+    manifest = tmp_path / "inner" / "store" / "manifest.json"
+    merged = {name: value for name, value in json.loads(manifest.read_text()).items() if name != "counts"}
+    manifest.write_text(json.dumps(merged))
+    with pytest.raises(StoreError, match=r"holds clips of toy, not what this makes of toy"):
+        ingested(clip_plan(tmp_path / "inner", Source(3)))
+    assert not (tmp_path / "store.work").exists()
+
+
+def test_two_that_make_one_store_do_not_meet(tmp_path: Path) -> None:
+    plan = clip_plan(tmp_path, Source(2))
+    with lock(plan.folder / LOCK), pytest.raises(StoreError, match=rf"store: process {os.getpid()} on .* is making it"):
+        ingested(plan)
+    assert ingested(plan) is not None
+
+
+def test_what_a_killed_worker_left_is_swept_up(tmp_path: Path) -> None:
+    left = tmp_path / "store.work" / "units" / "tracks" / "ab" / "x.array_record.host-1.tmp"
+    left.parent.mkdir(parents=True)
+    left.touch()
+    ingested(clip_plan(tmp_path, Source(2)))
+    assert not left.exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "match"),
+    [
+        (Source(0), r"the toy data set has no episode"),
+        (
+            Source(2, broken=(0,), short=(1,)),
+            r"none of 2 episodes gave a clip \(1 left out, 1 quarantined\).*video_0.mp4: truncated",
+        ),
+    ],
+)
+def test_where_nothing_comes_of_it_one_line_says_so(tmp_path: Path, source: Source, match: str) -> None:
+    with pytest.raises(StoreError, match=match):
+        ingested(clip_plan(tmp_path, source))
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (
+            ClipConfig(CONFIG.windows, 8, 6, camera="fronty"),
+            "(0 left out, 3 quarantined, all 3 of these because of --camera)",
+        ),
+        (
+            ClipConfig(WindowConfig(4, 20), 8, 6),
+            "(0 left out, 3 quarantined, all 3 of these because of --windows.rate)",
+        ),
+    ],
+)
+def test_an_option_for_which_all_are_quarantined_is_named(tmp_path: Path, config: ClipConfig, message: str) -> None:
+    with pytest.raises(StoreError, match=re.escape(message)):
+        ingested(clip_plan(tmp_path, Source(3), config=config))
+    with pytest.raises(StoreError, match=r"\(0 left out, 2 quarantined\), the first"):
+        ingested(clip_plan(tmp_path, Source(2, broken=(0, 1))))
+
+
+def test_only_tables_that_hold_something_are_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"the longest has 5\).* has all of them in summary.json$"):
+        ingested(clip_plan(tmp_path, Source(2, short=(0, 1))))
+    with pytest.raises(StoreError, match=r" has all of them in quarantine.jsonl$"):
+        ingested(clip_plan(tmp_path / "broken", Source(2, broken=(0, 1))))
+    summary = ingested(clip_plan(tmp_path / "sound", Source(2)))
+    assert summary is not None and summary.tables() == ""
+
+
+def test_a_manifest_is_json_for_others_too(tmp_path: Path) -> None:
+    config = {"most": float("inf"), "deep": [{"x": float("nan")}], "y": 1.5}
+    ingested(replace(clip_plan(tmp_path, Source(2)), meta={"config": config}))
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    manifest = json.loads((tmp_path / "store" / "manifest.json").read_text(), parse_constant=refuse)
+    assert manifest["config"] == {"most": None, "deep": [{"x": None}], "y": 1.5}
+
+
+def test_memory_does_not_grow_with_the_episodes(tmp_path: Path) -> None:
+    config = ClipConfig(CONFIG.windows, image_size=96, tracks=6)  # 440 kB of pixels a clip, 5 clips an episode
+
+    def peak(count: int) -> int:
+        plan = clip_plan(tmp_path / str(count), Source(count, depth=True), config=config)
+        tracemalloc.start()
+        ingested(plan)
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return most
+
+    peak(1)
+    few, many = peak(3), peak(12)
+    assert many < few + 1_000_000  # the pixels of nine more episodes are 20 MB
+
+
+def test_messages_to_and_from_workers_are_small(tmp_path: Path) -> None:
+    """Ids and places, never pictures."""
+    plan = clip_plan(tmp_path, Source(2, depth=True), Annotators(), config=replace(CONFIG, image_size=96))
+    for ref in plan.source.episodes():
+        work = EpisodeWork(plan, ref)
+        marks = [run_item(work, step, set()) for step in plan.steps]
+        assert len(work.records("clips", marks[-1]["records"])[0]["rgb"].tobytes()) > 100_000
+        messages = [ref, run_episode(plan, ref, set()), *marks]  # those of the pool and of Ray
+        assert max(len(pickle.dumps(message)) for message in messages) < 2000
+
+
+def test_a_failed_packing_leaves_the_old_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ingested(clip_plan(tmp_path, Source(2)))
+    before = hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest()
+
+    def failing(*arguments: object) -> Iterator[Record]:
+        raise OSError(errno.ENOSPC, "No space left on device")
+        yield {}
+
+    monkeypatch.setattr(packing, "_records", failing)
+    with pytest.raises(FileError, match=r"disk is full"):
+        ingested(clip_plan(tmp_path, Source(3)))
+    assert hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest() == before
+
+
+def test_a_loop_of_links_in_place_of_the_store_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "store").symlink_to("store")
+    with pytest.raises(FileError, match=r"store: cannot write"):
+        ingested(clip_plan(tmp_path, Source(2)))

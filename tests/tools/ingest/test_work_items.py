@@ -1,0 +1,169 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from rsjax.errors import UserError
+from rsjax.tools.ingest.episode import EpisodeRef
+from rsjax.tools.ingest.ingest import limit_threads, run_on_this_machine
+from rsjax.tools.ingest.summary import IngestSummary, summarise, write_tables
+from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, mark_path
+from tests.tools.ingest.toy import Source, noting_plan, runs
+from tests.waiting import wait_until
+
+ROOT = Path(__file__).parents[3]
+
+
+def finish(plan: IngestPlan, workers: int = 0) -> IngestSummary:
+    """Runs what is missing, and counts; every episode is settled once, and the numbers add up."""
+    refs, settled = list(plan.source.episodes()), list[str]()
+    run_on_this_machine(plan, refs, lambda ref, items, clips: settled.append(ref.id), workers)
+    assert sorted(settled) == [ref.id for ref in refs]
+    summary = summarise(plan, refs)
+    assert summary.episodes == len(refs) == summary.done + len(summary.filtered) + len(summary.quarantined)
+    return summary
+
+
+def test_every_step_runs_once_and_sees_the_one_before(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(3))
+    summary = finish(plan)
+    assert summary.done == 3 and summary.windows == {"kept": 6}
+    assert {name: row["done"] for name, row in summary.steps.items()} == {"first": 3, "clips": 3}
+    work = EpisodeWork(plan, next(plan.source.episodes()))
+    assert work.records("clips", 2)[0]["from"] == [2]
+    assert sorted(runs(tmp_path)) == sorted(f"{step} episode_{n:03d}" for step in ("first", "clips") for n in range(3))
+    finish(plan)
+    assert len(runs(tmp_path)) == 6
+
+
+def test_a_run_counts_what_it_did_itself(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(3), seconds=0.02)
+    refs, ran = list(plan.source.episodes()), list[tuple[int, int]]()
+    run_on_this_machine(plan, refs[:2], lambda ref, items, clips: ran.append((items, clips)))
+    run_on_this_machine(plan, refs, lambda ref, items, clips: ran.append((items, clips)))
+    assert ran == [(2, 2), (2, 2), (0, 0), (0, 0), (2, 2)]
+    steps = summarise(plan, refs).steps
+    assert steps["first"]["seconds"] >= 0.06
+    assert steps["first"]["clips_per_second"] == pytest.approx(6 / steps["first"]["seconds"])
+
+
+def test_a_worker_leaves_cores_to_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    before = cv2.getNumThreads()
+    limit_threads(1)
+    assert cv2.getNumThreads() == 1 and os.environ["OMP_NUM_THREADS"] == "1"
+    cv2.setNumThreads(before)
+
+
+def test_only_what_depends_on_a_change_runs_again(tmp_path: Path) -> None:
+    finish(noting_plan(tmp_path, Source(2)))
+    finish(noting_plan(tmp_path, Source(3)))
+    assert len(runs(tmp_path)) == 6
+    finish(noting_plan(tmp_path, Source(3, version="1")))
+    assert len(runs(tmp_path)) == 12
+    finish(noting_plan(tmp_path, Source(3), extra=1))
+    assert len(runs(tmp_path)) == 18
+    finish(noting_plan(tmp_path, Source(3)))
+    assert len(runs(tmp_path)) == 18
+
+
+def test_a_damaged_output_or_mark_is_made_again(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(2))
+    finish(plan)
+    one, two = (EpisodeWork(plan, ref).output("clips") for ref in plan.source.episodes())
+    os.truncate(one, 100)
+    mark_path(two).write_text("{")
+    finish(plan)
+    assert sorted(runs(tmp_path)[4:]) == ["clips episode_000", "clips episode_001"]
+
+
+def test_a_failing_item_is_quarantined_with_its_traceback_and_the_others_go_on(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(4, broken=(1,)), fails="episode_002")
+    summary = finish(plan)
+    assert summary.done == 2
+    broken, failing = summary.quarantined
+    assert (broken["episode"], broken["stage"]) == ("episode_001", "first")
+    assert broken["error"] == "video_1.mp4: truncated; copy it again"
+    assert failing["error"] == "ValueError: no such colour" and "in __call__" in failing["traceback"]
+    write_tables(plan, list(plan.source.episodes()), summary)
+    rows = [json.loads(line) for line in (plan.folder / "quarantine.jsonl").read_text().splitlines()]
+    assert rows == summary.quarantined
+    assert json.loads((plan.folder / "summary.json").read_text())["quarantined"] == 2
+    assert not list(tmp_path.rglob("*.tmp"))
+    before = runs(tmp_path)
+    finish(plan)
+    assert runs(tmp_path) == before
+
+
+def test_an_episode_that_kills_its_worker_is_tried_again_and_then_quarantined(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(4), deadly="episode_003", once="episode_001")
+    summary = finish(plan, workers=2)
+    assert summary.done == 3
+    assert [(row["episode"], row["stage"]) for row in summary.quarantined] == [("episode_003", "first")]
+    assert summary.quarantined[0]["error"].startswith("WorkerDied: 2 workers died over it")
+    assert [runs(tmp_path).count(f"first episode_00{number}") for number in range(4)] == [1, 2, 1, 2]
+    assert len(runs(tmp_path)) == 9
+
+
+PROGRAM = """
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+from rsjax.tools.ingest.ingest import run_on_this_machine
+from tests.tools.ingest.toy import Source, noting_plan
+if __name__ == "__main__":
+    plan = noting_plan(Path(sys.argv[1]), Source(6), seconds=0.2)
+    def stop(*episode):
+        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+        time.sleep(600)
+    run_on_this_machine(plan, list(plan.source.episodes()), stop, workers=2)
+"""
+
+
+def test_after_a_kill_only_the_rest_is_run(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    line = [sys.executable, str(program), str(tmp_path)]
+    parent = subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pids = parent.stdout.readline().split()  # once an episode is done
+    parent.kill()
+    parent.communicate()
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    marks = len(list(tmp_path.rglob("units/**/*.json")))
+    assert 0 < marks < 12
+    started = len(runs(tmp_path))
+    plan = noting_plan(tmp_path, Source(6))
+    assert finish(plan).done == 6
+    assert len(runs(tmp_path)) - started == 12 - marks
+    assert len(list(tmp_path.rglob("units/**/*.array_record"))) == 12
+
+
+def test_a_full_disk_ends_the_run_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("rsjax.tools.ingest.work_items.ArrayRecordWriter", full)
+    with pytest.raises(UserError, match=r"disk is full"):
+        finish(noting_plan(tmp_path, Source(2)))
+
+
+def test_an_unfinished_ingest_is_not_counted(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(2))
+    with pytest.raises(UserError, match=r"not finished, run it again"):
+        summarise(plan, list(plan.source.episodes()))
+
+
+def test_refused_episodes_are_rows_of_the_quarantine(tmp_path: Path) -> None:
+    plan = noting_plan(tmp_path, Source(1))
+    finish(plan)
+    refs = list(plan.source.episodes())
+    summary = summarise(plan, refs, [(EpisodeRef(refs[0].id, "0" * 16, {}), "id: twice")])
+    assert (summary.episodes, summary.done, len(summary.quarantined)) == (2, 1, 1)
+    assert summary.quarantined[0]["error"] == "id: twice"

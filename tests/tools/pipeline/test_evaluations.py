@@ -1,0 +1,333 @@
+import contextlib
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import compare as compare_command
+from rsjax.config import Config, presets, to_dict
+from rsjax.data.normalization import Normalization
+from rsjax.data.store import Store
+from rsjax.errors import UserError
+from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.protocols import Protocol, find
+from rsjax.evaluation.results import read_frames, read_result
+from rsjax.files import write_json
+from rsjax.models.trained import TrainedModel
+from rsjax.runtime import HUGE_PAGES
+from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tools.pipeline import evaluations
+from rsjax.tools.pipeline import validation_clips as held_out
+from rsjax.tools.pipeline.evaluations import Request, evaluate_own, evaluate_run
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import on_store
+from rsjax.tools.pipeline.validation_clips import held_out_store, longer_episodes
+from rsjax.tools.sim import retakes
+from rsjax.training.checkpoint import save_weights
+from tests.tools.pipeline import toy
+from tests.tools.pipeline.conftest import Commands
+
+FRAMES = toy.config().clips.frames
+CHANGES = {"horizon": FRAMES - 1, "clips": toy.TEST, "action_draws": 0}
+MADE: list[Path] = []  # where batches of the evaluations that were made lie
+
+
+def scored(
+    trained: TrainedModel, store: Store, protocol: Protocol | None = None, *, held_out: HeldOut, folder: Path
+) -> Evaluation:
+    """Stands for an evaluation, whose scores other tests look at: PSNR rises by 1 dB from clip to clip."""
+    MADE.append(folder)
+    folder.mkdir(parents=True)
+    rgb = held_out.clips.rgb
+    per_clip = {f"psnr{suffix}": [20.0 + i for i in range(len(rgb))] for suffix in ("", "_repeat_first", "_tokenizer")}
+    metrics = {name: float(np.mean(values)) for name, values in per_clip.items()}
+    kept = {"rows": np.arange(len(rgb)), "truth": rgb, "prediction": rgb, "reconstruction": rgb}
+    shown = {"clip": held_out.clips.index}
+    return Evaluation(metrics, {"lpips_alex": "no weights"}, shown, per_clip, {}, [metrics], held_out.ids(), kept)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    """A run of random parameters on a store of clips; nothing is generated for its evaluations."""
+    base, plain = tmp_path_factory.mktemp("evaluated"), toy.clip
+    with pytest.MonkeyPatch.context() as patch:  # frames of a recording at 10 frames a second, of which every other
+        timing = {"fps": 10.0, "frames": list(range(0, 2 * FRAMES, 2))}
+        timed = lambda *numbers: replace(clip := plain(*numbers), provenance=clip.provenance | timing)  # noqa: E731
+        patch.setattr(toy, "clip", timed)
+        store = toy.store(base / "clips")
+    config = on_store(toy.config(), base / "clips")
+    run = Run(config, base / "run", base)
+    for stage in ("tokenizer", "world_model", "tokens"):
+        (run.directory / stage).mkdir(parents=True)
+    save_weights(run.output("tokenizer"), zeros(config))
+    save_weights(run.output("world_model"), toy.world_model_params(config))
+    Normalization.create(store).save(run.directory / "tokens")
+    write_json(run.directory / "config.json", to_dict(config))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "evaluate", scored)
+        yield run
+
+
+def zeros(config: Config) -> Any:
+    """A tokenizer's parameters."""
+    shapes = jax.eval_shape(Tokenizer(config.tokenizer).init_params, jax.random.key(0))
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+
+
+def evaluated(run: Run, overwrite: bool = False, **changes: Any) -> list[Path]:
+    wanted = Request("paper", CHANGES | changes, overwrite=overwrite)
+    return list(evaluate_run(run.directory, run.data_directory, wanted))
+
+
+@pytest.fixture(scope="module")
+def folder(run: Run) -> Path:
+    return evaluated(run)[0]
+
+
+def test_a_result_says_all_that_decided_it(run: Run, folder: Path) -> None:
+    result = read_result(folder)
+    assert folder.parent == run.directory / "evaluations"
+    assert result.label == folder.name == f"paper,horizon={FRAMES - 1},clips=5,action_draws=0"
+    assert result.protocol["prompt_frames"] == 1
+    assert result.data["key"] == "toy"
+    assert (result.data["split"], result.data["frames"]) == ("test", FRAMES)
+    assert (result.data["fps"], result.settings["physics_iq_threshold"]) == (5.0, 10)
+    assert result.sampling["unmask"] == "greedy"
+    assert result.model["parameters"] > 0
+    assert len(result.model["weights_sha256"]) == 16
+    assert result.model["training"]["train"]["steps"] == run.config.train.steps
+    assert "seed" not in result.model["training"]["train"]
+    assert result.code["version"]
+    assert result.made["machine"]["devices"] >= 1
+    assert [clip["number"] for clip in result.clips] == list(range(toy.TEST))
+    assert len({clip["sha256"] for clip in result.clips}) == toy.TEST
+    assert result.metrics["lpips_alex"] is None
+    assert result.reasons == {"lpips_alex": "no weights"}
+    assert read_frames(folder)["prediction"].shape[0] == toy.TEST
+    assert MADE[0].parent == folder
+    assert not MADE[0].exists()
+
+
+def test_what_is_up_to_date_is_skipped_and_other_weights_are_another_model(run: Run, folder: Path) -> None:
+    MADE.clear()
+    assert evaluated(run) == [folder]
+    assert not MADE
+    assert evaluated(run, clips=4)[0].name.endswith("clips=4,action_draws=0")
+    evaluated(run, clips=4, overwrite=True)
+    assert len(MADE) == 2
+    assert MADE[0] == MADE[1]
+    weights, kept = run.output("world_model").parent, run.directory / "kept"
+    weights.rename(kept)
+    weights.mkdir()
+    try:
+        save_weights(run.output("world_model"), jax.tree.map(lambda x: x + 1, toy.world_model_params(run.config)))
+        evaluated(run, clips=4)
+    finally:
+        weights.rename(run.directory / "other")
+        kept.rename(weights)
+    assert len(MADE) == 3
+    assert MADE[2] != MADE[1]
+
+
+def test_other_weights_of_a_metric_at_the_same_path_are_evaluated_anew(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "check_files", lambda settings: None)
+
+    def evaluated(name: str) -> str:
+        settings = {"fvd_weights": str(tmp_path / name)}
+        return read_result(*evaluate_run(run.directory, run.data_directory, Request("run", settings=settings))).key
+
+    (tmp_path / "i3d").write_bytes(b"1")
+    first = evaluated("i3d")
+    MADE.clear()
+    (tmp_path / "i3d").rename(tmp_path / "moved")
+    assert evaluated("moved") == first
+    assert not MADE
+    (tmp_path / "moved").write_bytes(b"2")
+    assert evaluated("moved") != first
+    assert len(MADE) == 1
+
+
+def test_results_of_other_stores_stay_apart_and_in_the_run(run: Run, folder: Path, tmp_path: Path) -> None:
+    def evaluated(name: str, key: str | None) -> Path:
+        path = shutil.copytree(run.clips, tmp_path / name)
+        manifest = json.loads((path / "manifest.json").read_text())
+        write_json(path / "manifest.json", manifest | {"key": key})
+        (made,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, data=path))
+        return made
+
+    made = {
+        evaluated("a", "x/../../../elsewhere"),
+        evaluated("b", None),
+        evaluated("c", None),
+        evaluated("d", "abc-0.1"),
+    }
+    assert len(made) == 4
+    assert all(each.resolve().parent == run.directory / "evaluations" for each in made)
+    assert f"{folder.name},data=abc-0.1" in {each.name for each in made}
+
+
+def test_overwriting_begins_without_the_batches_of_an_interrupted_evaluation(run: Run, folder: Path) -> None:
+    left = folder / f"parts-{read_result(folder).key}"
+    left.mkdir()
+    MADE.clear()
+    evaluated(run, overwrite=True)  # the stand-in makes this folder, which must not be there
+    assert [left] == MADE
+
+
+def test_who_waited_for_the_lock_takes_what_the_other_process_made(
+    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, whole, left = folder / "result.json", (folder / "result.json").read_bytes(), folder / "parts-of-another"
+    made.unlink()
+    left.mkdir()
+    real, seen = evaluations.lock, []
+
+    @contextlib.contextmanager
+    def waiting(*args: Any, **options: Any) -> Iterator[bool]:
+        seen.append(left.exists())  # --overwrite deletes in the lock alone
+        with real(*args, **options) as taken:
+            made.write_bytes(whole)
+            yield taken
+
+    monkeypatch.setattr(evaluations, "lock", waiting)
+    monkeypatch.setattr(evaluations, "_parts", lambda folder, key: left)
+    MADE.clear()
+    assert evaluated(run) == [folder]
+    assert not MADE
+    assert seen == [True]
+    left.mkdir()
+    evaluated(run, overwrite=True)
+    assert [left] == MADE
+    assert seen == [True, True, False]
+
+
+def test_the_evaluation_stage_writes_such_a_file_too(run: Run) -> None:
+    found = evaluate_own(run)
+    own = read_result(run.directory / "evaluation")
+    assert own.label == "run"
+    assert own.per_clip == found.per_clip
+    assert own.protocol["action_draws"] == run.config.eval.action_draws
+    assert own.data["frames"] == FRAMES
+
+
+def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="clips: these clips were not simulated, so there is no second take of them"):
+        list(evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True)))
+    takes: list[np.ndarray] = []
+    whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
+    monkeypatch.setattr(retakes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
+
+    def evaluate(*inputs: Any, held_out: HeldOut, **more: Any) -> Evaluation:
+        assert held_out.retakes is not None
+        takes.append(held_out.retakes.rgb)
+        return scored(*inputs, held_out=held_out, **more)
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    (with_takes,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True))
+    np.testing.assert_array_equal(takes[0][:, -1, 0, 0, 0], range(toy.TEST))
+    assert takes[0].shape[:2] == (toy.TEST, FRAMES), "cut to the protocol's frames"
+    assert with_takes.name == f"{folder.name},second-takes"
+    results = read_result(folder), read_result(with_takes)
+    assert [each.settings.get("second_take_jitter") for each in results] == [None, retakes.JITTER]
+    assert results[0].key != results[1].key
+    reconstructed = Request("1xgpt", {"prompt_frames": 2, "horizon": 2}, retakes=True)
+    with pytest.raises(UserError, match="protocol 1xgpt compares with reconstructions, of which there is no second"):
+        list(evaluate_run(run.directory, run.data_directory, reconstructed))
+
+
+def test_a_protocol_changes_the_settings_of_sampling(run: Run) -> None:
+    changes = {"prompt_frames": 2, "horizon": 2, "clips": 3}
+    (folder,) = evaluate_run(run.directory, run.data_directory, Request("1xgpt", changes))
+    result = read_result(folder)
+    assert folder.name == "1xgpt,prompt_frames=2,horizon=2,clips=3"
+    assert (result.sampling["steps"], result.sampling["temperature"], result.sampling["unmask"]) == (2, 0.0, "random")
+    assert result.protocol["teacher_forced"]
+    assert len(result.clips) == 3
+    tiny: Any = presets.tiny()
+    assert tiny.model.sample.shows_means
+    assert not replace(tiny.model.sample, **find("1xgpt", tiny).sampling).shows_means
+    late = {"mean_codes": False, "guidance": 1.0}
+    assert result.protocol.items() >= late.items()
+    assert not late.keys() & find("paper", tiny).described().keys(), "keys of results from before these fields stay"
+
+
+def test_a_full_size_preset_raises_the_clips_but_not_those_of_several_samples() -> None:
+    full_size = presets.get("ivideogpt_64")
+    assert [find(name, full_size).clips for name in ("paper", "ivideogpt-bair")] == [1200, 256]
+
+
+def test_a_comparison_of_a_run_with_itself(
+    run: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GLIBC_TUNABLES", HUGE_PAGES)
+    arguments = [f"a={run.directory}", f"b={run.directory}", "--protocol", folder.name, "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["compare", *arguments])
+    compare_command.main()
+    assert "| same" in capsys.readouterr().out
+    assert {path.suffix for path in tmp_path.iterdir()} == {".md", ".csv", ".json", ".html"}
+    assert json.loads((tmp_path / "compare.json").read_text())["protocol"]["name"] == "paper"
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (Request("paper"), "predicts 15 frames after 1, so it takes clips of 16 frames; .* have 6: lower --horizon"),
+        (Request("paper", CHANGES, splits=("unseen",)), "no split 'unseen'; it has train, test: choose with --split"),
+        (Request("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
+        (Request("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
+        (Request("paper", CHANGES, {"lpips_alex_weights": "none.npz"}), "none.npz"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says: str) -> None:
+    with pytest.raises(UserError, match=says) as refused:
+        list(evaluate_run(run.directory, run.data_directory, request_))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("splits", "frames", "simulated"),
+    [
+        (("test",), FRAMES, None),
+        (("test",), FRAMES + 9, "longer"),
+        (("tset",), FRAMES, None),
+        (("tset",), FRAMES + 9, None),
+        (("unseen_camera", "tset"), FRAMES, None),
+        (("unseen_camera",), FRAMES, "unseen"),
+        (("unseen*",), FRAMES + 9, "unseen"),
+        (("train",), FRAMES + 9, None),
+        (("train", "test"), FRAMES + 9, None),
+    ],
+)
+def test_only_splits_that_there_can_be_are_simulated(
+    run: Run, splits: tuple[str, ...], frames: int, simulated: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulating = replace(run, config=toy.config())
+    monkeypatch.setattr(held_out, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
+    protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
+    store = run.open_clips()
+    assert held_out_store(simulating, store, protocol) == (simulated or store)
+
+
+def test_longer_episodes_are_none_of_the_runs_own() -> None:
+    sim = toy.config().sim
+    longer = longer_episodes(sim, 49, 10)
+    assert (longer.frames, longer.test_episodes) == (49, 10)
+    assert longer.seed != sim.seed
+    assert replace(longer, frames=sim.frames, seed=0, episodes=sim.episodes, test_episodes=sim.test_episodes) == sim
+
+
+def test_commands_without_runs_say_how(command: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "name a run directory" in command.refused("experiments.evaluate", "--protocol", "paper")
+    assert "unknown argument '--protocl'; did you mean '--protocol'" in command.refused(
+        "experiments.evaluate", "--protocl"
+    )
+    assert "is not a run directory" in command.refused("experiments.evaluate", "nowhere")

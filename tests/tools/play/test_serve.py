@@ -1,0 +1,45 @@
+"""The command: what it refuses before it serves, and that it serves and stops."""
+
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rsjax.config import ConfigError
+from rsjax.errors import UserError
+from rsjax.tools.play.guard import Guard
+from rsjax.tools.play.serve import ServeSettings, _address, listen
+from rsjax.tools.play.settings import first_settings, settings_limits
+from tests.tools.pipeline import toy
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"--port {port}: .*--port 0 takes a free port"):
+            listen("127.0.0.1", port)
+        assert _address(taken, "127.0.0.1", Guard("")) == f"http://127.0.0.1:{port}/"
+        assert _address(taken, "::1", Guard("abc")) == f"http://[::1]:{port}/?token=abc"
+        assert _address(taken, "0.0.0.0", Guard("abc")) == f"http://{socket.gethostname()}:{port}/?token=abc"
+
+
+@pytest.mark.parametrize("wrong", [{"sessions": 0}, {"lanes": 0}, {"port": 2**16}, {"idle_minutes": 0.0}])
+def test_impossible_settings_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ConfigError):
+        ServeSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_settings_are_the_runs_and_limits_follow_from_it() -> None:
+    config = toy.config()
+    assert first_settings(config).describe() == {"temperature": 0.0, "steps": 2, "guidance": 1.0, "top_k": 0}
+    assert settings_limits(config)["guidance"] == [1.0, 1.0]
+    assert settings_limits(toy.with_model(config, action_dropout=0.1))["guidance"] == [0.0, 8.0]
+
+
+def test_a_run_that_is_none_is_named_in_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "experiments.play", str(tmp_path), "--no-browser"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and re.fullmatch(r"error: .*not a run directory.*\n", done.stderr), done.stderr

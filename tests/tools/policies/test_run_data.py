@@ -1,0 +1,55 @@
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.config import Config, presets, to_dict
+from rsjax.errors import UserError
+from rsjax.files import write_json
+from rsjax.tools.policies.judge import Network, TrainedJudge
+from rsjax.tools.policies.run_data import RunData
+from rsjax.tools.policies.verdicts import HISTORY
+
+
+def run(path: Path, config: Config, trained: bool = True) -> RunData:
+    write_json(path / "config.json", to_dict(config))
+    if trained:
+        (path / "world_model" / "weights").mkdir(parents=True)
+    return RunData(path)
+
+
+def test_runs_in_which_no_policy_can_act_are_named_before_any_training(tmp_path: Path) -> None:
+    config = presets.debug()
+    first = run(tmp_path / "first", config)
+    first.check_world(first)
+    run(tmp_path / "genie", config.with_family("genie")).check_world(first)
+    run(tmp_path / "irasim", config.with_family("irasim")).check_world(first)
+    without = config.with_family("genie")
+    without = replace(without, model=replace(without.model, action_encoder="none"))  # type: ignore[call-arg]
+    still = run(tmp_path / "still", without)
+    for act in (lambda: still.check_world(first), lambda: still.world(5)):
+        with pytest.raises(UserError, match=r"still: the model takes no actions \(family 'genie'\)"):
+            act()
+    small = run(
+        tmp_path / "small", replace(config, sim=replace(config.sim, control_steps=config.sim.control_steps + 1))
+    )
+    with pytest.raises(
+        UserError, match=r"small: frames of 64 pixels and actions of \d+ numbers, .*first has 64 and 28"
+    ):
+        small.check_world(first)
+    with pytest.raises(UserError, match="new: its world model is not trained yet"):
+        run(tmp_path / "new", config, trained=False).check_world(first)
+
+
+def test_a_judge_of_frames_of_another_size_is_named(tmp_path: Path) -> None:
+    first = run(tmp_path / "first", presets.debug())
+    for side in (60, 64):  # networks with parameters of equal shapes
+        params = Network().init(jax.random.key(0), np.zeros((1, HISTORY, side, side, 3), np.uint8))["params"]
+        TrainedJudge(params, 1.0, side).save(tmp_path / f"judge-{side}")
+    first.judge(tmp_path / "judge-64")
+    with pytest.raises(
+        UserError, match=r"judge-60/judge.msgpack: was trained on frames of 60 × 60 pixels, these have 64 × 64"
+    ):
+        first.judge(tmp_path / "judge-60")

@@ -1,0 +1,3 @@
+from tests.tools.pipeline.conftest import command, debug, shared
+
+__all__ = ["command", "debug", "shared"]
