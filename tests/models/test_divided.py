@@ -14,5 +14,5 @@ def test_devices_divide_the_clips_of_a_batch() -> None:
     assert {name.removeprefix("rsjax.models."): rows for name, rows in in_rows.items()} == {
         "ivideogpt.rollout.sample": [True],
         "ivideogpt.autoencoder._apply": [True] * 2,
-        "roboscape.teacher._score_window": [True] * 2,
+        "roboscape.teacher_forcing._score_window": [True] * 2,
     }
