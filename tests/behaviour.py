@@ -2,8 +2,8 @@
 
 ``python -m tests.behaviour record`` writes the file, ``python -m tests.behaviour check`` compares with it (four minutes
 on 2 cores). The file records the losses of ``tiny`` over 100 steps of both training stages, the metrics of ``debug``,
-the tokens of a greedy rollout, generated videos, the bytes of a store into which BridgeData was ingested, the parameters
-and outputs of every preset by shape, and the pictures of a played session. Floating-point results differ between
+the tokens of a greedy rollout, generated videos, the bytes of a store into which BridgeData was ingested, parameters
+of every preset by shape, and the pictures of a played session. Floating-point results differ between
 processors, so a record from another processor is refused, not compared.
 """
 

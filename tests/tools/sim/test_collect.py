@@ -147,7 +147,7 @@ def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:
             visible=np.ones((1, 2), bool),
             success=np.array([False, i % 2 == 0]),
             task="lift",
-            provenance={"episode": i, "difficulty": "simple"},
+            provenance={"episode": i, "difficulty": "simple", "expert": {"mode": "lift"}},
         )
         if i in failed:
             collect_module._error_file(partial, f"{i:06d}").write_text("ArithmeticError: it diverged")
