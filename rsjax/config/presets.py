@@ -59,7 +59,7 @@ def tiny() -> Config:
         # sub-tokens do. Chosen on an earlier model; two vocabularies of 512 do as well now (docs/results/paper.md).
         tokenizer=TokenizerConfig(
             # Patches of 4 pixels: a step takes two thirds of the time that it takes with patches of 2, half of the
-            # channels and a third level (docs/results/miniature.md). The model, which limits quality, gets that time.
+            # channels and a third level (notebooks/miniature.md). The model, which limits quality, gets that time.
             patch_size=4,
             channels=64,
             channel_multipliers=(1, 2),
@@ -101,14 +101,14 @@ def tiny() -> Config:
             embed_std=0.5,
             position_std=0.5,
             compute_dtype="bfloat16",
-            # In so few steps corruption and visible prefixes cost more than they gain (docs/results/miniature.md).
+            # In so few steps corruption and visible prefixes cost more than they gain (notebooks/miniature.md).
             mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0, own_frames=0.5, own_frames_after=500),
             sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
         ),
         train=LoopConfig(
             steps=1700,
             batch_size=4,
-            accumulate=2,  # half the memory, and 0.46 s instead of 0.57 s a step (docs/performance.md)
+            accumulate=2,  # half the memory, and 0.46 s instead of 0.57 s a step (notebooks/cpu-performance.md)
             optimizer=OptimizerConfig(kind="muon", learning_rate=5e-3, final_share=0.02),
             ema=0.995,
             checkpoint_every=500,

@@ -39,11 +39,11 @@ class SampleConfig:
     top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
     unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
     # Frames are decoded from each cell's mean code under the model's probabilities, not from its most probable one:
-    # 0.45 dB closer to the truth, and blurred where the model is unsure (docs/results/miniature.md). No effect at
+    # 0.45 dB closer to the truth, and blurred where the model is unsure (notebooks/miniature.md). No effect at
     # temperatures other than 0.
     mean_codes: bool = False
     # With mean_codes: later frames read the mean codes too, not the most probable ones, so that they know where the
-    # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (docs/results/miniature.md).
+    # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (notebooks/miniature.md).
     read_means: bool = added(False)
     # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
     # double the work.
@@ -101,10 +101,10 @@ class LossConfig:
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
     # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
     # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which gives
-    # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (docs/results/keypoints.md).
+    # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (notebooks/keypoints.md).
     keypoint_target: Literal["observed", "predicted"] = "observed"
     # Whether Eq. 5 compares masked cells only: a third to half of ŝ_t lie on visible cells, which are never sampled.
-    # It had no effect in the measurements of docs/results/keypoints.md.
+    # It had no effect in the measurements of notebooks/keypoints.md.
     keypoint_masked_only: bool = True
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 The localiser measures what a picture shows: a blurred frame can have everything in its place, and a sharp frame
 nothing. In training, the true frames are moved and blurred, so that the network can also read blurred frames
-(docs/results/miniature.md).
+(notebooks/miniature.md).
 
 Axes: B frames, H×W pixels; 2 objects: cube, gripper.
 """

@@ -1,7 +1,7 @@
 """Group normalisation (Wu & He 2018, arXiv 1803.08494) whose sums run along whole rows of channels.
 
 flax's layer adds up each group's channels first, which CPUs cannot vectorise if groups are small: for large images it
-takes 2 to 3 times as long (docs/performance.md). Parameters have the same names and shapes.
+takes 2 to 3 times as long (notebooks/cpu-performance.md). Parameters have the same names and shapes.
 
 Axes: B images or sequences, C channels, G groups.
 """

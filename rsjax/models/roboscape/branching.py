@@ -3,7 +3,7 @@
 A frame has the same bits whichever frames share its pass. On an accelerator, every pass is over the same number of
 clips, the lanes, and repeated clips fill empty lanes: with another number, floating-point sums would differ in their
 last bit. On a CPU, clips are generated one by one: there, the last bits of a row of a product may also depend on its
-place among the rows (seen without AVX-512), and larger passes gain little (``docs/performance.md``).
+place among the rows (seen without AVX-512), and larger passes gain little (``notebooks/cpu-performance.md``).
 
 Axes: N clips, S cells, A action dimensions.
 """

@@ -62,7 +62,7 @@ class LiftSim(MujocoSim):
 
     robosuite's OSC_POSE controller pulls the gripper to a goal pose. Its own actions set the goal relative to the
     current pose. The arm always lags behind its goal, so the sum of those actions does not tell where the arm is. Here
-    the actions move the goal itself, so that their sum does (docs/results/miniature.md).
+    the actions move the goal itself, so that their sum does (notebooks/miniature.md).
 
     An episode depends only on the arguments of :meth:`reset`. Use as a context manager, or call :meth:`close`: a
     renderer that is freed only when the interpreter exits prints errors.

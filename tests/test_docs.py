@@ -1,0 +1,59 @@
+"""Tests that the documentation's links lead somewhere, and that its pages stay short enough to be read."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "notebooks").rglob("*.md"))]
+USER_PAGES = sorted((ROOT / "docs").rglob("*.md"))
+LONGEST = 200  # lines of a page for users
+FOLDER_README = 15  # lines of a folder's README
+
+
+def anchors(page: Path) -> set[str]:
+    """Returns the anchors that GitHub makes from a page's headings."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    plain = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").lower() for heading in headings]
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in plain}
+
+
+def folder_readmes() -> list[Path]:
+    folders = ("rsjax", "experiments", "benchmarks", "notebooks", "scripts")
+    return [path for folder in folders for path in sorted((ROOT / folder).rglob("README.md"))]
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", [*PAGES, *folder_readmes()], ids=name_of)
+def test_links_lead_somewhere(page: Path) -> None:
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if link.startswith(("http://", "https://")):
+            continue
+        target, _, anchor = link.partition("#")
+        path = (page.parent / target).resolve() if target else page
+        if not path.exists():
+            broken.append(link)
+        elif anchor and path.suffix == ".md" and anchor not in anchors(path):
+            broken.append(link)
+    assert not broken
+
+
+@pytest.mark.parametrize("page", USER_PAGES, ids=name_of)
+def test_pages_for_users_are_short(page: Path) -> None:
+    assert len(page.read_text().splitlines()) <= LONGEST
+
+
+def test_the_index_names_every_page() -> None:
+    index = (ROOT / "docs" / "index.md").read_text()
+    missing = [page.name for page in USER_PAGES if page.name != "index.md" and f"{page.name})" not in index]
+    assert not missing
+
+
+@pytest.mark.parametrize("readme", folder_readmes(), ids=name_of)
+def test_readmes_of_folders_are_short(readme: Path) -> None:
+    assert len(readme.read_text().splitlines()) <= FOLDER_README
