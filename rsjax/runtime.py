@@ -62,7 +62,7 @@ def set_xla_flags() -> None:
     """Keeps convolutions from YNNPACK on x86 processors, and matrix products on those without bf16 units.
 
     YNNPACK convolves on one core only. Where it has no bf16 units, XLA's own products of bf16 operands are twice as
-    fast (``notebooks/cpu-performance.md``). Sums and maxima stay with YNNPACK. Changes nothing if the user has set this flag.
+    fast (``notebooks/cpu-performance.md``). Sums and maxima stay with YNNPACK. Does nothing if the user set this flag.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if platform.machine() != "x86_64" or YNNPACK in flags:
