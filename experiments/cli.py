@@ -13,7 +13,7 @@ from tyro import _errors as parse_errors  # private; the alternative is to parse
 from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
 from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
-from rsjax.config.config_fields import leaves
+from rsjax.config.config_fields import config_fields
 from rsjax.config.curriculum import format_stage, parse_stage
 from rsjax.errors import did_you_mean
 
@@ -161,7 +161,7 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
     default: Any = dataclasses.make_dataclass("Command", kinds)(**parts)
 
     def refuse(event: parse_errors.ParseErrorEvent) -> None:
-        flags = [name.replace("_", "-") for part in parts.values() for name in leaves(part)]
+        flags = [name.replace("_", "-") for part in parts.values() for name in config_fields(part)]
         if message := _message(event, flags):  # for an event without a message, tyro prints its own report
             raise ConfigError(f"{message} (see {prog} --help)")
 

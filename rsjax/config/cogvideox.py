@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.diffusion import DenoiseConfig, NoiseConfig, check_grid
-from rsjax.config.fields import added, require, require_range, runtime, sampling
+from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 ENCODED, DECODED = 8, 2  # frames that the autoencoder encodes and latent frames that it decodes in one piece
@@ -32,7 +32,7 @@ class CausalVAEConfig:
     # pixels being in ±1. This many noisy images are encoded for each clip; 0: the frame as it is.
     image_draws: int = 4
     image_noise: tuple[float, float] = (-3.0, 0.5)  # mean, deviation
-    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # of the operands of 3×3 and 3×3×3 convolutions
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of the operands of 3×3 and 3×3×3 convolutions
 
     def __post_init__(self) -> None:
         require_range(

@@ -8,26 +8,25 @@ from typing import Any, NamedTuple, TypeVar
 T = TypeVar("T")
 
 
-class Leaf(NamedTuple):
-    """A field's value, its declared type, and whether :mod:`rsjax.config.fields` marks it as runtime or as added."""
+class ConfigField(NamedTuple):
+    """A field's value, its declared type, and whether it is a runtime field (:func:`rsjax.config.fields.runtime`)."""
 
     value: Any
     kind: Any
     runtime: bool
-    added: bool = False
 
 
-def leaves(config: Any, prefix: str = "") -> dict[str, Leaf]:
+def config_fields(config: Any, prefix: str = "") -> dict[str, ConfigField]:
     """Returns every field of a config dataclass and of those nested in it, by dotted name (``loss.gamma``)."""
     hints = typing.get_type_hints(type(config))
-    out: dict[str, Leaf] = {}
+    out: dict[str, ConfigField] = {}
     for field in dataclasses.fields(config):
-        value, name = getattr(config, field.name), prefix + field.name
+        value = getattr(config, field.name)
+        name = prefix + field.name
         if dataclasses.is_dataclass(value):
-            out |= leaves(value, f"{name}.")
+            out |= config_fields(value, f"{name}.")
         else:
-            marks = (bool(field.metadata.get(mark)) for mark in ("runtime", "added"))
-            out[name] = Leaf(value, hints[field.name], *marks)
+            out[name] = ConfigField(value, hints[field.name], bool(field.metadata.get("runtime")))
     return out
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import added, fitting_sizes, require, require_range
+from rsjax.config.fields import fitting_sizes, require, require_range
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class NoiseConfig:
     beta_end: float = 0.02
     betas: Literal["linear", "scaled_linear"] = "linear"  # scaled_linear: their roots grow linearly
     prediction: Literal["noise", "velocity"] = "noise"
-    snr_shift: float = added(1.0)  # s in ᾱ ← ᾱ / (s + (1 - s)·ᾱ): the ratio of signal to noise is divided by it
-    zero_terminal: bool = added(False)  # √ᾱ is rescaled to be 0 after the last step, where sampling then begins
+    snr_shift: float = 1.0  # s in ᾱ ← ᾱ / (s + (1 - s)·ᾱ): the ratio of signal to noise is divided by it
+    zero_terminal: bool = False  # √ᾱ is rescaled to be 0 after the last step, where sampling then begins
 
     def __post_init__(self) -> None:
         require_range(self, "model.noise", 2, math.inf, "steps")

@@ -26,14 +26,6 @@ def runtime(default: Any) -> Any:
     return field(default=default, metadata={"runtime": True})
 
 
-def added(default: Any) -> Any:
-    """Returns a dataclass field that content keys leave out at its default.
-
-    For a field that was added later: results from before it existed keep their key.
-    """
-    return field(default=default, metadata={"added": True})
-
-
 def sampling(default: Any) -> Any:
     """Returns a dataclass field that changes generated videos but not training; content keys leave it out."""
     return field(default=default, metadata={"sampling": True})
@@ -182,5 +174,4 @@ def _content(part: Any) -> Any:
     if not dataclasses.is_dataclass(part):
         return part
     kept = [f.name for f in dataclasses.fields(part) if not f.metadata.keys() & {"runtime", "sampling"}]
-    late = [f.name for f in dataclasses.fields(part) if f.metadata.get("added") and getattr(part, f.name) == f.default]
-    return {"": type(part).__name__} | {name: _content(getattr(part, name)) for name in kept if name not in late}
+    return {"": type(part).__name__} | {name: _content(getattr(part, name)) for name in kept}

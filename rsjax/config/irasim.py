@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.diffusion import DenoiseConfig, NoiseConfig, check_grid
-from rsjax.config.fields import added, require, require_range, runtime, sampling
+from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
 
@@ -20,7 +20,7 @@ class DiTConfig:
     conditioning: Literal["frame", "video"] = "frame"
     # Between the two linear layers of the action encoder; none: as in the public model of Language-Table.
     action_activation: Literal["gelu", "none"] = "gelu"
-    integrate_actions: bool = added(False)  # also the sum of all actions so far; see TransformerConfig
+    integrate_actions: bool = False  # also the sum of all actions so far; see TransformerConfig
     width: int = 1152
     blocks: int = 28  # half of them within frames, half over time
     heads: int = 16
@@ -60,7 +60,7 @@ class KLConfig:
     patch_size: int = 1  # magvit2: space-to-depth before the first convolution
     local_codes: bool = False  # magvit2: a cell's latents depend on its own pixels alone
     kl_weight: float = 1e-4  # of the mean divergence of a latent number from the normal distribution
-    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # of convolutions, as in TokenizerConfig
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of convolutions, as in TokenizerConfig
 
     def __post_init__(self) -> None:
         require_range(self, "model.autoencoder", 1, math.inf, "latent_channels")

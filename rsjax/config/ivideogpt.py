@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import added, fitting_sizes, require, require_range, runtime, sampling
+from rsjax.config.fields import fitting_sizes, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 
@@ -26,7 +26,7 @@ class ConditionalVQConfig:
     # Codes are initialised between ± this; 0: ± 1/codes, as in the public code, but a short training moves few of them.
     codebook_scale: float = 0.0
     codebook_weight: float = 1.0
-    compute_dtype: Literal["float32", "bfloat16"] = added("float32")  # of the operands of 3×3 convolutions
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"  # of the operands of 3×3 convolutions
 
     def __post_init__(self) -> None:
         sizes = ("context_frames", "patch_size", "res_blocks", "norm_groups", "latent", "codes", "future_patch")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rsjax.config.data import ClipShape, DataConfig
-from rsjax.config.fields import added, check_numbers, require, require_range
+from rsjax.config.fields import check_numbers, require, require_range
 from rsjax.config.model import ModelConfig, converted
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import RoboScapeConfig
@@ -18,7 +18,7 @@ class EvalConfig:
     """Settings of the evaluation on the test split."""
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
-    repetitions: int = added(1)  # how often each clip is generated, with different random draws
+    repetitions: int = 1  # how often each clip is generated, with different random draws
     loss_clips: int = 1000  # clips of the validation loss during training, spread in the same way
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR

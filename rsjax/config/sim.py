@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import added, require, require_range, runtime
+from rsjax.config.fields import require, require_range, runtime
 from rsjax.config.metaworld import ML45, ML45_UNSEEN, TASKS
 from rsjax.errors import did_you_mean
 
@@ -32,9 +32,9 @@ class SimConfig:
     track_points: Literal["grid", "objects"] = "grid"
     seed: int = 0
     workers: int = runtime(0)  # 0: one process per core
-    env: Literal["lift", "metaworld"] = added("lift")
-    tasks: tuple[str, ...] = added(())  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
-    unseen_tasks: tuple[str, ...] = added(())  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
+    env: Literal["lift", "metaworld"] = "lift"
+    tasks: tuple[str, ...] = ()  # of Meta-World; none: the 45 training tasks of its ML45 benchmark
+    unseen_tasks: tuple[str, ...] = ()  # for the protocol "unseen"; none: the 5 tasks that ML45 holds out
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, f"sim.frames is {self.frames}; a clip needs at least 2 frames")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.fields import added, loss_weights, require, require_range, runtime, sampling
+from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
 
@@ -24,8 +24,8 @@ class MaskConfig:
     # With model.whole_frames: after own_frames_after steps, in this share of the steps, every frame is predicted from
     # the model's own prediction of the frame before (its mean codes), as in a rollout. Such a step takes a third more
     # work. Not in the reference.
-    own_frames: float = added(0.0)
-    own_frames_after: int = added(0)
+    own_frames: float = 0.0
+    own_frames_after: int = 0
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class SampleConfig:
     mean_codes: bool = False
     # With mean_codes: later frames read the mean codes too, not the most probable ones, so that they know where the
     # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (notebooks/miniature.md).
-    read_means: bool = added(False)
+    read_means: bool = False
     # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
     # double the work.
     guidance: float = 1.0
@@ -130,7 +130,7 @@ class TransformerConfig:
     # and the frames before, which the network sees only through read_previous. Training then sets every cell the same
     # task as decoding in one step, and decoding makes one pass over a frame instead of two; further decoding steps gain
     # nothing. The paper and the public code mask a share of the cells.
-    whole_frames: bool = added(False)
+    whole_frames: bool = False
     width: int = 256
     blocks: int = 32
     heads: int = 8
@@ -205,8 +205,8 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
-    shifts: int = added(0)
-    shift_pixels: int = added(4)
+    shifts: int = 0
+    shift_pixels: int = 4
     mask: MaskConfig = MaskConfig()
     sample: SampleConfig = sampling(SampleConfig())
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import added, fitting_sizes, require, require_range
+from rsjax.config.fields import fitting_sizes, require, require_range
 from rsjax.config.train import LoopConfig
 
 
@@ -32,7 +32,7 @@ class TokenizerConfig:
     # bfloat16: operands of convolutions, and on an accelerator their results; CPUs without bf16 units still convolve in
     # float32, which is faster there. The public code trains in mixed half precision and is used in
     # float32.
-    compute_dtype: Literal["float32", "bfloat16"] = added("float32")
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
         sizes = ("patch_size", "channels", "res_blocks", "norm_groups", "code_bits", "vocabularies")

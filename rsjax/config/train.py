@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from rsjax.config.fields import added, require, require_range, runtime
+from rsjax.config.fields import require, require_range, runtime
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ComponentConfig:
     scenes: tuple[str, ...] = ("*",)  # likewise, such as kitchen
     store: str = ""  # a token store of the same tokenizer; empty: this run's own
     weight: float = 1.0  # share of the clips drawn, relative to the other components
-    clips: int = added(0)  # use only this many of these clips, the first ones; 0: all
+    clips: int = 0  # use only this many of these clips, the first ones; 0: all
 
     def __post_init__(self) -> None:
         require(self.weight > 0, f"a component of a data mixture has weight {self.weight}; it must be above 0")

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from rsjax.config import Config, require, to_dict
-from rsjax.config.fields import added, check_numbers, require_range
+from rsjax.config.fields import check_numbers, require_range
 from rsjax.errors import UserError, did_you_mean
 
 OWN = "run"  # the protocol of a run's own configuration, which its evaluation stage uses
@@ -43,8 +43,8 @@ class Protocol:
     temperature: float | None = None
     top_k: int | None = None
     unmask: Literal["random", "greedy"] | None = None
-    mean_codes: bool | None = added(None)
-    guidance: float | None = added(None)
+    mean_codes: bool | None = None
+    guidance: float | None = None
     samples: int = 1
     clips: int = 100
     repetitions: int = 1
@@ -82,14 +82,12 @@ class Protocol:
         return "" if self.depth_alignment == "none" else f"_{self.depth_alignment}_{self.depth_source}"
 
     def described(self) -> dict[str, Any]:
-        """Returns the fields, JSON-ready, and in words the frames that are scored; later-added fields only if set."""
-        late = {field.name for field in fields(self) if field.metadata.get("added")}
-        values = {name: value for name, value in to_dict(self).items() if name not in late or value is not None}
+        """Returns the fields, JSON-ready, and in words the frames that are scored."""
         frames = {
             "scores": "predicted frames",
             "best of samples": "all frames, the prompt as the model sees it included",
         }
-        return values | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
+        return to_dict(self) | {"frames": frames if self.samples > 1 else {"scores": frames["scores"]}}
 
 
 PAPER = Protocol(

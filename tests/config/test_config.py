@@ -23,13 +23,13 @@ BASE = c.Config(
 )
 
 
-def leaves(part: Any, prefix: str = "", in_key: bool = True) -> list[tuple[str, bool]]:
+def keyed(part: Any, prefix: str = "", in_key: bool = True) -> list[tuple[str, bool]]:
     """(dotted path, whether the content key covers it) of every plain field within ``part``."""
     paths: list[tuple[str, bool]] = []
     for field in dataclasses.fields(part):
         value, path = getattr(part, field.name), prefix + field.name
         covered = in_key and not field.metadata.keys() & {"runtime", "sampling"}
-        paths += leaves(value, f"{path}.", covered) if dataclasses.is_dataclass(value) else [(path, covered)]
+        paths += keyed(value, f"{path}.", covered) if dataclasses.is_dataclass(value) else [(path, covered)]
     return paths
 
 
@@ -59,7 +59,7 @@ def settings_key(config: c.Config) -> str:
     return c.content_key(*c.sampling_settings(config.model))
 
 
-@pytest.mark.parametrize(("path", "in_key"), leaves(BASE))
+@pytest.mark.parametrize(("path", "in_key"), keyed(BASE))
 def test_the_key_changes_exactly_with_fields_that_change_results(path: str, in_key: bool) -> None:
     """Fields of sampling change what is generated, not what is trained: they have a key of their own."""
     changed = altered(BASE, path)

@@ -16,7 +16,7 @@ import jax
 
 import rsjax
 from rsjax.config import Config, LoopConfig, to_dict
-from rsjax.config.config_fields import leaves
+from rsjax.config.config_fields import config_fields
 from rsjax.data.store import MANIFEST
 from rsjax.files import FileError, parse_json, read_json, write_json
 from rsjax.tools.pipeline.run import Run
@@ -148,7 +148,7 @@ def training_settings(config: Config) -> dict[str, Any]:
 
 
 def _without_runtime(part: Any) -> dict[str, Any]:
-    skipped = {name for name, leaf in leaves(part).items() if leaf.runtime or name in BY_SEED}
+    skipped = {name for name, field in config_fields(part).items() if field.runtime or name in BY_SEED}
     return {name: value for name, value in to_dict(part).items() if name not in skipped}
 
 

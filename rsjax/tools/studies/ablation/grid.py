@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rsjax.config import Config, ConfigError, from_dict, require, to_dict
-from rsjax.config.config_fields import Leaf, leaves, with_values
+from rsjax.config.config_fields import ConfigField, config_fields, with_values
 from rsjax.errors import UserError, did_you_mean
 from rsjax.files import lock, read_json, write_json
 from rsjax.progress import note
@@ -93,7 +93,7 @@ def parse_axes(base: Config, texts: Sequence[str]) -> dict[str, tuple[Value, ...
     Raises:
         ConfigError: a field does not exist, is repeated or is the seed; a value has another type or is repeated.
     """
-    known, axes = leaves(base), dict[str, tuple[Value, ...]]()
+    known, axes = config_fields(base), dict[str, tuple[Value, ...]]()
     for text in texts:
         name, _, values = text.partition("=")
         field = name.strip().lstrip("-").replace("-", "_")
@@ -158,7 +158,7 @@ def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[in
 
 def values_of(config: Config, fields: Sequence[str]) -> dict[str, Value]:
     """Returns the values of these fields, by dotted name."""
-    known = leaves(config)
+    known = config_fields(config)
     return {field: known[field].value for field in fields}
 
 
@@ -176,7 +176,7 @@ def cell_name(values: Mapping[str, Value], seed: int) -> str:
 
 def repeated_cells(grid: Grid) -> list[str]:
     """Returns one line per field that varies among cells in which its switch is off, so that it has no effect."""
-    cells, lines = [leaves(config) for config in grid.cells.values()], []
+    cells, lines = [config_fields(config) for config in grid.cells.values()], []
     for field, switch in SWITCHES.items():
         off = {known[field].value for known in cells if field in known and switch in known and not known[switch].value}
         if field in grid.fields and len(off) > 1:
@@ -202,8 +202,8 @@ def merge(before: Grid | None, new: Grid, out: Path) -> tuple[Grid, tuple[str, .
     if before is None:
         return new, tuple(new.cells)
     fields = tuple(dict.fromkeys((*before.fields, *new.fields)))
-    old, now = (leaves(next(iter(grid.cells.values()))) for grid in (before, new))
-    unset = Leaf("not set", None, False)
+    old, now = (config_fields(next(iter(grid.cells.values()))) for grid in (before, new))
+    unset = ConfigField("not set", None, False)
     pairs = {name: (old.get(name, unset), now.get(name, unset)) for name in old | now if name not in (*fields, SEED)}
     differing = [
         f"{name} is {there.value} there, {here.value} here"

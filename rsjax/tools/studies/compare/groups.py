@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rsjax.config import require
-from rsjax.config.config_fields import Leaf, leaves
+from rsjax.config.config_fields import config_fields
 from rsjax.config.model import FAMILIES
 from rsjax.errors import UserError, did_you_mean
 from rsjax.evaluation.protocols import OWN
@@ -159,17 +159,10 @@ def check_seeds(group: Group) -> None:
 
 def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the :data:`SEEDED` fields of a result's model that affect scores, by dotted name."""
-    known = _known(model)
-    later = {f"settings.{name}": leaf.value for name, leaf in known.items() if leaf.added}
-    named = later | _flat({name: model[name] for name in SEEDED if name in model})
-    runtime = {f"settings.{name}" for name, leaf in known.items() if leaf.runtime}
-    return {name: value for name, value in named.items() if name not in runtime}
-
-
-def _known(model: Mapping[str, Any]) -> dict[str, Leaf]:
-    """Returns a family's default settings by dotted name; a result lacks settings that were added after it was made."""
     kind = FAMILIES.get(model["family"])
-    return leaves(kind()) if kind else {}
+    runtime = {f"settings.{name}" for name, field in config_fields(kind()).items() if field.runtime} if kind else set()
+    named = _flat({name: model[name] for name in SEEDED if name in model})
+    return {name: value for name, value in named.items() if name not in runtime}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -183,21 +176,13 @@ def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...]
     """Returns a line for each of the wanted fields in which two results are known to differ."""
     lines = []
     for section, names in wanted.items():
-        there, here = _section(first, section), _section(other, section)
+        there, here = getattr(first, section), getattr(other, section)
         for name in names or dict.fromkeys((*there, *here)):
             values: tuple[Any, Any] = there.get(name), here.get(name)
             unknown = name in MAYBE_UNKNOWN and None in values
             if values[0] != values[1] and not unknown:
                 lines.append(f"{section}.{name} is {values[0]} in the first, {values[1]} in the other")
     return lines
-
-
-def _section(result: Result, name: str) -> dict[str, Any]:
-    values: dict[str, Any] = getattr(result, name)
-    if name != "sampling":
-        return values
-    known = {each.removeprefix("sample."): leaf for each, leaf in _known(result.model).items() if "sample." in each}
-    return {each: leaf.value for each, leaf in known.items() if leaf.added} | values
 
 
 def noted(groups: Sequence[Group]) -> list[str]:

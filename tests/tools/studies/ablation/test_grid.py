@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError, presets
-from rsjax.config.config_fields import leaves, with_values
+from rsjax.config.config_fields import config_fields, with_values
 from rsjax.tools.studies.ablation.grid import (
     DEFAULT_AXES,
     SEED,
@@ -55,7 +55,7 @@ def test_every_combination_is_there_once_in_order_and_is_what_it_says(
     assert found.fields == tuple(grid)
     expected = list(product(seeds, *grid.values()))
     assert len(found.cells) == len(set(found.cells.values())) == len(expected)
-    others = [name for name in leaves(DEBUG) if name not in (*grid, SEED)]
+    others = [name for name in config_fields(DEBUG) if name not in (*grid, SEED)]
     for config, values in zip(found.cells.values(), expected, strict=True):
         assert tuple(values_of(config, (SEED, *grid)).values()) == values
         assert values_of(config, others) == values_of(DEBUG, others)
@@ -88,14 +88,14 @@ def test_the_default_is_depth_and_keypoints_on_and_off() -> None:
 
 
 def test_the_named_fields_exist() -> None:
-    assert set(SWITCHES) | set(SWITCHES.values()) | {SEED} <= set(leaves(DEBUG))
+    assert set(SWITCHES) | set(SWITCHES.values()) | {SEED} <= set(config_fields(DEBUG))
 
 
 def test_a_value_as_printed_is_read_back() -> None:
-    for name, leaf in leaves(DEBUG).items():
-        if not isinstance(leaf.value, tuple):
-            value = parse_value(name, leaf.kind, str(leaf.value))
-            assert (value, type(value)) == (leaf.value, type(leaf.value)), name
+    for name, field in config_fields(DEBUG).items():
+        if not isinstance(field.value, tuple):
+            value = parse_value(name, field.kind, str(field.value))
+            assert (value, type(value)) == (field.value, type(field.value)), name
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_value_as_printed_is_read_back() -> None:
 )
 def test_a_value_of_another_type_is_refused(name: str, text: str, line: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        parse_value(name, leaves(DEBUG)[name].kind, text)
+        parse_value(name, config_fields(DEBUG)[name].kind, text)
     assert line in str(caught.value)
 
 

@@ -255,7 +255,10 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
         ({"family": "genie"}, "model.family is roboscape in the first, genie in the other"),
         ({"preset": "debug"}, "model.preset is tiny in the first, debug in the other"),
         ({"settings": {"loss": {"gamma": 9.0}}}, "model.settings.loss.gamma is 5.0 in the first, 9.0 in the other"),
-        ({"settings": {"whole_frames": True}}, "model.settings.whole_frames is False in the first, True in the other"),
+        (
+            {"settings": {"loss": {"gamma": 5.0}, "whole_frames": True}},
+            "model.settings.whole_frames is False in the first, True in the other",
+        ),
         ({"training": {"train": {"steps": 9}}}, "model.training.train.steps is 5 in the first, 9 in the other"),
         ({"weights_sha256": "w0"}, "have the same weights; a group takes each training once"),
         ({"seed": 1, "settings": {"loss": {"gamma": 5.0}, "unroll": 4, "new": 1}}, ""),
@@ -263,7 +266,11 @@ def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
 )
 def test_runs_of_a_group_differ_in_their_seed_alone(make: Make, changes: dict, says: str) -> None:
     plain = toy.result(0.0)
-    own = plain.model | {"preset": "tiny", "settings": {"loss": {"gamma": 5.0}, "unroll": 1}, "weights_sha256": "w0"}
+    own = plain.model | {
+        "preset": "tiny",
+        "settings": {"loss": {"gamma": 5.0}, "whole_frames": False, "unroll": 1},
+        "weights_sha256": "w0",
+    }
     own |= {"training": {"train": {"steps": 5}}}
     group = make("a", replace(plain, model=own), replace(plain, model=own | {"weights_sha256": "w1"} | changes))
     if not says:
@@ -274,9 +281,10 @@ def test_runs_of_a_group_differ_in_their_seed_alone(make: Make, changes: dict, s
 
 
 @pytest.mark.parametrize("reads", [False, True])
-def test_a_setting_of_sampling_that_came_later_is_noted_only_where_it_differs(make: Make, reads: bool) -> None:
-    old, new = toy.result(0.0), toy.result(1.0, sampling={"steps": 2, "read_means": reads})
-    notes = noted(read_groups([make("a", old), make("b", new)], None))
+def test_a_setting_of_sampling_is_noted_only_where_it_differs(make: Make, reads: bool) -> None:
+    plain = toy.result(0.0, sampling={"steps": 2, "read_means": False})
+    other = toy.result(1.0, sampling={"steps": 2, "read_means": reads})
+    notes = noted(read_groups([make("a", plain), make("b", other)], None))
     line = "a and b: sampling.read_means is False in the first, True in the other"
     assert notes == ([line] if reads else [])
 
