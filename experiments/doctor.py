@@ -61,8 +61,7 @@ def main() -> None:
     from rich.console import Console
 
     from rsjax.processes import count_workers
-    from rsjax.tools.ingest.checks import Thresholds
-    from rsjax.tools.ingest.doctor import diagnose, open_any
+    from rsjax.tools.ingest.doctor import Thresholds, diagnose, open_any
     from rsjax.tools.ingest.options import source_options
 
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
@@ -93,7 +92,7 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from rsjax.tools.ingest.checks import KINDS
+    from rsjax.tools.ingest.doctor import KINDS
 
     if diagnosis.findings:
         table = Table("kind", "episodes", "meaning", box=SIMPLE_HEAD, pad_edge=False)
@@ -111,7 +110,7 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
 
 def _fix(diagnosis: "Diagnosis", path: Path, about: str) -> str:
     """Writes the list of the episodes without a finding, and returns a line that reports it."""
-    from rsjax.tools.ingest.selection import write_selection
+    from rsjax.tools.ingest.doctor import write_selection
 
     kept, out = write_selection(path, about, diagnosis.refs, diagnosis.reasons())
     line = f"{path}: keeps {kept}, leaves out {out}"

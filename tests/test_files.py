@@ -18,9 +18,9 @@ from rsjax.errors import UserError
 from rsjax.files import FileError, content_hash, holder, is_held, lock, making, placeholder, read_json
 from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.convert.files import read_tensors
-from rsjax.tools.ingest.annotators.networks.local import require_weights
+from rsjax.tools.ingest.annotators.network import require_weights
+from rsjax.tools.ingest.doctor import select
 from rsjax.tools.ingest.episode import SourceError
-from rsjax.tools.ingest.selection import select
 from rsjax.tools.pipeline.videos import Request, _foreign_actions
 from rsjax.training.log import read_rows
 from tests.tools.ingest.toy import Source

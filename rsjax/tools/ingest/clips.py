@@ -19,15 +19,21 @@ from rsjax.clip import UNKNOWN
 from rsjax.config import ConfigError, content_key, require, to_dict
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Statistics
-from rsjax.tools.ingest.actions import ActionConfig, Layout, check_declared, sampled_actions
+from rsjax.tools.ingest.actions import (
+    ActionConfig,
+    Layout,
+    check_declared,
+    describe_dimensions,
+    flat_names,
+    sampled_actions,
+)
 from rsjax.tools.ingest.annotate import Annotated, FrameRecords, StoredDepths, camera_of
 from rsjax.tools.ingest.annotators.categories import CategoryConfig
 from rsjax.tools.ingest.annotators.depth import FilledDepths
 from rsjax.tools.ingest.annotators.protocols import Tracked
 from rsjax.tools.ingest.annotators.tracks import window_tracks
-from rsjax.tools.ingest.dimensions import describe_dimensions, flat_names
 from rsjax.tools.ingest.episode import Episode, EpisodeError, EpisodeSource, Segment
-from rsjax.tools.ingest.fit import Fit, Placement
+from rsjax.tools.ingest.pictures import Fit, Placement
 from rsjax.tools.ingest.windows import (
     Span,
     WindowConfig,

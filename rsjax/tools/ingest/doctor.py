@@ -1,28 +1,247 @@
 """Checks a whole data set, and lists the episodes that should be left out.
 
-Each episode is checked by itself (:mod:`rsjax.tools.ingest.checks`) and then compared with the others by its statistics
+Each episode is checked by itself (:mod:`rsjax.tools.ingest.doctor`) and then compared with the others by its statistics
 alone, so that memory does not depend on the pictures.
 """
 
+import hashlib
+import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, UInt8
 
+from rsjax.config import require
 from rsjax.data.store import MANIFEST
 from rsjax.errors import did_you_mean
+from rsjax.files import disk_guard, parse_json, regular, write_atomically
 from rsjax.processes import WorkerDied, run_items
-from rsjax.tools.ingest.checks import KINDS, EpisodeStats, Finding, Thresholds, check_episode
-from rsjax.tools.ingest.episode import Episode, EpisodeError, EpisodeRef, EpisodeSource, SourceError
+from rsjax.tools.ingest.actions import Layout
+from rsjax.tools.ingest.episode import (
+    Depths,
+    Episode,
+    EpisodeError,
+    EpisodeRef,
+    EpisodeSource,
+    Frames,
+    SourceError,
+    fingerprint,
+)
 from rsjax.tools.ingest.formats import FORMATS, open_source
+from rsjax.tools.ingest.video import VideoFrames, misread
 
+KINDS = {
+    "unreadable": "the reader refuses the episode for another reason",
+    "camera": "pictures are missing that other episodes have, or are blank, or never change",
+    "undecodable": "a video, picture or depth map is missing or cannot be decoded",
+    "seeking": "a video gives other pictures by seeking than by decoding it in order",
+    "length": "actions, states or pictures are not as many as the timestamps",
+    "not-finite": "values are NaN or infinite",
+    "time": "time stands still, jumps, or does not match fps",
+    "action": "actions are all zero, of another width, or far beyond the usual",
+    "state": "states jump, or are of another width",
+    "quaternion-flip": "a quaternion changes its sign from one frame to the next",
+    "depth": "depth is negative, or nothing was measured",
+    "segment": "a segment lies outside the episode, or is empty",
+    "no-task": "the episode does not name its task",
+    "duplicate": "the same content or the same id as another episode",
+}
+_CHUNK = 16  # pictures decoded at once
+_REWRITE = "rewrite the video, such as with ffmpeg -i OLD NEW.mp4"
+_TOLERANCE = 1e-3  # of a unit quaternion's length
+
+Problem = tuple[str, str]  # one of KINDS, and what is wrong where
 FEWEST = 5  # with fewer episodes, they are not compared with what is usual
 
+_SELECTION_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A problem of an episode.
+
+    Attributes:
+        episode: its id.
+        kind: one of :data:`KINDS`.
+        detail: what is wrong where, in one line.
+    """
+
+    episode: str
+    kind: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """The limits of the checks.
+
+    Attributes:
+        frames: pictures of each camera that are decoded, evenly spread over the episode; 0: all.
+        gap: longest time between two frames, relative to 1 / fps.
+        unusual: largest action, or step of the state, relative to the median over the episodes.
+    """
+
+    frames: int = 5
+    gap: float = 1.5
+    unusual: float = 20.0
+
+    def __post_init__(self) -> None:
+        require(self.frames >= 0, f"frames is {self.frames}; it must be positive, or 0 for all")
+        require(self.gap > 1, f"gap is {self.gap}; it is relative to 1 / fps and must be above 1")
+        require(self.unusual > 1, f"unusual is {self.unusual}; it is relative to the usual and must be above 1")
+
+
+@dataclass(frozen=True)
+class EpisodeStats:
+    """Statistics of an episode by which it is compared with the others: a few hundred bytes.
+
+    Attributes:
+        digest: hash of its actions, states and first picture; None if no picture could be decoded.
+        cameras: names of its cameras.
+        reach: largest absolute action of each dimension.
+        jump: largest step of each dimension of the state.
+    """
+
+    digest: bytes | None
+    cameras: tuple[str, ...]
+    reach: Float32[np.ndarray, " A"]
+    jump: Float32[np.ndarray, " S"]
+
+
 Checked = tuple[EpisodeRef, list[Finding], EpisodeStats | None, str]  # the last: what the reader repaired
+
+
+def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], EpisodeStats]:
+    """Returns all problems found in one episode by itself, and its statistics."""
+    problems = [*_time(episode, limits.gap), *_actions(episode), *_flips(episode), *_segments(episode)]
+    first: UInt8[np.ndarray, "H W 3"] | None = None
+    for name, frames in episode.cameras.items():
+        more, picture = _pictures(name, frames, limits.frames, moving=bool(episode.actions[1:].any()))
+        problems += more
+        first = picture if first is None else first
+    for name, maps in episode.depth.items():
+        problems += _depth(name, maps, limits.frames)
+    if not episode.task.strip():
+        problems.append(("no-task", "its task is empty"))
+    states = np.zeros((0, 0), np.float32) if episode.states is None else episode.states
+    digest = None
+    if first is not None:
+        digest = hashlib.sha256(first.tobytes() + episode.actions.tobytes() + states.tobytes()).digest()
+    reach, jump = _largest(episode.actions[1:]), _largest(np.diff(states, axis=0))
+    stats = EpisodeStats(digest, tuple(episode.cameras), reach, jump)
+    return [Finding(episode.id, kind, detail) for kind, detail in problems], stats
+
+
+def _largest(rows: Float[np.ndarray, "N n"]) -> Float32[np.ndarray, " n"]:
+    """Returns the largest absolute value of each column; 0 if there are no rows."""
+    return np.abs(rows).max(0, initial=0).astype(np.float32)
+
+
+def _time(episode: Episode, gap: float) -> Iterator[Problem]:
+    steps = np.diff(episode.timestamps)
+    if not len(steps):
+        yield "length", "has 1 frame, so nothing happens in it"
+    elif abs(np.median(steps) * episode.fps - 1) > 0.1:
+        yield "time", f"frames are {np.median(steps):.4g} s apart (median), fps is {episode.fps:g}"
+    elif (long := np.flatnonzero(steps > gap / episode.fps)).size:
+        yield "time", f"{steps[long[0]]:.3g} s before frame {long[0] + 1} at {episode.fps:g} fps ({len(long)} such)"
+
+
+def _actions(episode: Episode) -> Iterator[Problem]:
+    rows = episode.actions[1:]
+    if len(rows) and not rows.any():
+        yield "action", "all are zero"
+    layout = Layout.from_json(episode.meta.get("actions", {}))
+    for doubt in layout.unclear:
+        yield "action", f"{doubt}, so it is no step: declare kind and held"
+    for first in layout.quaternions:
+        lengths = np.linalg.norm(rows[:, first : first + 4], axis=1)
+        if (off := np.flatnonzero(np.abs(lengths - 1) > _TOLERANCE)).size:
+            actual = f"of length {lengths[off[0]]:.3g} in frame {off[0] + 1} ({len(off)} such)"
+            yield "action", f"dimensions {first} to {first + 3} should be a unit quaternion, are {actual}"
+
+
+def _flips(episode: Episode) -> Iterator[Problem]:
+    arrays = [("actions", 1, episode.actions[1:], Layout.from_json(episode.meta.get("actions", {})).held)]
+    if episode.states is not None:
+        arrays.append(("states", 0, episode.states, ()))
+    for name, offset, rows, others in arrays:
+        for first in (first for first in quaternions(rows) if not {*range(first, first + 4)} & {*others}):
+            part = rows[:, first : first + 4]
+            if (flips := np.flatnonzero((part[1:] * part[:-1]).sum(1) < 0)).size:
+                where = f"frame {flips[0] + 1 + offset} ({len(flips)} such)"
+                yield "quaternion-flip", f"{name}: dimensions {first} to {first + 3} at {where}"
+
+
+def _segments(episode: Episode) -> Iterator[Problem]:
+    for part in episode.segments:
+        if not 0 <= part.start < part.end <= len(episode.timestamps):
+            yield "segment", f"{part.text!r} goes from {part.start} to {part.end} of {len(episode.timestamps)} frames"
+
+
+def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
+    """Returns the first of each four consecutive columns that look like a quaternion: each row has length 1.
+
+    A 1 or -1 beside three zeros in every row, such as a gripper's, does not count.
+    """
+    found: list[int] = []
+    for first in range(rows.shape[1] - 3 if len(rows) else 0):
+        free, part = not found or first >= found[-1] + 4, rows[:, first : first + 4]
+        turns = (np.abs(part).max(1) < 1 - _TOLERANCE).any()
+        if free and turns and (np.abs(np.linalg.norm(part, axis=1) - 1) < _TOLERANCE).all():
+            found.append(first)
+    return found
+
+
+def _sample(count: int, frames: int) -> list[int]:
+    """Spreads ``frames`` indices evenly over ``count``, including the first and the last; 0 means all."""
+    return list(range(count)) if not frames else np.unique(np.linspace(0, count - 1, frames).astype(int)).tolist()
+
+
+def _pictures(
+    name: str, frames: Frames, wanted: int, moving: bool
+) -> tuple[list[Problem], UInt8[np.ndarray, "H W 3"] | None]:
+    """Returns the problem of a camera's pictures, if any, and the first picture.
+
+    Args:
+        moving: whether the robot moves, so that pictures should change.
+    """
+    chosen, first, blank, changes = _sample(len(frames), wanted), None, [], False
+    try:
+        if isinstance(frames, VideoFrames) and (wrong := misread(frames.path)) is not None:
+            return [("seeking", f"{name}: frame {wrong} is not that of decoding in order; {_REWRITE}")], first
+        for start in range(0, len(chosen), _CHUNK):
+            numbers = chosen[start : start + _CHUNK]
+            pictures = frames.read(numbers)
+            first = pictures[0] if first is None else first
+            flat = np.ptp(pictures.reshape(len(pictures), -1, 3), axis=1).max(1) == 0
+            blank += [number for number, one_colour in zip(numbers, flat, strict=True) if one_colour]
+            changes = changes or bool((pictures != first).any())
+    except EpisodeError as error:
+        return [("undecodable", f"{name}: {' '.join(str(error).split())}")], first
+    problem = ""
+    if blank:
+        problem = f"frame {blank[0]} is of one colour ({len(blank)} of {len(chosen)} checked)"
+    elif moving and not changes and len(chosen) > 1:
+        problem = f"{len(chosen)} pictures are all the same, though actions are not zero"
+    return [("camera", f"{name}: {problem}")] if problem else [], first
+
+
+def _depth(name: str, maps: Depths, wanted: int) -> Iterator[Problem]:
+    try:
+        for number in _sample(len(maps), wanted):
+            (depth,) = maps.read([number])
+            bad = not np.isfinite(depth).all() or depth.min() < 0
+            if bad or not depth.any():
+                problem = "values that are negative or not finite" if bad else "no value above 0"
+                yield "depth", f"{name}: frame {number} has {problem}"
+                return
+    except EpisodeError as error:
+        yield "undecodable", f"depth {name}: {error}"
 
 
 @dataclass(frozen=True)
@@ -210,3 +429,93 @@ def _outliers(kind: str, figures: dict[str, Float32[np.ndarray, " n"]], verb: st
             yield Finding(
                 name, kind, f"dimension {worst} {verb} {figure[worst]:.4g}, {times[worst]:.0f} times the usual"
             )
+
+
+def write_selection(
+    path: Path, about: str, refs: tuple[tuple[str, str], ...], reasons: Mapping[str, list[str]]
+) -> tuple[int, int]:
+    """Writes which episodes are kept, which are left out, and why.
+
+    Args:
+        path: the list, a JSON file.
+        about: the data set, for human readers of the list.
+        refs: every episode's id and fingerprint.
+        reasons: why episodes are left out, by id.
+
+    Returns:
+        How many episodes are kept, and how many are left out.
+
+    Raises:
+        FileError: the file cannot be written.
+    """
+    kept = [{"id": name, "fingerprint": mark} for name, mark in refs if name not in reasons]
+    out = [{"id": name, "fingerprint": mark, "reasons": reasons[name]} for name, mark in refs if name in reasons]
+    content = {"format": _SELECTION_FORMAT, "data_set": about, "kept": kept, "left_out": out}
+    with disk_guard(path):
+        write_atomically(path, json.dumps(content, indent=1).encode())
+    return len(kept), len(out)
+
+
+@dataclass
+class Selected:
+    """A source that refuses to read the episodes that a list leaves out; the error gives the reasons.
+
+    It still lists these episodes. An episode that has changed since the list was written is read.
+
+    Attributes:
+        source: the source that is read.
+        reasons: why episodes are left out, by id and fingerprint.
+        name: name of the source.
+    """
+
+    source: EpisodeSource
+    reasons: dict[tuple[str, str], str]
+    name: str
+
+    def episodes(self) -> Iterator[EpisodeRef]:
+        """Lists all episodes; one that is left out gets another fingerprint, so that earlier work on it is not used."""
+        for ref in self.source.episodes():
+            why = self.reasons.get((ref.id, ref.fingerprint))
+            if why is None:
+                yield ref
+            else:
+                yield EpisodeRef(ref.id, fingerprint((), ref.fingerprint, why), {"left_out": why})
+
+    def read(self, ref: EpisodeRef) -> Episode:
+        """Reads one episode; raises :class:`EpisodeError` with the reasons if it is left out."""
+        if "left_out" in ref.location:
+            raise EpisodeError(f"{ref.id}: left out by the list: {ref.location['left_out']}")
+        return self.source.read(ref)
+
+
+def select(source: EpisodeSource, path: Path) -> Selected:
+    """Returns a source that refuses the episodes that the list at ``path`` leaves out.
+
+    Raises:
+        SourceError: the list cannot be read, or is about other episodes or about these read with other options.
+    """
+    try:
+        content = parse_json(regular(path).read_bytes())
+        if content["format"] != _SELECTION_FORMAT:
+            raise ValueError(f"format {content['format']}, this code reads format {_SELECTION_FORMAT}")
+        reasons = {_key(entry): "; ".join(map(str, entry["reasons"])) for entry in content["left_out"]}
+        listed = {*reasons, *map(_key, content["kept"])}
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise SourceError(f"{path}: not a list of experiments.doctor ({error}); make it again with --fix") from error
+    names, known = {name for name, _ in listed}, False
+    for ref in source.episodes():
+        known = known or ref.id in names
+        if (ref.id, ref.fingerprint) in listed:
+            return Selected(source, reasons, source.name)
+    if known:
+        raise SourceError(
+            f"{path}: the data set was read with other options then, or all its files have changed; run "
+            f"experiments.doctor --fix again, with the same --option"
+        )
+    raise SourceError(f"{path}: names no episode of this data set; give the list that was made for it")
+
+
+def _key(entry: Mapping[str, object]) -> tuple[str, str]:
+    return str(entry["id"]), str(entry["fingerprint"])

@@ -36,7 +36,7 @@ class EpisodeError(UserError):
     """An episode cannot be read, so it is quarantined. The message names the file, the field and the cure.
 
     Attributes:
-        kind: one of :data:`rsjax.tools.ingest.checks.KINDS`.
+        kind: one of :data:`rsjax.tools.ingest.doctor.KINDS`.
         option: the command's option that rules the episode out, such as ``--camera``; "" if none does.
     """
 

@@ -115,8 +115,8 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     from rsjax.tools.ingest.annotators.categories import CategoryConfig, parse_table
     from rsjax.tools.ingest.annotators.choose import choose_annotators, choose_recorded
     from rsjax.tools.ingest.clips import ClipConfig, check_first, clip_step
+    from rsjax.tools.ingest.doctor import select
     from rsjax.tools.ingest.formats import open_source
-    from rsjax.tools.ingest.selection import select
     from rsjax.tools.ingest.work_items import IngestPlan
 
     out = Path(os.path.abspath(options.out or Path("data") / source))

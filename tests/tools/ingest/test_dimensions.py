@@ -3,8 +3,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.tools.ingest.actions import ActionConfig, Kind, Layout, check_declared
-from rsjax.tools.ingest.dimensions import describe_dimensions, flat_names, layout_of
+from rsjax.tools.ingest.actions import (
+    ActionConfig,
+    Kind,
+    Layout,
+    check_declared,
+    describe_dimensions,
+    flat_names,
+    layout_of,
+)
 from rsjax.tools.ingest.episode import EpisodeError
 
 COUNT = 60

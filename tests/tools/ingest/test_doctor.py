@@ -15,11 +15,9 @@ from experiments import doctor as command
 from rsjax.config import ConfigError
 from rsjax.processes import WorkerDied
 from rsjax.tools.ingest import doctor
-from rsjax.tools.ingest.checks import KINDS, Thresholds, quaternions
-from rsjax.tools.ingest.doctor import diagnose, open_any
+from rsjax.tools.ingest.doctor import KINDS, Thresholds, diagnose, open_any, quaternions, select, write_selection
 from rsjax.tools.ingest.episode import Episode, EpisodeError, Segment, SourceError
 from rsjax.tools.ingest.formats import open_source
-from rsjax.tools.ingest.selection import select, write_selection
 from tests.tools.ingest.formats.test_folder import write_episode
 from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.tools.ingest.toy_source import COUNT, Pictures, ToySource, episode, pictures, source

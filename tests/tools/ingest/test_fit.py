@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from rsjax.tools.ingest.fit import Fit, Placement
+from rsjax.tools.ingest.pictures import Fit, Placement
 
 FITS: list[Fit] = ["crop", "pad", "stretch"]
 SIZE = 64

@@ -3,10 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.tools.ingest.checks import Thresholds
-from rsjax.tools.ingest.doctor import diagnose
+from rsjax.tools.ingest.doctor import Thresholds, diagnose, select, write_selection
 from rsjax.tools.ingest.episode import EpisodeError, SourceError
-from rsjax.tools.ingest.selection import select, write_selection
 from tests.tools.ingest.toy_source import ToySource, episode, source
 
 

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest import checks, video_index
+from rsjax.tools.ingest import doctor, video
 from rsjax.tools.ingest.annotate import Annotated
 from rsjax.tools.ingest.clips import ClipConfig, cut
 from rsjax.tools.ingest.episode import EpisodeError
@@ -106,15 +106,15 @@ def test_the_doctor_compares_seeking_with_decoding_in_order(tmp_path: Path, monk
     np.save(tmp_path / "one/actions.npy", np.ones((COUNT, 2)))
 
     def kinds() -> set[str]:
-        video_index._scan.cache_clear()
+        video._scan.cache_clear()
         close_videos()
         source = open_source("folder", tmp_path, task="go", kind="delta", held=[])
-        findings, _ = checks.check_episode(source.read(next(source.episodes())), checks.Thresholds(frames=2))
+        findings, _ = doctor.check_episode(source.read(next(source.episodes())), doctor.Thresholds(frames=2))
         return {finding.kind for finding in findings}
 
     assert not kinds()
     trusted: Callable[..., list[int]] = lambda path, labels, avi: labels  # noqa: E731
-    monkeypatch.setattr(video_index, "_shown_order", trusted)
+    monkeypatch.setattr(video, "_shown_order", trusted)
     assert "seeking" in kinds()
     monkeypatch.undo()
     assert not kinds()

@@ -16,19 +16,19 @@ from rsjax.tools.ingest.annotators.depth import RecordedDepth
 
 NONE = "none"
 METHODS = {  # step → method's name → module and class in this package
-    "shots": {"hsv-histogram": "shots:HistogramShots", "transnetv2": "networks.shots:TransNetShots"},
-    "motion": {"dis": "motion:DISFlow", "raft": "networks.motion:RaftFlow"},
+    "shots": {"hsv-histogram": "shots:HistogramShots", "transnetv2": "shots:TransNetShots"},
+    "motion": {"dis": "motion:DISFlow", "raft": "motion:RaftFlow"},
     "depth": {
         "recorded": "depth:RecordedDepth",
-        "depth-anything": "networks.depth:DepthAnything",
-        "video-depth-anything": "networks.depth:VideoDepthAnything",
+        "depth-anything": "depth:DepthAnything",
+        "video-depth-anything": "depth:VideoDepthAnything",
     },
     "tracks": {
         "lucas-kanade": "tracks:LucasKanade",
-        "spatial-tracker": "networks.tracks:SpatialTracker",
-        "bootstapir": "networks.tracks:BootsTapir",
+        "spatial-tracker": "tracks:SpatialTracker",
+        "bootstapir": "tracks:BootsTapir",
     },
-    "semantics": {"own": "semantics:OwnSemantics", "internvl": "networks.semantics:InternVL"},
+    "semantics": {"own": "semantics:OwnSemantics", "internvl": "semantics:InternVL"},
 }
 
 

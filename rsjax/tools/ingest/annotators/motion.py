@@ -5,18 +5,22 @@ The camera's own motion counts too. :mod:`rsjax.tools.ingest.windows` filters by
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from rsjax.config import require
+from rsjax.tools.ingest.annotators.network import Network, library, load_weights
 from rsjax.tools.ingest.annotators.protocols import Annotator, FlowEstimator, Motion, Pictures, in_chunks
 from rsjax.tools.ingest.episode import Frames
 
 WIDTH = 256  # of the picture that motion is scaled to; wider pictures are shrunk before the measurement
 _LEAST = 32  # pixels per side; for smaller pictures DIS has no pyramid
+_RAFT_MULTIPLE = 8  # of both sides that RAFT accepts, in pixels
+_RAFT_LEAST = 128  # likewise
 
 
 @dataclass(frozen=True)
@@ -73,3 +77,46 @@ def _resized(pictures: Pictures) -> UInt8[np.ndarray, "T h w 3"]:
     size = (round(width * scale), round(height * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     return np.stack([cv2.resize(picture, size, interpolation=how) for picture in pictures])
+
+
+@dataclass(frozen=True)
+class RaftFlow(Network):
+    """RAFT; pictures are resized to sides that it accepts, and the flow is in pixels of the original ones.
+
+    Attributes:
+        weights: torchvision's file, such as ``raft_small_C_T_V2-01064c6d.pth``.
+        size: of the network.
+        updates: of the flow, by the recurrent part.
+        batch: pairs at a time.
+    """
+
+    name: ClassVar[str] = "raft"
+    title: ClassVar[str] = "RAFT"
+    weights: Path
+    size: Literal["small", "large"] = "small"
+    updates: int = 12
+    batch: int = 8
+
+    def __call__(self, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
+        model = self.load()
+        starts = range(0, len(before), self.batch)
+        flows = [self._flow(model, before[i : i + self.batch], after[i : i + self.batch]) for i in starts]
+        return np.concatenate(flows) if flows else np.zeros((*before.shape[:3], 2), np.float32)
+
+    def build(self) -> Any:
+        flows = library("torchvision.models.optical_flow", self.title)
+        model = getattr(flows, f"raft_{self.size}")(weights=None)
+        return load_weights(model, self.weights, self.device, f"{self.title} ({self.size})")
+
+    def _flow(self, model: Any, before: Pictures, after: Pictures) -> Float32[np.ndarray, "T H W 2"]:
+        torch = library("torch", self.title)
+        height, width = before.shape[1:3]
+        size = [max(_RAFT_LEAST, round(side / _RAFT_MULTIPLE) * _RAFT_MULTIPLE) for side in (height, width)]
+        resize = torch.nn.functional.interpolate
+        pair = [torch.from_numpy(x).to(self.device).permute(0, 3, 1, 2).float() / 127.5 - 1 for x in (before, after)]
+        with torch.no_grad():
+            pair = [resize(x, size, mode="bilinear", antialias=True) for x in pair]
+            flow = model(*pair, num_flow_updates=self.updates)[-1]
+            flow = resize(flow, (height, width), mode="bilinear")
+        unit = np.array([width / size[1], height / size[0]], np.float32)
+        return flow.permute(0, 2, 3, 1).cpu().numpy() * unit

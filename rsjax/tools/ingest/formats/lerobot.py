@@ -4,20 +4,24 @@ A row's action is sent at that row's frame, so it leads into the next frame. v2 
 video for each episode and camera; in v3 many episodes share a file, and an episode's pictures are looked up by time.
 """
 
+import bisect
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from rsjax.clip import words_of
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Kind, align_actions, check_layout
-from rsjax.tools.ingest.dimensions import Declared, flat_names, layout_of
+from rsjax.tools.ingest.actions import Declared, Kind, align_actions, check_layout, flat_names, layout_of
 from rsjax.tools.ingest.episode import (
     FETCH_AGAIN,
+    MAX_FPS,
     Episode,
     EpisodeError,
     EpisodeRef,
@@ -29,6 +33,7 @@ from rsjax.tools.ingest.episode import (
 )
 from rsjax.tools.ingest.formats.files import (
     broken,
+    exists,
     fill,
     inside,
     integers,
@@ -36,16 +41,18 @@ from rsjax.tools.ingest.formats.files import (
     location_of,
     matrix,
     media,
+    parquet_columns,
     parquet_rows,
+    read_json,
     seconds,
 )
-from rsjax.tools.ingest.formats.lerobot_info import Info, read_info
-from rsjax.tools.ingest.formats.lerobot_tables import TablePictures, read_rows
+from rsjax.tools.ingest.pictures import decode_pictures
 from rsjax.tools.ingest.video import at_times
 
 TOLERANCE = 1e-4  # seconds, LeRobot's own tolerance
 _PLACES = ("chunk_index", "file_index")
 _BEGINS = "from_timestamp"
+_ALL = [("episode_index", ">=", 0)]  # a shared file may have more rows than the limit for one episode
 
 
 def open_source(
@@ -78,6 +85,66 @@ def open_source(
     stay = None if held is None else tuple(held)
     declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
     return LeRobot(path, info, tasks, declared, action, state)
+
+
+@dataclass(frozen=True)
+class Info:
+    """The part of ``meta/info.json`` that reading needs.
+
+    Attributes:
+        shared: whether episodes share files (v3).
+        fps: frames per second.
+        chunks_size: episodes per folder (v2).
+        data_path: template of a table's path.
+        video_path: template of a video's path, "" without videos.
+        features: column → ``dtype``, ``shape``, ``names``.
+        episodes: number of episodes that there should be; 0 if the file does not say.
+    """
+
+    shared: bool
+    fps: float
+    chunks_size: int
+    data_path: str
+    video_path: str
+    features: dict[str, dict[str, Any]]
+    episodes: int = 0
+
+    def of_type(self, dtype: str) -> list[str]:
+        """Returns the camera columns of a dtype (``video`` or ``image``), without coloured depth."""
+        keys = []
+        for key, feature in self.features.items():
+            details = feature.get("info") or feature.get("video_info")
+            is_depth = isinstance(details, dict) and details.get("video.is_depth_map")
+            if feature.get("dtype") == dtype and not is_depth and "depth" not in key.rpartition(".")[2]:
+                keys.append(key)
+        return keys
+
+
+def read_info(path: Path) -> Info:
+    """Reads ``meta/info.json``; :class:`SourceError` if a field is missing or of an unknown version."""
+    if not exists(path):
+        raise SourceError(f"{path}: missing; fetch the file again, or give the folder that has meta/")
+    values = read_json(path)
+    try:
+        version = str(values["codebase_version"])
+        if not version.startswith(("v2.", "v3.")):
+            raise SourceError(f"{path}: codebase_version {version}; v2.0, v2.1 and v3.0 can be read: convert it")
+        info = Info(
+            shared=version.startswith("v3."),
+            fps=float(values["fps"]),
+            chunks_size=int(values.get("chunks_size", 1000)),
+            data_path=str(values["data_path"]),
+            video_path=str(values.get("video_path") or ""),
+            features=dict(values["features"]),
+            episodes=int(values.get("total_episodes") or 0),
+        )
+        if not 0 < info.fps <= MAX_FPS or info.chunks_size <= 0:
+            raise ValueError(f"fps {info.fps}, chunks_size {info.chunks_size}")
+        if not all(isinstance(feature, dict) for feature in info.features.values()):
+            raise ValueError("features are not all objects")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise SourceError(f"{path}: field missing or wrong ({error}); fetch the file again") from error
+    return info
 
 
 class LeRobot:
@@ -256,3 +323,99 @@ def _tolerance(times: Float[np.ndarray, " N"]) -> float:
 
 def _camera(key: str) -> str:
     return key.removeprefix("observation.images.").removeprefix("observation.")
+
+
+def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequence[str]) -> tuple[Path, pa.Table]:
+    """Reads the rows of an episode.
+
+    LeRobot's converter to v3 writes wrong metadata: for the first episode of every file but the first it names the
+    previous file, and if the very first episode alone exceeds a file's size it names a file that does not exist. So if
+    the file that the metadata name is missing or has no row of the episode, the other files are searched, the next one
+    first.
+
+    Args:
+        template: template of the tables' paths.
+        location: the episode's location.
+        columns: the columns to read; those that the table lacks are left out.
+
+    Returns:
+        The file that has the rows, and the rows.
+
+    Raises:
+        EpisodeError: the named file cannot be read, or no file has a row of the episode.
+    """
+    named, number = inside(root, location["data"]), location["episode"]
+    failure = EpisodeError.at(named, f"has no row of episode {number}, nor has any other file", kind="length")
+    shared = "rows" in location
+    for path in (named, *(_others(root, template, named, number) if shared else ())):
+        try:
+            table = parquet_columns(path, columns, _only(location))
+        except EpisodeError as error:
+            if not (shared and isinstance(error.__cause__, FileNotFoundError)):
+                raise
+            failure = error
+        else:
+            if table.num_rows:
+                return path, table
+    raise failure
+
+
+def _others(root: Path, template: str, named: Path, number: int) -> Iterator[Path]:
+    """Yields the other files that have rows of an episode; files that cannot be read are skipped."""
+    pattern = inside(root, re.sub(r"\{[^{}]*\}", "*", template)).relative_to(root)
+    files = sorted(root.glob(str(pattern)))
+    after = bisect.bisect_right(files, named)
+    for path in (*files[after:], *reversed(files[:after])):
+        try:
+            status = path.stat()
+            if number in _episodes_in(path, status.st_size, status.st_mtime_ns):
+                yield path
+        except (EpisodeError, OSError):
+            continue
+
+
+@lru_cache(maxsize=4096)
+def _episodes_in(path: Path, size: int, modified: int) -> frozenset[int]:
+    """Returns the episodes of a file; ``size`` and ``modified`` make the cache read a changed file again."""
+    table = parquet_columns(path, ["episode_index"], _ALL)
+    return frozenset(np.unique(integers(table, "episode_index", path)).tolist())
+
+
+def _only(location: dict[str, Any]) -> list[tuple[str, str, int]] | None:
+    """Returns the filter that selects one episode from a shared table; None if the table holds only this episode."""
+    return [("episode_index", "==", location["episode"])] if "rows" in location else None
+
+
+@dataclass(frozen=True, eq=False)
+class TablePictures:
+    """Encoded pictures in an episode's table, as :class:`rsjax.tools.ingest.episode.Frames`.
+
+    Attributes:
+        path: the table.
+        column: a column of ``{bytes, path}``.
+        location: the episode's location.
+    """
+
+    path: Path
+    column: str
+    location: dict[str, Any]
+
+    def __len__(self) -> int:
+        return self.location["length"]
+
+    def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
+        """Returns these pictures; :class:`EpisodeError` names one that is missing or damaged."""
+        table = parquet_columns(self.path, [self.column], _only(self.location))
+        if self.column not in table.column_names:
+            raise EpisodeError.at(self.path, f"has no column {self.column!r}")
+        if table.num_rows != len(self):
+            raise EpisodeError.at(self.path, f"{table.num_rows} rows of {self.column}, not {len(self)}")
+        cells = table[self.column].take(list(indices)).to_pylist()
+        payloads: list[tuple[str, bytes]] = []
+        for index, cell in zip(indices, cells, strict=True):
+            where = f"{self.path}: {self.column} of row {index}"
+            payload = cell.get("bytes") if isinstance(cell, dict) else cell
+            if not isinstance(payload, bytes):
+                raise EpisodeError.at(where, "has no encoded picture", kind="undecodable")
+            payloads.append((where, payload))
+        return decode_pictures(payloads)

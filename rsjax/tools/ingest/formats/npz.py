@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 
 from rsjax.files import safe_id
-from rsjax.tools.ingest.actions import Kind, align_actions, check_layout
-from rsjax.tools.ingest.dimensions import layout_of
+from rsjax.tools.ingest.actions import Kind, align_actions, check_layout, layout_of
 from rsjax.tools.ingest.episode import (
     MAX_FPS,
     MAX_PIXELS,

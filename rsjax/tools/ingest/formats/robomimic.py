@@ -28,9 +28,19 @@ from rsjax.tools.ingest.episode import (
     checked,
     fingerprint,
 )
-from rsjax.tools.ingest.formats.demo_settings import fps_of, instruction_of, kind_of, settings_of
 from rsjax.tools.ingest.formats.files import broken, inside, location_of
-from rsjax.tools.ingest.formats.hdf5 import H5Frames, Stored, attribute, member, open_file, rows
+from rsjax.tools.ingest.formats.hdf5 import (
+    H5Frames,
+    Stored,
+    attribute,
+    fps_of,
+    instruction_of,
+    kind_of,
+    member,
+    open_file,
+    rows,
+    settings_of,
+)
 from rsjax.tools.ingest.formats.rendered import CURE, Pictures, rendered
 
 

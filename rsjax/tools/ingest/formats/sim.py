@@ -15,8 +15,7 @@ from jaxtyping import Float
 from rsjax.clip import UNKNOWN, words_of
 from rsjax.data.store import Record, Store, StoreError, open_store
 from rsjax.errors import did_you_mean
-from rsjax.tools.ingest.actions import Kind, Layout
-from rsjax.tools.ingest.dimensions import layout_of
+from rsjax.tools.ingest.actions import Kind, Layout, layout_of
 from rsjax.tools.ingest.episode import (
     LEAVE_OUT,
     Episode,

@@ -8,8 +8,7 @@ from rsjax.config import ConfigError
 from rsjax.tools.ingest.annotate import Annotators
 from rsjax.tools.ingest.annotators.choose import METHODS, choose, choose_annotators, choose_recorded
 from rsjax.tools.ingest.annotators.depth import RecordedDepth
-from rsjax.tools.ingest.annotators.networks.tracks import BootsTapir
-from rsjax.tools.ingest.annotators.tracks import LucasKanade
+from rsjax.tools.ingest.annotators.tracks import BootsTapir, LucasKanade
 
 
 def test_a_word_is_a_method_and_its_fields() -> None:

@@ -10,16 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsjax.config import ConfigError
-from rsjax.tools.ingest.annotators.motion import DISFlow
-from rsjax.tools.ingest.annotators.networks.depth import DepthAnything, VideoDepthAnything
-from rsjax.tools.ingest.annotators.networks.motion import RaftFlow
-from rsjax.tools.ingest.annotators.networks.semantics import InternVL
-from rsjax.tools.ingest.annotators.networks.shots import TransNetShots
-from rsjax.tools.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
+from rsjax.tools.ingest.annotators.depth import DepthAnything, VideoDepthAnything
+from rsjax.tools.ingest.annotators.motion import DISFlow, RaftFlow
 from rsjax.tools.ingest.annotators.protocols import Annotator, in_chunks
-from rsjax.tools.ingest.annotators.semantics import OwnSemantics
-from rsjax.tools.ingest.annotators.shots import HistogramShots
-from rsjax.tools.ingest.annotators.tracks import LucasKanade
+from rsjax.tools.ingest.annotators.semantics import InternVL, OwnSemantics
+from rsjax.tools.ingest.annotators.shots import HistogramShots, TransNetShots
+from rsjax.tools.ingest.annotators.tracks import BootsTapir, LucasKanade, SpatialTracker
 from tests.tools.ingest.videos import ArrayFrames
 
 HERE = Path(__file__)

@@ -25,7 +25,7 @@ from rsjax.tools.ingest.formats.files import (
     read_json,
     seconds,
 )
-from rsjax.tools.ingest.formats.folder_files import read_table
+from rsjax.tools.ingest.formats.folder import read_table
 from rsjax.tools.ingest.formats.hdf5 import open_file
 from rsjax.tools.ingest.formats.keymap import key_map
 from rsjax.tools.ingest.formats.tfrecord import read_payload, spans

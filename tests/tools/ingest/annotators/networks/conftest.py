@@ -2,7 +2,7 @@ import sys
 
 import pytest
 
-from rsjax.tools.ingest.annotators.networks.local import _build
+from rsjax.tools.ingest.annotators.network import _build
 
 
 @pytest.fixture(autouse=True)

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.annotators.depth import RELATIVE_FAR, inverse_of
-from rsjax.tools.ingest.annotators.networks.depth import DepthAnything, VideoDepthAnything
+from rsjax.tools.ingest.annotators.depth import RELATIVE_FAR, DepthAnything, VideoDepthAnything, inverse_of
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
 from tests.tools.ingest.annotators.networks.checkouts import check_out
 from tests.tools.ingest.videos import episode, sliding

@@ -3,14 +3,13 @@ import sys
 
 import pytest
 
-from rsjax.tools.ingest.annotators.networks.depth import DepthAnything, VideoDepthAnything
-from rsjax.tools.ingest.annotators.networks.local import checkout_module, library, load_weights, on_device
-from rsjax.tools.ingest.annotators.networks.motion import RaftFlow
-from rsjax.tools.ingest.annotators.networks.semantics import InternVL
-from rsjax.tools.ingest.annotators.networks.shots import TransNetShots
-from rsjax.tools.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
+from rsjax.tools.ingest.annotators.depth import DepthAnything, VideoDepthAnything
+from rsjax.tools.ingest.annotators.motion import RaftFlow
+from rsjax.tools.ingest.annotators.network import checkout_module, library, load_weights, on_device
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
-from rsjax.tools.ingest.annotators.tracks import LucasKanade
+from rsjax.tools.ingest.annotators.semantics import InternVL
+from rsjax.tools.ingest.annotators.shots import TransNetShots
+from rsjax.tools.ingest.annotators.tracks import BootsTapir, LucasKanade, SpatialTracker
 from tests.tools.ingest.annotators.networks.checkouts import check_out
 from tests.tools.ingest.videos import sliding
 

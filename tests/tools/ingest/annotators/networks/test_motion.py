@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.annotators.motion import measure_motion
-from rsjax.tools.ingest.annotators.networks.motion import RaftFlow
+from rsjax.tools.ingest.annotators.motion import RaftFlow, measure_motion
 from tests.tools.ingest.videos import sliding
 
 torch = pytest.importorskip("torch")

@@ -5,9 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.tools.ingest.annotators.networks.semantics import AnswerError, InternVL, complete, parse_answer, valid_answer
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
-from rsjax.tools.ingest.annotators.semantics import OwnSemantics
+from rsjax.tools.ingest.annotators.semantics import (
+    AnswerError,
+    InternVL,
+    OwnSemantics,
+    complete,
+    parse_answer,
+    valid_answer,
+)
 from rsjax.tools.ingest.episode import Segment
 from tests.tools.ingest.videos import episode, sliding
 

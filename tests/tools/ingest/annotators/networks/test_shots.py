@@ -3,8 +3,7 @@ import random
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.annotators.networks.shots import TransNetShots, transition_probabilities
-from rsjax.tools.ingest.annotators.shots import HistogramShots
+from rsjax.tools.ingest.annotators.shots import HistogramShots, TransNetShots, transition_probabilities
 from tests.tools.ingest.videos import ArrayFrames, sliding
 
 torch = pytest.importorskip("torch")

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.annotators.networks.tracks import BootsTapir, SpatialTracker
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
+from rsjax.tools.ingest.annotators.tracks import BootsTapir, SpatialTracker
 from tests.tools.ingest.annotators.networks.checkouts import check_out
 from tests.tools.ingest.videos import ArrayFrames, sliding
 

@@ -1,1 +1,0 @@
-"""Annotators that run networks: torch and transformers are imported by the first call; weights are local files only."""
