@@ -60,25 +60,25 @@ def main(argv: Sequence[str]) -> None:
     refuse_repeated(argv, repeatable=("task",))
     options = parser().parse_args(argv)
     # JAX is loaded only now, after arguments are known to be good.
-    from rsjax.tools.convert import cogvideox_commands, commands, diffusion_commands, ivideogpt
+    from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, lpips, tokenizer
 
     if options.kind == "tokenizer":
-        lines = commands.convert_tokenizer(options.source, options.out, options.weights)
+        lines = tokenizer.convert(options.source, options.out, options.weights)
     elif options.kind == "genie":
-        lines = commands.convert_genie(options.source, options.out, options.heads)
+        lines = genie.convert(options.source, options.out, options.heads)
     elif options.kind == "ivideogpt":
         lines = ivideogpt.convert(options.source, options.out, options.heads, options.part)
     elif options.kind == "cogvideox":
-        lines = cogvideox_commands.convert(options.source, options.out, options.part)
+        lines = cogvideox.convert(options.source, options.out, options.part)
     elif options.kind == "text":
         texts = (options.task, options.store, options.tokens)
-        lines = cogvideox_commands.embed_texts(options.source, options.out, *texts)
+        lines = cogvideox.embed_texts(options.source, options.out, *texts)
     elif options.kind == "irasim":
-        lines = diffusion_commands.convert_irasim(options.source, options.out, options.weights, options.heads)
+        lines = irasim.convert(options.source, options.out, options.weights, options.heads)
     elif options.kind == "sdxl":
-        lines = diffusion_commands.convert_sdxl(options.source, options.out)
+        lines = kl_autoencoder.convert(options.source, options.out)
     else:
-        lines = commands.convert_lpips([path for path in (options.source, options.heads_file) if path], options.out)
+        lines = lpips.convert([path for path in (options.source, options.heads_file) if path], options.out)
     print(*lines, sep="\n")
 
 

@@ -1,6 +1,6 @@
 """The public image autoencoders (VAE, VQ) of ``diffusers``: both halves, and their layers.
 
-Convolutions have biases, norms are GroupNorms with epsilon 1e-6. ``rsjax/tools/convert/vae_names.py`` lists the public
+Convolutions have biases, norms are GroupNorms with epsilon 1e-6. ``rsjax/tools/convert/table.py`` lists the public
 names of these modules.
 
 Axes: N images, h×w cells, C channels.

@@ -4,35 +4,58 @@ The ``config.json`` that is published beside the weights contains what they do n
 latents, and how positions are encoded. The weights of a large transformer are in several files; name any one of them.
 """
 
+import importlib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from flax.traverse_util import flatten_dict
 
+from rsjax.clip import UNKNOWN
 from rsjax.config import CausalVAEConfig, CogVideoXConfig, ConfigError
+from rsjax.data.store import open_store
+from rsjax.errors import first_line
+from rsjax.files import write_file
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.pretrained import saved_architecture
+from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.cogvideox.transformer import shapes
-from rsjax.tools.convert.files import ConvertError, Tensors, setting
+from rsjax.models.saved import Inputs, read_model
+from rsjax.tools.convert.directory import Part, save_part, saved_part
+from rsjax.tools.convert.files import (
+    REPLACES,
+    SAFE,
+    SETTINGS,
+    ConvertError,
+    TensorFile,
+    Tensors,
+    check_file,
+    left_aside,
+    published_settings,
+    read_tensors,
+    setting,
+    write_published,
+)
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
-    Layout,
     Names,
     Table,
     norm,
+    renamed_table,
     shape_of,
     to_params,
+    to_tensors,
     weight_and_bias,
 )
 from rsjax.trainable import Params
+from rsjax.training.checkpoint import load_weights
 
-CONFIG = "config.json"
 CLASSES = {"tokenizer": "AutoencoderKLCogVideoX", "world_model": "CogVideoXTransformer3DModel"}
 FACTOR = 0.7  # scaling factor of 5B-I2V's latents; 2B's is 1.15258426
 WIDTH_2B = 1920
@@ -46,18 +69,14 @@ _PARTS = (
     (r"\b(conv_in|conv_out|conv\d|conv_y|conv_b)\.(kernel|bias)$", r"\1.conv.\2"),
     (r"\b(kernel|scale)$", "weight"),
 )
-_LAYOUTS: dict[int, Layout] = {2: "linear3d", 4: "conv", 5: "conv3d"}
+PARTS: tuple[Part, Part] = ("tokenizer", "world_model")
+_SHARD = re.compile(r"(.*)-(\d{5})-of-(\d{5})\.safetensors")
+TOKENS = 226
 
 
 def autoencoder_table(of: Params) -> Table:
     """Returns an entry for each parameter of encoder and decoder; ``of`` gives the parameters' shapes."""
-    entries = []
-    for path, x in flatten_dict(of, sep="/").items():
-        key = path.replace("/", ".")
-        for own, public in _PARTS:
-            key = re.sub(own, public, key)
-        entries.append(Entry(key, path, _LAYOUTS[x.ndim] if path.endswith("kernel") else "same"))
-    return tuple(entries)
+    return renamed_table(of, _PARTS, {2: "linear3d", 4: "conv", 5: "conv3d"})
 
 
 def transformer_table(config: CogVideoXConfig) -> Table:
@@ -250,3 +269,127 @@ def transformer_settings(config: CogVideoXConfig) -> dict[str, Any]:
         sides = {"sample_height": learned[1] * config.patch_size, "sample_width": learned[2] * config.patch_size}
         settings |= sides | {"sample_frames": 4 * (learned[0] - 1) + 1, "temporal_compression_ratio": 4}
     return settings
+
+
+def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
+    """Imports a public autoencoder or transformer into a directory, or exports a directory's to a safetensors file.
+
+    Args:
+        source: the file or directory; if a network has several files (``…-00001-of-00003.safetensors``), any of them.
+        part: the part to export; None: the only one.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        return [_export(source, out, part)]
+    tensors, _, names, others, _ = _read(source)
+    settings, vae = published_settings(source, *CLASSES.values()), is_autoencoder(source, tensors)
+    part, other = PARTS if vae else PARTS[::-1]
+    if settings.get("_class_name", CLASSES[part]) != CLASSES[part]:
+        raise ConvertError(f"{source}: is no {settings['_class_name']}, as {SETTINGS} beside it says")
+    saved = saved_part(out, CogVideoXConfig, other)
+    before, inputs = saved or (None, Inputs(0, 0))
+    if vae:
+        network, params = autoencoder_from_public(source, tensors, settings, names)
+        model = replace(before or CogVideoXConfig(), autoencoder=network)
+        lines = [f"{out}: an autoencoder of {len(tensors)} tensors, {network}", *left_aside(others)]
+        if "scaling_factor" not in settings:
+            lines.append(f"no {SETTINGS} with scaling_factor beside {source.name}: 5B-I2V's 0.7 is taken")
+    else:
+        model, params, aside = transformer_from_public(source, tensors, settings, names)
+        network = model.autoencoder
+        model = replace(model, autoencoder=before.autoencoder if before else network)
+        lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {model}"]
+        lines += left_aside({"fixed positions, which the network computes": aside}, others)
+    if before and before.autoencoder.latent_channels != network.latent_channels:
+        there, here = before.autoencoder.latent_channels, network.latent_channels
+        raise ConvertError(f"{out}: holds a part with {there} latent channels, this one has {here}; choose another OUT")
+    lines[0] += REPLACES * save_part(out, part, model, inputs, params)
+    return lines
+
+
+def _read(source: Path) -> TensorFile:
+    """Returns the content of a file, or of all files of a network if the file is one of several."""
+    if not (match := _SHARD.fullmatch(source.name)):
+        return read_tensors(source)
+    numbers = range(1, int(match[3]) + 1)
+    files = [read_tensors(source.with_name(f"{match[1]}-{i:05d}-of-{match[3]}{SAFE}")) for i in numbers]
+    tensors = {name: x for file in files for name, x in file.tensors.items()}
+    names = {name: known for file in files for name, known in file.names.items()}
+    return TensorFile(tensors, {}, names, {}, "")
+
+
+def _export(source: Path, out: Path, part: Part | None) -> str:
+    replaces, parts = check_file(out), [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
+    if part not in parts and len(parts) != 1:
+        raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of a CogVideoX'}; name one with --part")
+    part = part if part in parts else parts[0]
+    model = read_model(source, CogVideoXConfig, part)
+    if part == "tokenizer":
+        of = jax.eval_shape(lambda key: autoencoder.init(model.autoencoder, key), jax.random.key(0))
+        params = load_weights(source / part / "weights", of)
+        settings = autoencoder_settings(model.autoencoder, params)
+        params = {name: params[name] for name in ("encoder", "decoder")}
+        entries = autoencoder_table(params)
+    else:
+        params = load_weights(source / part / "weights", shapes(saved_architecture(model)))
+        settings, entries = transformer_settings(model), transformer_table(model)
+    tensors = to_tensors(params, entries)
+    write_published(out, tensors, settings)
+    text = f"under their public names; settings in {SETTINGS}{replaces}"
+    return f"{out}: {len(tensors)} tensors of CogVideoX's {part}, {text}"
+
+
+def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | None, tokens: int = TOKENS) -> list[str]:
+    """Embeds the empty text and tasks with a T5 encoder from a local directory.
+
+    Padding is not masked, as in the public code.
+
+    Args:
+        source: a directory with ``text_encoder`` (safetensors) and ``tokenizer``, as the public models have.
+        tasks: in words.
+        store: a store of clips whose tasks are embedded too.
+        tokens: length to which each text is padded or cut.
+
+    Raises:
+        UserError: the directory holds no such encoder, ``transformers`` is not installed, or there are no tasks.
+    """
+    replaces = check_file(out)
+    names = [EMPTY, *dict.fromkeys([*tasks, *(_tasks(store) if store else ())])]
+    if len(names) == 1:
+        raise ConvertError(f"{out}: there are no tasks to embed; name them with --task, or a store with --store")
+    try:
+        torch, transformers = (importlib.import_module(name) for name in ("torch", "transformers"))
+    except ImportError as error:
+        raise ConvertError(
+            f"{source}: embedding texts needs transformers and PyTorch ({error}); pip install -e '.[text]'"
+        ) from None
+    for folder in ("text_encoder", "tokenizer"):
+        if not (source / folder).is_dir():
+            raise ConvertError(f"{source}: has no directory {folder}; pass that of a public CogVideoX")
+    local: dict[str, Any] = {"local_files_only": True}
+    try:
+        tokenizer = transformers.AutoTokenizer.from_pretrained(source / "tokenizer", **local)
+        encoder = transformers.T5EncoderModel.from_pretrained(source / "text_encoder", use_safetensors=True, **local)
+    except Exception as error:  # transformers raises many types for missing and damaged files
+        raise ConvertError(f"{source}: holds no T5 encoder with its tokenizer ({first_line(error)})") from error
+    made, fixed = [], {"padding": "max_length", "max_length": tokens, "truncation": True, "return_tensors": "pt"}
+    with torch.no_grad():
+        for name in names:
+            made.append(encoder.eval()(tokenizer(name, **fixed).input_ids)[0].float().numpy())
+    embeddings = np.concatenate(made)
+    write_file(out, write_texts(names, embeddings))
+    return [
+        f"{out}: {len(names)} texts of {tokens} tokens of {embeddings.shape[2]} numbers, the empty one first{replaces}"
+    ]
+
+
+def _tasks(store: Path) -> list[str]:
+    """Returns the tasks of a store's clips, in words."""
+    opened = open_store(store)
+    splits = [split for split in opened.splits if opened.labelled(split)]
+    tasks = [word for split in splits for word in opened.labels(split).words.get("task", ())]
+    if not splits:
+        tasks = [opened.source(split)[i]["task"] for split in opened.splits for i in range(len(opened.source(split)))]
+    return [task for task in dict.fromkeys(tasks) if task != UNKNOWN]

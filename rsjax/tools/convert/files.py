@@ -12,13 +12,17 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from rsjax.config import ConfigError, from_dict
 from rsjax.errors import UserError, first_line
-from rsjax.files import placeholder, read_json, write_file
+from rsjax.files import parse_json, placeholder, read_json, write_file, write_json
 
 Tensors = dict[str, np.ndarray]
+T = TypeVar("T")
 
 SAFE = ".safetensors"
+REPLACES = "; it replaces the one that was there"
 PICKLED = (".ckpt", ".pt", ".pth", ".bin")  # PyTorch's own formats, which contain a pickle
+SETTINGS = "config.json"  # published beside a file of weights
 HOLDERS = ("state_dict", "model_state_dict", "model")  # keys under which training scripts save a network's tensors
 # The prefixes that DistributedDataParallel and torch.compile add to names.
 _WRAPPED = re.compile(r"^module\.|(?<![^.])_orig_mod\.")
@@ -107,6 +111,42 @@ def write_safetensors(path: Path, tensors: Tensors, metadata: dict[str, str]) ->
     # safetensors writes memory as it lies and ignores strides.
     contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
     write_file(path, safetensors.numpy.save(contiguous, metadata))
+
+
+def check_file(out: Path) -> str:
+    """Checks the name of the file to write; returns a note for the message if the file replaces another one."""
+    if out.suffix != SAFE:
+        raise ConvertError(f"{out}: the output is a {SAFE} file; name OUT accordingly")
+    return REPLACES * out.exists()
+
+
+def write_published(out: Path, tensors: Tensors, settings: dict[str, Any]) -> None:
+    """Writes a file of tensors with its settings beside it, as the public checkpoints come.
+
+    Raises:
+        ConvertError: other settings are there already.
+        FileError: the files cannot be written.
+    """
+    beside = out.parent / SETTINGS
+    cure = "write to an empty directory"
+    if beside.exists() and read_json(beside, cure=cure) != settings:
+        raise ConvertError(f"{beside}: exists with other settings; {cure}")
+    write_safetensors(out, tensors, {})
+    write_json(beside, settings)
+
+
+def exported_config(kind: type[T], source: Path, metadata: dict[str, str], key: str) -> T | None:
+    """Returns the configuration that this project wrote into a file's metadata; None if another program made the file.
+
+    Raises:
+        ConvertError: it is damaged.
+    """
+    if key not in metadata:
+        return None
+    try:
+        return from_dict(kind, parse_json(metadata[key]))
+    except (ValueError, TypeError, ConfigError) as error:
+        raise ConvertError(f"{source}: its metadata {key} are of another version or damaged ({error})") from error
 
 
 def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
@@ -234,7 +274,7 @@ def published_settings(weights: Path, *classes: str) -> dict[str, Any]:
     Raises:
         UserError: the file is damaged or describes another network.
     """
-    path = weights.parent / "config.json"
+    path = weights.parent / SETTINGS
     if not path.exists():
         return {}
     cure = f"put the published one beside {weights.name}, or delete it"

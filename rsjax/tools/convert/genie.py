@@ -14,11 +14,30 @@ from rsjax.config import ConfigError
 from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
-from rsjax.tools.convert.files import ConvertError, Tensors, check_type
-from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, Table, norm, shape_of, to_params, weight_and_bias
+from rsjax.tools.convert.directory import load_world_model, save
+from rsjax.tools.convert.files import (
+    REPLACES,
+    SETTINGS,
+    ConvertError,
+    Tensors,
+    check_file,
+    check_type,
+    left_aside,
+    read_tensors,
+    write_published,
+)
+from rsjax.tools.convert.table import (
+    SAME_NAMES,
+    Entry,
+    Names,
+    Table,
+    norm,
+    shape_of,
+    to_params,
+    to_tensors,
+    weight_and_bias,
+)
 from rsjax.trainable import Params
-
-CONFIG = "config.json"
 
 # The only values under which the public network has the same parameters as this project's.
 FIXED = {"qkv_bias": False, "proj_bias": True, "mlp_bias": True}
@@ -63,7 +82,7 @@ def read_settings(weights: Path) -> dict[str, Any]:
     Raises:
         UserError: the file is damaged or is not a GenieConfig.
     """
-    path = weights.parent / CONFIG
+    path = weights.parent / SETTINGS
     if not path.exists():
         return {}
     cure = f"put the published one beside {weights.name}, or delete it"
@@ -91,7 +110,7 @@ def infer_config(
     def shape(key: str, axes: int) -> tuple[int, ...]:
         return shape_of(source, tensors, key, axes, names)
 
-    _check_types(source.parent / CONFIG, settings)
+    _check_types(source.parent / SETTINGS, settings)
     position, first, hidden = (
         "pos_embed_TSC",
         "token_embed.factored_embeds.0.weight",
@@ -112,7 +131,7 @@ def infer_config(
     if heads is None or heads < 1:
         raise ConvertError(
             f"{source}: the number of attention heads is {'unknown' if heads is None else heads}; "
-            f"put the published {CONFIG} beside the file, or set --heads (8 in the public models)"
+            f"put the published {SETTINGS} beside the file, or set --heads (8 in the public models)"
         )
     try:
         config = Architecture(
@@ -132,7 +151,7 @@ def infer_config(
         )
     except ConfigError as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
-    _check_settings(source.parent / CONFIG, settings, settings_of(config) | {"S": cells})
+    _check_settings(source.parent / SETTINGS, settings, settings_of(config) | {"S": cells})
     return config
 
 
@@ -186,3 +205,26 @@ def from_public(
     config = infer_config(source, tensors, settings, heads, names)
     shapes = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
     return config, to_params(source, tensors, table(config), shapes, names)
+
+
+def convert(source: Path, out: Path, heads: int | None) -> list[str]:
+    """Imports a public Genie into a directory, or exports a directory's world model to a safetensors file.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        replaces = check_file(out)
+        config, params = load_world_model(source)
+        tensors = to_tensors(params, table(config))
+        write_published(out, tensors, settings_of(config))
+        text = f"under their public names; settings in {SETTINGS}{replaces}"
+        return [f"{out}: {len(tensors)} tensors of a Genie, {text}"]
+    tensors, _, names, others, _ = read_tensors(source)
+    settings = read_settings(source)
+    config, params = from_public(source, tensors, settings, heads, names)
+    replaces = REPLACES * save(out, config, params)
+    lines = [f"{out}: a world model of {len(tensors)} tensors, {config}{replaces}", *left_aside(others)]
+    if settings.get("use_mup") is None:
+        lines.append(f"no use_mup in a {SETTINGS} beside {source.name}: converted as a model without muP")
+    return lines

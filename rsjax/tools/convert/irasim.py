@@ -4,17 +4,32 @@ The weights' shapes reveal neither the number of heads nor the token grid of a f
 the grid. The file's fixed positions are left aside: the network computes its own.
 """
 
+import json
 import math
+from pathlib import Path
+from typing import Literal
 
 import jax
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, to_dict
 from rsjax.models.diffusion.layers import grid_positions, positions
 from rsjax.models.irasim.dit import Architecture, DiT
-from rsjax.tools.convert.files import ConvertError, Tensors
+from rsjax.tools.convert.directory import load_irasim, save
+from rsjax.tools.convert.files import (
+    HOLDERS,
+    REPLACES,
+    ConvertError,
+    Tensors,
+    check_file,
+    exported_config,
+    left_aside,
+    read_tensors,
+    write_safetensors,
+)
 from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, Table, shape_of, to_params, to_tensors, weight_and_bias
 from rsjax.trainable import Params
 
+METADATA = "rsjax.irasim"  # key of the architecture in the metadata of an exported file
 FIXED = ("pos_embed", "temp_embed")
 HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # attention heads of the public sizes, by width
 
@@ -112,3 +127,31 @@ def to_public(config: Architecture, params: Params) -> Tensors:
     """Returns the tensors of a public file, including the fixed positions."""
     space, time = grid_positions(*config.grid, config.width), positions(config.frames, config.width)
     return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, table(config))
+
+
+def convert(source: Path, out: Path, weights: Literal["ema", "raw"], heads: int | None) -> list[str]:
+    """Imports a public IRASim into a directory, or exports a directory's transformer to a safetensors file.
+
+    Args:
+        weights: which of the two networks in a public training checkpoint to import.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        replaces = check_file(out)
+        config, params = load_irasim(source)
+        tensors = to_public(config, params)
+        write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
+        return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]
+    holders = ("ema", *HOLDERS) if weights == "ema" else HOLDERS
+    tensors, metadata, names, others, key = read_tensors(source, holders)
+    lacking = ", as it has no ema" if weights == "ema" and key != "ema" else ""
+    own = exported_config(Architecture, source, metadata, METADATA)
+    config, params, aside = from_public(source, tensors, own, heads, names)
+    replaces = REPLACES * save(out, config, params)
+    return [
+        f"{out}: an IRASim of {len(tensors) - aside} tensors, {config}{replaces}",
+        *([f"read from the file's key {key}{lacking}"] if key else []),
+        *left_aside({"fixed positions, which the network computes": aside}, others),
+    ]

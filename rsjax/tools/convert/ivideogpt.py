@@ -21,9 +21,16 @@ from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import Inputs, read_model, saved_inputs
 from rsjax.tokenizers.conditional_vq import ConditionalVQ
-from rsjax.tools.convert.commands import REPLACES, check_file
 from rsjax.tools.convert.directory import Part, save_part, saved_part
-from rsjax.tools.convert.files import ConvertError, Tensors, left_aside, read_tensors, write_safetensors
+from rsjax.tools.convert.files import (
+    REPLACES,
+    ConvertError,
+    Tensors,
+    check_file,
+    left_aside,
+    read_tensors,
+    write_safetensors,
+)
 from rsjax.tools.convert.table import (
     SAME_NAMES,
     Entry,
@@ -32,9 +39,9 @@ from rsjax.tools.convert.table import (
     shape_of,
     to_params,
     to_tensors,
+    vae_table,
     weight_and_bias,
 )
-from rsjax.tools.convert.vae_names import vae_table
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights
 

@@ -6,6 +6,7 @@ reveal this factor: older autoencoders of the same shapes have another one.
 
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,12 +15,23 @@ import numpy as np
 from rsjax.config import ConfigError, KLConfig
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
 from rsjax.progress import note
-from rsjax.tools.convert.files import ConvertError, Tensors, check_type, setting
-from rsjax.tools.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors
-from rsjax.tools.convert.vae_names import vae_table
+from rsjax.tools.convert.directory import load_kl_autoencoder, save
+from rsjax.tools.convert.files import (
+    REPLACES,
+    SETTINGS,
+    ConvertError,
+    Tensors,
+    check_file,
+    check_type,
+    left_aside,
+    published_settings,
+    read_tensors,
+    setting,
+    write_published,
+)
+from rsjax.tools.convert.table import SAME_NAMES, Names, Table, shape_of, to_params, to_tensors, vae_table
 from rsjax.trainable import Params
 
-CONFIG = "config.json"
 CLASS = "AutoencoderKL"
 # The names of the attention layers in older files.
 OLDER = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
@@ -95,7 +107,7 @@ def from_public(
     )
     config = infer_config(source, tensors, settings, names)
     factor, shift = setting(source, settings, "scaling_factor", SDXL_FACTOR), settings.get("shift_factor") or 0.0
-    check_type(f"{source}: its {CONFIG}", "shift_factor", shift, 0.0)
+    check_type(f"{source}: its {SETTINGS}", "shift_factor", shift, 0.0)
     if factor != SDXL_FACTOR:
         note(f"{source}: its latents have the factor {factor:g}; the public IRASim needs SDXL's, {SDXL_FACTOR:g}")
     fixed = {"mean": shift, "log_deviation": -math.log(factor)}
@@ -137,3 +149,26 @@ def _renamed(name: str) -> str:
 def _flat(name: str, x: np.ndarray) -> np.ndarray:
     """Returns attention weights as matrices; some files store them as 1×1 convolutions."""
     return x[..., 0, 0] if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1) else x
+
+
+def convert(source: Path, out: Path) -> list[str]:
+    """Imports SDXL's autoencoder into a directory, or exports a directory's autoencoder to a safetensors file.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        replaces = check_file(out)
+        tensors, settings = to_public(*load_kl_autoencoder(source))
+        write_published(out, tensors, settings)
+        text = f"under their public names; settings in {SETTINGS}{replaces}"
+        return [f"{out}: {len(tensors)} tensors of an autoencoder, {text}"]
+    tensors, _, names, others, _ = read_tensors(source)
+    settings = published_settings(source, CLASS)
+    config, params = from_public(source, tensors, settings, names)
+    replaces = REPLACES * save(out, config, params)
+    lines = [f"{out}: an autoencoder of {len(tensors)} tensors, {config}{replaces}", *left_aside(others)]
+    if "scaling_factor" not in settings:
+        known = SDXL_FACTOR
+        lines.append(f"no scaling_factor in a {SETTINGS} beside {source.name}: SDXL's {known} is taken")
+    return lines

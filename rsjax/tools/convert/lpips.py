@@ -6,9 +6,17 @@ state dict, or inside a tokenizer's training checkpoint.
 
 import re
 from collections.abc import Iterable
+from pathlib import Path
 
 from rsjax.tokenizers.lpips import NETS, lpips_shapes
-from rsjax.tools.convert.files import ConvertError, Tensors
+from rsjax.tools.convert.files import (
+    ConvertError,
+    Tensors,
+    check_file,
+    left_aside,
+    read_tensors,
+    write_safetensors,
+)
 from rsjax.tools.convert.table import SAME_NAMES, Names, check
 
 _WITHIN = r"(?:loss\.perceptual_loss\.)?"  # the prefix in a tokenizer's checkpoint
@@ -57,3 +65,26 @@ def from_public(source: object, tensors: Tensors, names: Names = SAME_NAMES) -> 
 
 def _backbone(names: Iterable[str]) -> set[str]:
     return {name for name in names if name.startswith("backbone.")}
+
+
+def convert(sources: list[Path], out: Path) -> list[str]:
+    """Converts LPIPS's backbone and heads from one or two public files to one file.
+
+    Raises:
+        UserError: the files cannot be read or do not fit, or ``out`` cannot be written.
+    """
+    replaces = check_file(out)
+    merged: Tensors = {}
+    names: dict[str, str] = {}
+    aside = 0
+    for source in sources:
+        tensors, _, own, others, _ = read_tensors(source)
+        if twice := merged.keys() & tensors.keys():
+            raise ConvertError(f"{source}: {own[min(twice)]} is also in an earlier file; pass each part once")
+        merged |= tensors
+        names |= own
+        aside += sum(others.values())
+    net, weights = from_public(", ".join(map(str, sources)), merged, names)
+    write_safetensors(out, weights, {"net": net})
+    lines = left_aside({"other layers or networks": aside + len(merged) - len(weights)})
+    return [f"{out}: LPIPS with {net}, {len(weights)} tensors{replaces}", *lines]

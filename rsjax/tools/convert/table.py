@@ -4,7 +4,8 @@ A table has one :class:`Entry` per public tensor. Reading uses every tensor exac
 exactly once; one error names everything that does not fit.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import dtypes
 
 from rsjax.tools.convert.files import ConvertError, Tensors
+from rsjax.trainable import Params
 
 Layout = Literal["same", "linear", "conv", "lead", "conv3d", "linear3d"]
 Shape = tuple[int, ...]
@@ -31,6 +33,15 @@ LAYOUTS: dict[Layout, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.nda
     "linear3d": (lambda x: x[..., 0, 0, 0].T, lambda x: x.T[..., None, None, None]),  # a 1×1×1 convolution
 }
 NAMED = 8  # names of each kind that an error lists; the others are only counted
+_DIFFUSERS_PARTS = (
+    (r"(down|up)_(\d+)_block_(\d+)", r"\1_blocks.\2.resnets.\3"),
+    (r"(down|up)_(\d+)_(down|up)sample", r"\1_blocks.\2.\3samplers.0"),
+    (r"mid_block_(\d)", r"mid_block.resnets.\1"),
+    (r"mid_attention", "mid_block.attentions.0"),
+    (r"to_out", "to_out.0"),
+    (r"\bnorm_out", "conv_norm_out"),
+    (r"\b(kernel|scale)$", "weight"),
+)
 
 
 @dataclass(frozen=True)
@@ -168,3 +179,30 @@ def _some(names: Iterable[str]) -> str:
     listed = sorted(names)
     more = f" and {len(listed) - NAMED} more" if len(listed) > NAMED else ""
     return ", ".join(listed[:NAMED]) + more
+
+
+def vae_table(shapes: Params, more: Sequence[tuple[str, str]] = ()) -> Table:
+    """Returns an entry for each parameter of :mod:`rsjax.tokenizers.vae_blocks`, under ``diffusers``' names.
+
+    Args:
+        shapes: the parameters' shapes.
+        more: further (regular expression for a part of a dotted path, its replacement), which are applied first.
+    """
+    return renamed_table(shapes, (*more, *_DIFFUSERS_PARTS), {2: "linear", 4: "conv"})
+
+
+def renamed_table(shapes: Params, parts: Sequence[tuple[str, str]], layouts: Mapping[int, Layout]) -> Table:
+    """Returns an entry for each parameter, whose public name is its dotted path after all replacements.
+
+    Args:
+        shapes: the parameters' shapes.
+        parts: pairs of a regular expression for a part of a dotted path and its replacement, applied in order.
+        layouts: the layout of kernels by their number of axes.
+    """
+    entries = []
+    for path, x in flatten_dict(shapes, sep="/").items():
+        key = path.replace("/", ".")
+        for own, public in parts:
+            key = re.sub(own, public, key)
+        entries.append(Entry(key, path, layouts[x.ndim] if path.endswith("kernel") else "same"))
+    return tuple(entries)

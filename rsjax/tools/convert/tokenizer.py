@@ -4,19 +4,40 @@ A public file holds ``encoder.*`` and ``decoder.*``, their exponential moving av
 dots removed from the names), and the networks of the training losses.
 """
 
+import json
 from collections import Counter
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
 
-from rsjax.config import ConfigError, TokenizerConfig
+from rsjax.config import ConfigError, TokenizerConfig, to_dict
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.tools.convert.files import ConvertError, Tensors
-from rsjax.tools.convert.table import SAME_NAMES, Entry, Names, Table, norm, shape_of, to_params, weight_and_bias
+from rsjax.tools.convert.directory import load_tokenizer, save
+from rsjax.tools.convert.files import (
+    REPLACES,
+    ConvertError,
+    Tensors,
+    check_file,
+    exported_config,
+    left_aside,
+    read_tensors,
+    write_safetensors,
+)
+from rsjax.tools.convert.table import (
+    SAME_NAMES,
+    Entry,
+    Names,
+    Table,
+    norm,
+    shape_of,
+    to_params,
+    to_tensors,
+    weight_and_bias,
+)
 
 Weights = Literal["raw", "ema"]
-
-
+METADATA = "rsjax.tokenizer"  # key of the configuration in the metadata of an exported file
 # Prefixes of the tensors to ignore.
 IGNORED: dict[Weights, tuple[str, ...]] = {
     "raw": ("loss.", "model_ema."),
@@ -149,3 +170,23 @@ def from_public(
     shapes = jax.eval_shape(Tokenizer(config).init_params, jax.random.key(0))
     public = {own: names.get(key, key) for key, own in keys.items()}
     return config, to_params(source, kept, entries, shapes, dict(names) | public), aside
+
+
+def convert(source: Path, out: Path, weights: Weights) -> list[str]:
+    """Imports a public tokenizer into a directory, or exports a directory's tokenizer to a safetensors file.
+
+    Raises:
+        UserError: the source cannot be read or does not fit, or ``out`` cannot be written.
+    """
+    if source.is_dir():
+        replaces = check_file(out)
+        config, params = load_tokenizer(source)
+        tensors = to_tensors(params, table(config))
+        write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
+        return [f"{out}: {len(tensors)} tensors of a tokenizer, under their public names{replaces}"]
+    tensors, metadata, names, others, _ = read_tensors(source)
+    own = exported_config(TokenizerConfig, source, metadata, METADATA)
+    config, params, aside = from_public(source, tensors, weights, own, names)
+    replaces = REPLACES * save(out, config, params)
+    used = len(tensors) - aside.total()
+    return [f"{out}: a tokenizer of {used} {weights} tensors, {config}{replaces}", *left_aside(aside, others)]

@@ -21,9 +21,14 @@ from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.files import disk_guard, making, replace_directory
 from rsjax.progress import note
-from rsjax.tools.export.lerobot_layouts import Episode, LayoutV21, LayoutV30
-from rsjax.tools.export.lerobot_meta import describe_features
-from rsjax.tools.export.lerobot_video import VideoSettings, video_rate
+from rsjax.tools.export.lerobot_files import (
+    LayoutV21,
+    LayoutV30,
+    LeRobotEpisode,
+    VideoSettings,
+    describe_features,
+    video_rate,
+)
 
 LAYOUTS: dict[str, type[LayoutV30 | LayoutV21]] = {"v3.0": LayoutV30, "v2.1": LayoutV21}
 CONTROLS = ("delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper")  # of simulated Lift
@@ -157,10 +162,10 @@ def _names(store: Store, width: int) -> list[str]:
     return [f"action_{number}" for number in range(width)]
 
 
-def _episode(clip: Record, features: dict[str, Any], state: str) -> Episode:
+def _episode(clip: Record, features: dict[str, Any], state: str) -> LeRobotEpisode:
     actions = clip["actions"]
     columns: dict[str, Float32[np.ndarray, "T D"]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
     if "observation.state" in features:
         zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
         columns["observation.state"] = actions if state == "command" else zeros
-    return Episode(clip["rgb"], columns, str(clip["task"]))
+    return LeRobotEpisode(clip["rgb"], columns, str(clip["task"]))

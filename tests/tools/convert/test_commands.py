@@ -12,7 +12,7 @@ import pytest
 
 from experiments.convert import main
 from rsjax.tokenizers.lpips import load_lpips
-from rsjax.tools.convert import commands
+from rsjax.tools.convert import files
 from rsjax.tools.convert.directory import load_tokenizer, load_world_model, save
 from rsjax.tools.convert.files import read_tensors, write_safetensors
 from tests.tools.convert.public import Tensors, genie_shapes, random_tensors, tokenizer_shapes
@@ -120,7 +120,7 @@ def test_an_export_that_stops_leaves_no_settings(tmp_path: Path, monkeypatch: py
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "write_safetensors", stop)
+    monkeypatch.setattr(files, "write_safetensors", stop)
     monkeypatch.setattr("rsjax.command.exit_now", sys.exit)  # which would end the tests
     with pytest.raises(SystemExit) as stopped:
         convert("genie", tmp_path / "own", tmp_path / "out" / "x.safetensors")

@@ -16,7 +16,7 @@ import rsjax
 from rsjax.data.merge import merge
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
-from rsjax.tools.export import lerobot_layouts
+from rsjax.tools.export import lerobot_files
 from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.options import IngestOptions, make_plan
@@ -95,9 +95,9 @@ def test_ingested_again_the_clips_are_the_same(tmp_path: Path, version: Any) -> 
 def test_large_data_sets_fill_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = toy_store(tmp_path / "store", 5)
     for name in ("DATA_MEGABYTES", "VIDEO_MEGABYTES"):
-        monkeypatch.setattr(lerobot_layouts, name, 0)
+        monkeypatch.setattr(lerobot_files, name, 0)
     for name, value in (("CHUNK", 2), ("BUFFERED", 2)):
-        monkeypatch.setattr(lerobot_layouts, name, value)
+        monkeypatch.setattr(lerobot_files, name, value)
     export_lerobot(store, tmp_path / "out", LeRobotOptions(codec="h264"))
     assert len(list((tmp_path / "out").glob("data/chunk-*/*"))) == 4
     assert (tmp_path / "out/data/chunk-001/file-001.parquet").exists()
