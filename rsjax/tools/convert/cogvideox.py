@@ -192,11 +192,13 @@ def infer_transformer(
     def shape(key: str, axes: int) -> tuple[int, ...]:
         return shape_of(source, tensors, key, axes, names)
 
-    (width, inputs, patch, _), text = shape("patch_embed.proj.weight", 4), shape("patch_embed.text_proj.weight", 2)[1]
+    (width, inputs, patch, _) = shape("patch_embed.proj.weight", 4)
+    text = shape("patch_embed.text_proj.weight", 2)[1]
     channels = shape("proj_out.weight", 2)[0] // patch**2
     head = shape("transformer_blocks.0.attn1.norm_q.weight", 1)[0]
     read = partial(setting, source, settings)
-    tokens, learned = read("max_text_seq_length", 226), tuple[int, ...]()
+    tokens = read("max_text_seq_length", 226)
+    learned = tuple[int, ...]()
     rotary = read("use_rotary_positional_embeddings", width != WIDTH_2B)
     if read("use_learned_positional_embeddings", rotary) and "patch_embed.pos_embedding" in tensors:
         sides = (read("sample_height", 60), read("sample_width", 90))
@@ -228,7 +230,8 @@ def autoencoder_settings(config: CausalVAEConfig, params: Params) -> dict[str, A
     Raises:
         ConvertError: the public format cannot express the network or its latents' statistics.
     """
-    mean, deviation = np.asarray(params["latents"]["mean"]), np.exp(params["latents"]["log_deviation"])
+    mean = np.asarray(params["latents"]["mean"])
+    deviation = np.exp(params["latents"]["log_deviation"])
     if config.patch_size > 1 or np.any(mean) or np.ptp(deviation) > 0:
         raise ConvertError(
             "the public format has neither model.autoencoder.patch_size above 1 nor means and factors of single latent "
@@ -249,7 +252,8 @@ def autoencoder_settings(config: CausalVAEConfig, params: Params) -> dict[str, A
 
 def transformer_settings(config: CogVideoXConfig) -> dict[str, Any]:
     """Returns the settings to write beside an exported transformer."""
-    channels, learned = config.autoencoder.latent_channels, config.learned_positions
+    channels = config.autoencoder.latent_channels
+    learned = config.learned_positions
     settings = {
         "_class_name": CLASSES["world_model"],
         "num_attention_heads": config.heads,
@@ -284,7 +288,8 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     if source.is_dir():
         return [_export(source, out, part)]
     tensors, _, names, others, _ = _read(source)
-    settings, vae = published_settings(source, *CLASSES.values()), is_autoencoder(source, tensors)
+    settings = published_settings(source, *CLASSES.values())
+    vae = is_autoencoder(source, tensors)
     part, other = PARTS if vae else PARTS[::-1]
     if settings.get("_class_name", CLASSES[part]) != CLASSES[part]:
         raise ConvertError(f"{source}: is no {settings['_class_name']}, as {SETTINGS} beside it says")
@@ -303,7 +308,8 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
         lines = [f"{out}: a transformer of {len(tensors) - aside} tensors, {model}"]
         lines += left_aside({"fixed positions, which the network computes": aside}, others)
     if before and before.autoencoder.latent_channels != network.latent_channels:
-        there, here = before.autoencoder.latent_channels, network.latent_channels
+        there = before.autoencoder.latent_channels
+        here = network.latent_channels
         raise ConvertError(f"{out}: holds a part with {there} latent channels, this one has {here}; choose another OUT")
     lines[0] += REPLACES * save_part(out, part, model, inputs, params)
     return lines
@@ -321,7 +327,8 @@ def _read(source: Path) -> TensorFile:
 
 
 def _export(source: Path, out: Path, part: Part | None) -> str:
-    replaces, parts = check_file(out), [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
+    replaces = check_file(out)
+    parts = [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
     if part not in parts and len(parts) != 1:
         raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of a CogVideoX'}; name one with --part")
     part = part if part in parts else parts[0]
@@ -334,7 +341,8 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
         entries = autoencoder_table(params)
     else:
         params = load_weights(source / part / "weights", shapes(saved_architecture(model)))
-        settings, entries = transformer_settings(model), transformer_table(model)
+        settings = transformer_settings(model)
+        entries = transformer_table(model)
     tensors = to_tensors(params, entries)
     write_published(out, tensors, settings)
     text = f"under their public names; settings in {SETTINGS}{replaces}"
@@ -374,7 +382,8 @@ def embed_texts(source: Path, out: Path, tasks: Sequence[str], store: Path | Non
         encoder = transformers.T5EncoderModel.from_pretrained(source / "text_encoder", use_safetensors=True, **local)
     except Exception as error:  # transformers raises many types for missing and damaged files
         raise ConvertError(f"{source}: holds no T5 encoder with its tokenizer ({first_line(error)})") from error
-    made, fixed = [], {"padding": "max_length", "max_length": tokens, "truncation": True, "return_tensors": "pt"}
+    made = []
+    fixed = {"padding": "max_length", "max_length": tokens, "truncation": True, "return_tensors": "pt"}
     with torch.no_grad():
         for name in names:
             made.append(encoder.eval()(tokenizer(name, **fixed).input_ids)[0].float().numpy())

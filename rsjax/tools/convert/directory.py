@@ -42,7 +42,8 @@ def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | di
         ConvertError: the directory is a run's, so its weights were trained there.
         FileError: the disk is full.
     """
-    (section, place), path = SECTIONS[type(config)], directory / "config.json"
+    (section, place) = SECTIONS[type(config)]
+    path = directory / "config.json"
     settings = read_json(path) if path.exists() else {}
     if settings.keys() - {name for name, _ in SECTIONS.values()}:
         raise ConvertError(f"{directory}: is a run directory; choose another one")

@@ -256,7 +256,8 @@ def setting(source: object, settings: dict[str, Any], name: str, default: S) -> 
     Raises:
         ConvertError: it is not of its default's type, or a number that is not above 0.
     """
-    value, where = settings.get(name), f"{source}: its config.json"
+    value = settings.get(name)
+    where = f"{source}: its config.json"
     check_type(where, name, value, default)
     if value is None:
         return default

@@ -61,7 +61,8 @@ def table(config: Architecture) -> Table:
     for k in range(config.vocabularies):
         entries.append(Entry(f"token_embed.factored_embeds.{k}.weight", f"rgb_embed/factored_embed_{k}/embedding"))
     for i in range(config.blocks):
-        layer, path = f"decoder.layers.{i}", "blocks/rgb"
+        layer = f"decoder.layers.{i}"
+        path = "blocks/rgb"
         if not config.qk_norm:
             entries += norm(f"{layer}.norm1", f"{path}/norm1", i) + norm(f"{layer}.norm2", f"{path}/norm2", i)
         for name in ("spatial_attn", "temporal_attn"):
@@ -111,11 +112,9 @@ def infer_config(
         return shape_of(source, tensors, key, axes, names)
 
     _check_types(source.parent / SETTINGS, settings)
-    position, first, hidden = (
-        "pos_embed_TSC",
-        "token_embed.factored_embeds.0.weight",
-        "decoder.layers.0.mlp.fc1.weight",
-    )
+    position = "pos_embed_TSC"
+    first = "token_embed.factored_embeds.0.weight"
+    hidden = "decoder.layers.0.mlp.fc1.weight"
     if not {position, first, hidden} <= tensors.keys():
         raise ConvertError(f"{source}: holds no weights of a Genie (STMaskGIT), such as pos_embed_TSC")
     _, frames, cells, width = shape(position, 4)
@@ -166,7 +165,8 @@ def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, An
     written = {name: value for name, value in settings.items() if value is not None}
     for name, only in FIXED.items():
         if written.get(name, only) != only:
-            given, known = json.dumps(written[name]), json.dumps(only)
+            given = json.dumps(written[name])
+            known = json.dumps(only)
             raise ConvertError(f"{path}: {name} {given} is not supported, only {known}")
     names = inferred.keys() & written.keys() - {"num_heads", "use_mup", "attn_drop", "mlp_drop"}
     wrong = [f"{n} is {written[n]}, not {x}" for n, x in inferred.items() if n in names and written[n] != x]

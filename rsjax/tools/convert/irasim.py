@@ -73,7 +73,8 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
     if not {"mask_emb_fn.weight", "x_embedder.proj.weight"} <= tensors.keys():
         raise ConvertError(f"{source}: holds no weights of an IRASim, such as mask_emb_fn.weight")
     width, channels, patch, _ = shape("x_embedder.proj.weight", 4)
-    (_, cells, _), (_, frames, _) = shape("pos_embed", 3), shape("temp_embed", 3)
+    (_, cells, _) = shape("pos_embed", 3)
+    (_, frames, _) = shape("temp_embed", 3)
     linear = "embed_arm_state.weight" in tensors
     inputs = shape("embed_arm_state.weight" if linear else "embed_state.fc1.weight", 2)[1]
     # Frame-Ada reads one action at a time; Video-Ada reads all (frames - 1) actions of a clip.
@@ -125,7 +126,8 @@ def from_public(
 
 def to_public(config: Architecture, params: Params) -> Tensors:
     """Returns the tensors of a public file, including the fixed positions."""
-    space, time = grid_positions(*config.grid, config.width), positions(config.frames, config.width)
+    space = grid_positions(*config.grid, config.width)
+    time = positions(config.frames, config.width)
     return {"pos_embed": space[None], "temp_embed": time[None]} | to_tensors(params, table(config))
 
 

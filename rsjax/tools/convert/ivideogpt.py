@@ -173,16 +173,19 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
 
 
 def _export(source: Path, out: Path, part: Part | None) -> str:
-    replaces, parts = check_file(out), [p for p in PARTS if saved_part(source, IVideoGPTConfig, p)]
+    replaces = check_file(out)
+    parts = [p for p in PARTS if saved_part(source, IVideoGPTConfig, p)]
     if part not in parts and len(parts) != 1:
         raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of an iVideoGPT'}; name one with --part")
     part = part if part in parts else parts[0]
-    model, inputs = read_model(source, IVideoGPTConfig, part), saved_inputs(source)
+    model = read_model(source, IVideoGPTConfig, part)
+    inputs = saved_inputs(source)
     if part == "tokenizer":
         shapes = tokenizer_shapes(model.autoencoder, inputs.image_size)
         entries = tokenizer_table(shapes)
     else:
-        shapes, entries = _llama_shapes(model, inputs.action_dim), llama_table(model)
+        shapes = _llama_shapes(model, inputs.action_dim)
+        entries = llama_table(model)
     tensors = to_tensors(load_weights(source / part / "weights", shapes), entries)
     write_safetensors(out, tensors, {METADATA: json.dumps({"model": to_dict(model), "inputs": inputs._asdict()})})
     return f"{out}: {len(tensors)} tensors of iVideoGPT's {part}, under their public names{replaces}"
@@ -228,7 +231,8 @@ def llama_table(config: IVideoGPTConfig) -> Table:
             entries.append(Entry(f"{layer}.{name}.weight", f"blocks/{name}/scale", layer=i))
         for part, names in (("self_attn", "qkvo"), ("mlp", ("gate", "up", "down"))):
             for name in names:
-                key, path = f"{layer}.{part}.{name}_proj.weight", f"blocks/{name}_proj/kernel"
+                key = f"{layer}.{part}.{name}_proj.weight"
+                path = f"blocks/{name}_proj/kernel"
                 entries.append(Entry(key, path, "linear", i))
     if config.use_actions:
         entries += weight_and_bias("action_linear", "action_linear", "linear")
@@ -249,7 +253,8 @@ def infer_llama(
     """
     use_actions = "action_linear.weight" in tensors
     under = "llm." if use_actions else ""
-    layer, embedding = f"{under}model.layers.{{}}.self_attn.q_proj.weight", f"{under}model.embed_tokens.weight"
+    layer = f"{under}model.layers.{{}}.self_attn.q_proj.weight"
+    embedding = f"{under}model.embed_tokens.weight"
     if not {layer.format(0), embedding} <= tensors.keys():
         raise ConvertError(f"{source}: holds no LLaMA of iVideoGPT, such as {layer.format(0)}")
     vocabulary, width = shape_of(source, tensors, embedding, 2, names)

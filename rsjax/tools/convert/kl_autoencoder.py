@@ -69,7 +69,8 @@ def infer_config(source: object, tensors: Tensors, settings: dict[str, Any], nam
         tensors
     ):
         raise ConvertError(f"{source}: holds no {CLASS} of diffusers, such as SDXL's, with a tensor quant_conv.weight")
-    channels, z = width("encoder.conv_in"), width("post_quant_conv")
+    channels = width("encoder.conv_in")
+    z = width("post_quant_conv")
     first = re.compile(r"encoder\.down_blocks\.(\d+)\.resnets\.(\d+)\.conv1\.weight")
     places = [(int(match[1]), int(match[2])) for match in map(first.fullmatch, tensors) if match]
     levels, blocks = (max(column) + 1 for column in zip(*places, strict=True))
@@ -101,12 +102,11 @@ def from_public(
             or the settings are not numbers.
     """
     own = {_renamed(name): name for name in tensors}
-    tensors, names = (
-        {new: _flat(new, tensors[old]) for new, old in own.items()},
-        {n: names.get(o, o) for n, o in own.items()},
-    )
+    tensors = {new: _flat(new, tensors[old]) for new, old in own.items()}
+    names = {n: names.get(o, o) for n, o in own.items()}
     config = infer_config(source, tensors, settings, names)
-    factor, shift = setting(source, settings, "scaling_factor", SDXL_FACTOR), settings.get("shift_factor") or 0.0
+    factor = setting(source, settings, "scaling_factor", SDXL_FACTOR)
+    shift = settings.get("shift_factor") or 0.0
     check_type(f"{source}: its {SETTINGS}", "shift_factor", shift, 0.0)
     if factor != SDXL_FACTOR:
         note(f"{source}: its latents have the factor {factor:g}; the public IRASim needs SDXL's, {SDXL_FACTOR:g}")
@@ -124,7 +124,8 @@ def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]
     """
     networks = {name: params[name] for name in ("encoder", "decoder")}
     tensors = to_tensors(networks, table(config))
-    mean, deviation = np.asarray(params["latents"]["mean"]), np.exp(params["latents"]["log_deviation"])
+    mean = np.asarray(params["latents"]["mean"])
+    deviation = np.exp(params["latents"]["log_deviation"])
     if np.ptp(mean) > 0 or np.ptp(deviation) > 0:
         raise ConvertError(
             "the public format has one factor for all latent channels; this autoencoder has one for each"

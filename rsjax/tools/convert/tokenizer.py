@@ -70,7 +70,8 @@ def table(config: TokenizerConfig) -> Table:
     for level in reversed(levels):
         place = f"decoder.up.{level}"
         if config.adaptive_norm:
-            key, path = f"decoder.adaptive.{level}", f"decoder/adaptive_{level}"
+            key = f"decoder.adaptive.{level}"
+            path = f"decoder/adaptive_{level}"
             for name in ("gamma", "beta"):
                 entries += weight_and_bias(f"{key}.{name}", f"{path}/{name}", "linear")
         entries += _blocks(f"{place}.block", f"decoder/up_{level}_block", config.res_blocks, width, widths[level])
@@ -111,14 +112,16 @@ def infer_config(source: object, tensors: Tensors, weights: Weights, names: Name
             n += 1
         return n
 
-    levels, blocks = count("encoder.down.{}.block.0.conv1.weight"), count("encoder.down.0.block.{}.conv1.weight")
+    levels = count("encoder.down.{}.block.0.conv1.weight")
+    blocks = count("encoder.down.0.block.{}.conv1.weight")
     if not (has("encoder.conv_in.weight") and has("encoder.conv_out.weight") and levels):
         kind, cure = ("averaged (ema) ", "; try --weights raw") if weights == "ema" else ("", "")
         raise ConvertError(
             f"{source}: holds no {kind}weights of a MAGVIT-2 tokenizer, such as "
             f"{public_name('encoder.conv_in.weight', weights)}{cure}"
         )
-    (channels, colors), bits = shape("encoder.conv_in.weight")[:2], shape("encoder.conv_out.weight")[0]
+    (channels, colors) = shape("encoder.conv_in.weight")[:2]
+    bits = shape("encoder.conv_out.weight")[0]
     patch = round((colors / 3) ** 0.5)
     widths = [shape(f"encoder.down.{level}.block.0.conv1.weight")[0] for level in range(levels)]
     try:

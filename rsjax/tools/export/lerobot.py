@@ -99,7 +99,9 @@ def export_lerobot(
 
 def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[int, int], None]) -> dict[str, Any]:
     names = store.splits if options.split == "all" else (options.split,)
-    total, layout, splits = sum(len(store.source(name)) for name in names), None, {}
+    total = sum(len(store.source(name)) for name in names)
+    layout = None
+    splits = {}
     cameras: dict[str, None] = {}
     for name in names:
         begins = layout.episodes if layout else 0

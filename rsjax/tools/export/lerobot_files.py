@@ -29,7 +29,8 @@ COUNTERS = {
     "task_index": "int64",
 }
 CHUNK = 1000  # episodes (v2.1) or files (v3.0) in a folder
-DATA_MEGABYTES, VIDEO_MEGABYTES = 100, 200  # sizes after which v3.0 begins another file
+DATA_MEGABYTES = 100  # size after which v3.0 begins another table
+VIDEO_MEGABYTES = 200  # size after which v3.0 begins another video
 BUFFERED = 1000  # episodes whose metadata are written together
 
 
@@ -120,7 +121,8 @@ def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
     """
     arrays: dict[str, pa.Array] = {}
     for name, values in columns.items():
-        flat, width = pa.array(np.ascontiguousarray(values).reshape(-1)), values.size // len(values)
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+        width = values.size // len(values)
         arrays[name] = pa.FixedSizeListArray.from_arrays(flat, width) if width > 1 else flat
     return pa.table(arrays)
 
@@ -205,7 +207,9 @@ class _Layout(ABC):
     video_path: str
 
     def __init__(self, root: Path, video: VideoSettings, features: dict[str, dict[str, Any]]) -> None:
-        self.root, self.video, self.features = root, video, features
+        self.root = root
+        self.video = video
+        self.features = features
         self.camera = next(name for name, feature in features.items() if feature["dtype"] == "video")
         self.episodes = self.rows = 0
         self.tasks: dict[str, int] = {}
@@ -228,7 +232,8 @@ class _Layout(ABC):
         stats = {self.camera: picture_stats(episode.rgb)}
         stats |= {name: column_stats(values) for name, values in columns.items()}
         self._write(episode, rows_table(columns), stats)
-        self.episodes, self.rows = self.episodes + 1, self.rows + count
+        self.episodes = self.episodes + 1
+        self.rows = self.rows + count
 
     def finish(self, info: dict[str, Any]) -> dict[str, Any]:
         """Completes all files, writes ``info.json`` and returns its content."""
@@ -291,7 +296,8 @@ class LayoutV30(_Layout):
 
     def __init__(self, root: Path, video: VideoSettings, features: dict[str, dict[str, Any]]) -> None:
         super().__init__(root, video, features)
-        self._data, self._meta = _Tables(root, self.data_path), _Tables(root, self.meta_path)
+        self._data = _Tables(root, self.data_path)
+        self._meta = _Tables(root, self.meta_path)
         self._file: VideoFile | None = None
         self._files = 0  # videos that are complete
         self._stats: Stats = {}
@@ -327,7 +333,8 @@ class LayoutV30(_Layout):
     def _close_video(self) -> None:
         if self._file is not None:
             self._file.close()
-            self._file, self._files = None, self._files + 1
+            self._file = None
+            self._files += 1
 
     def _finish(self) -> dict[str, Any]:
         if self._buffer:
@@ -344,7 +351,8 @@ class _Tables:
     """Parquet files to which tables are appended; after :data:`DATA_MEGABYTES` another file begins."""
 
     def __init__(self, root: Path, template: str) -> None:
-        self._root, self._template = root, template
+        self._root = root
+        self._template = template
         self._writer: pq.ParquetWriter | None = None
         self._number = self._bytes = 0
 
@@ -352,7 +360,8 @@ class _Tables:
         """Returns the chunk and file that the next table goes to."""
         if self._bytes and self._bytes >= DATA_MEGABYTES * 2**20:
             self.close()
-            self._number, self._bytes = self._number + 1, 0
+            self._number = self._number + 1
+            self._bytes = 0
         return _place(self._number)
 
     def add(self, table: pa.Table) -> None:

@@ -233,7 +233,10 @@ def _shorter_way(turn: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4
 
 def _product(left: Float64[np.ndarray, "*N 4"], right: Float64[np.ndarray, "*N 4"]) -> Float64[np.ndarray, "*N 4"]:
     """Multiplies quaternions x y z w (Hamilton's product)."""
-    vector_l, vector_r, w_l, w_r = left[..., :3], right[..., :3], left[..., 3:], right[..., 3:]
+    vector_l = left[..., :3]
+    vector_r = right[..., :3]
+    w_l = left[..., 3:]
+    w_r = right[..., 3:]
     vector = w_l * vector_r + w_r * vector_l + np.cross(vector_l, vector_r)
     return np.concatenate([vector, w_l * w_r - np.sum(vector_l * vector_r, -1, keepdims=True)], -1)
 
@@ -283,7 +286,8 @@ def _no_steps(
     for place, values in enumerate(rows.T):
         if place in known or not values.any():
             continue
-        distinct, reach = np.unique(values), np.abs(values)
+        distinct = np.unique(values)
+        reach = np.abs(values)
         why = ""
         if np.isin(distinct, (0, 1)).all() or np.isin(distinct, (-1, 1)).all():
             why = f"is never anything but {' or '.join(f'{value:g}' for value in distinct)}"

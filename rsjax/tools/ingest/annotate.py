@@ -216,7 +216,8 @@ class StoredDepths:
     """
 
     def __init__(self, records: Source, episode: Episode) -> None:
-        self._records, self._episode = FrameRecords(records), episode
+        self._records = FrameRecords(records)
+        self._episode = episode
         self.unit = str(records[0]["unit"])
 
     def __len__(self) -> int:
@@ -237,14 +238,17 @@ class FrameRecords:
     """Records of consecutive frames, of depth or tracks. The last record read is kept, since windows come in order."""
 
     def __init__(self, records: Source) -> None:
-        self._records, self._number, self._current = records, -1, Record()
+        self._records = records
+        self._number = -1
+        self._current = Record()
 
     def with_frames(self, first: int, last: int) -> Record | None:
         """Returns the record that contains these two frames and all between them; None if there is none."""
         begin = max(0, self._number)
         for number in [*range(begin, len(self._records)), *range(begin)]:
             if number != self._number:
-                self._number, self._current = number, self._records[number]
+                self._number = number
+                self._current = self._records[number]
             record = self._current
             length = len(record["depth"]) if "depth" in record else record["points"].shape[1]
             if record["first"] <= first and last < record["first"] + length:

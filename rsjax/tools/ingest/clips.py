@@ -111,7 +111,8 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     Raises:
         EpisodeError: there is no such camera, or pictures, depth or annotations cannot be read or do not fit.
     """
-    episode, windows = annotated.episode, config.windows
+    episode = annotated.episode
+    windows = config.windows
     camera = camera_of(episode, config.camera)
     spans = cut_spans(len(episode.timestamps), annotated.shots, annotated.segments, windows)
     index = index_windows(episode.timestamps, episode.fps, spans, windows)
@@ -129,7 +130,9 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     depths, unit = _depths(annotated, camera, config, pictures)
     stored = None if annotated.tracks is None else FrameRecords(annotated.tracks)
     statistics: Statistics | None = None
-    near, far, succeeded = np.inf, 0.0, 0
+    near = np.inf
+    far = 0.0
+    succeeded = 0
     for number in np.flatnonzero(np.array(reasons) == "").tolist():
         frames = index.frames[number]
         if stacked and (np.diff(frames) != stacked).any():
@@ -145,7 +148,8 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         rows = Statistics.of(actions[1:])
         statistics = statistics.merged(rows) if statistics else rows
         if depth is not None:
-            near, far = min(near, float(depth[depth > 0].min())), max(far, float(depth.max()))
+            near = min(near, float(depth[depth > 0].min()))
+            far = max(far, float(depth.max()))
         success = np.asarray(episode.meta.get("success", False), bool)  # one value per frame, or one for the episode
         success = success[frames] if success.ndim else np.full(len(frames), bool(success))
         succeeded += bool(success[-1])
@@ -268,7 +272,9 @@ class _Fitted:
         config: ClipConfig,
         pictures: "_Fitted | None" = None,
     ) -> None:
-        self._read, self._config, self._pictures = read, config, pictures
+        self._read = read
+        self._config = config
+        self._pictures = pictures
         self.placement: Placement | None = None
         self._kept: dict[int, np.ndarray] = {}
 

@@ -131,7 +131,8 @@ def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], 
     digest = None
     if first is not None:
         digest = hashlib.sha256(first.tobytes() + episode.actions.tobytes() + states.tobytes()).digest()
-    reach, jump = _largest(episode.actions[1:]), _largest(np.diff(states, axis=0))
+    reach = _largest(episode.actions[1:])
+    jump = _largest(np.diff(states, axis=0))
     stats = EpisodeStats(digest, tuple(episode.cameras), reach, jump)
     return [Finding(episode.id, kind, detail) for kind, detail in problems], stats
 
@@ -190,7 +191,8 @@ def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
     """
     found: list[int] = []
     for first in range(rows.shape[1] - 3 if len(rows) else 0):
-        free, part = not found or first >= found[-1] + 4, rows[:, first : first + 4]
+        free = not found or first >= found[-1] + 4
+        part = rows[:, first : first + 4]
         turns = (np.abs(part).max(1) < 1 - _TOLERANCE).any()
         if free and turns and (np.abs(np.linalg.norm(part, axis=1) - 1) < _TOLERANCE).all():
             found.append(first)
@@ -210,7 +212,10 @@ def _pictures(
     Args:
         moving: whether the robot moves, so that pictures should change.
     """
-    chosen, first, blank, changes = _sample(len(frames), wanted), None, [], False
+    chosen = _sample(len(frames), wanted)
+    first = None
+    blank = []
+    changes = False
     try:
         if isinstance(frames, VideoFrames) and (wrong := misread(frames.path)) is not None:
             return [("seeking", f"{name}: frame {wrong} is not that of decoding in order; {_REWRITE}")], first
@@ -377,9 +382,11 @@ def _check(source: EpisodeSource, limits: Thresholds, ref: EpisodeRef) -> Checke
         return ref, *check_episode(episode, limits), _mended(episode)
     except Exception as error:  # an error in one episode must not hide the others
         line = " ".join(str(error).split())
-        kind, detail = ("unreadable", f"{type(error).__name__}: {line}")
+        kind = "unreadable"
+        detail = f"{type(error).__name__}: {line}"
         if isinstance(error, EpisodeError):
-            kind, detail = error.kind, line
+            kind = error.kind
+            detail = line
         return ref, [Finding(ref.id, kind, detail)], None, ""
 
 
@@ -504,7 +511,8 @@ def select(source: EpisodeSource, path: Path) -> Selected:
         raise SourceError(f"{path}: not there; make it with experiments.doctor … --fix {path.name}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SourceError(f"{path}: not a list of experiments.doctor ({error}); make it again with --fix") from error
-    names, known = {name for name, _ in listed}, False
+    names = {name for name, _ in listed}
+    known = False
     for ref in source.episodes():
         known = known or ref.id in names
         if (ref.id, ref.fingerprint) in listed:

@@ -21,7 +21,8 @@ from jaxtyping import Float, Float32, UInt8
 from rsjax.errors import UserError
 from rsjax.files import placeholder, regular
 
-_WHOLE, _EDGE = 2**18, 2**13  # bytes: fingerprints read files of up to _WHOLE fully, and _EDGE at both ends of others
+_WHOLE = 2**18  # bytes up to which fingerprints read a file fully
+_EDGE = 2**13  # bytes that they read at both ends of a larger one
 MAX_PIXELS = 2**26  # of one picture: more is a damaged header, not a camera
 MAX_FPS = 10_000.0  # more is a mistake, not a camera
 FETCH_AGAIN = "fetch the file again or leave the episode out"

@@ -113,7 +113,8 @@ def is_up_to_date(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> bool:
     Raises:
         StoreError: something else is in the store's place, which must not be replaced.
     """
-    out, name = plan.out, plan.source.name
+    out = plan.out
+    name = plan.source.name
     if out.exists() and not (out / MANIFEST).exists():
         raise StoreError(f"{out}: exists and is not a store; move it away or choose another --out")
     try:
@@ -148,11 +149,16 @@ def limit_threads(count: int) -> None:
 
 def _run(plan: IngestPlan, refs: list[EpisodeRef], run: Runner, progress: Progress) -> dict[str, float]:
     """Runs the missing work items; returns ``this_run`` of :class:`IngestSummary`."""
-    began, episodes, items, clips = time.monotonic(), 0, 0, 0
+    began = time.monotonic()
+    episodes = 0
+    items = 0
+    clips = 0
 
     def settle(ref: EpisodeRef, ran: int, cut: int) -> None:
         nonlocal episodes, items, clips
-        episodes, items, clips = episodes + 1, items + ran, clips + cut
+        episodes = episodes + 1
+        items = items + ran
+        clips = clips + cut
         progress(episodes * len(plan.steps), count_steps(plan, refs))
 
     run(plan, refs, settle)

@@ -86,7 +86,8 @@ class IngestOptions:
         )
         if self.runner != "ray":
             for name in ("ray_address", "cpus", "gpus"):
-                flag, default = f"--{name.replace('_', '-')}", type(self).__dataclass_fields__[name].default
+                flag = f"--{name.replace('_', '-')}"
+                default = type(self).__dataclass_fields__[name].default
                 require(getattr(self, name) == default, f"{flag} is for Ray alone; add --runner ray or leave it out")
 
 
@@ -123,7 +124,8 @@ def make_plan(source: str, path: Path, options: IngestOptions) -> "IngestPlan":
     require(bool(out.name), f"--out is {options.out}; name a directory for the store")
     methods = {step: getattr(options, step) for step in ("shots", "motion", "depth", "tracks", "semantics")}
     recorded = choose_recorded(methods["depth"])
-    difficulties, scenes = parse_table("--difficulty", options.difficulty), parse_table("--scene", options.scene)
+    difficulties = parse_table("--difficulty", options.difficulty)
+    scenes = parse_table("--scene", options.scene)
     config = ClipConfig(
         options.windows,
         options.image_size,

@@ -207,7 +207,8 @@ class Placement:
         words = "" if height == width else f"{width} × {height} {_DONE[fit]}"
         if fit == "crop":
             side = min(height, width)
-            left, top = (width - side) // 2, (height - side) // 2
+            left = (width - side) // 2
+            top = (height - side) // 2
             return cls((width / side, height / side), (-left / side, -top / side), size, words)
         if fit == "pad":
             inner = [max(1, round(size * side / max(height, width))) for side in (width, height)]
@@ -224,7 +225,8 @@ class Placement:
         source: list[slice] = []
         target: list[slice] = []
         for axis, side in ((1, picture.shape[0]), (0, picture.shape[1])):  # rows are y
-            scale, offset = self.scale[axis], self.offset[axis]
+            scale = self.scale[axis]
+            offset = self.offset[axis]
             source.append(_pixels(-offset / scale, (1 - offset) / scale, side))
             target.append(_pixels(offset, offset + scale, self.size))
         method = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST_EXACT

@@ -129,8 +129,11 @@ class _Actors:
     """The actors of each step, and which of them are idle. An actor that dies is replaced."""
 
     def __init__(self, ray: Any, plan: IngestPlan, patience: float) -> None:
-        self._ray, self._plan, self._patience = ray, plan, patience
-        self._shared, self._class = ray.put(plan), ray.remote(max_restarts=0, max_task_retries=0)(_Actor)
+        self._ray = ray
+        self._plan = plan
+        self._patience = patience
+        self._shared = ray.put(plan)
+        self._class = ray.remote(max_restarts=0, max_task_retries=0)(_Actor)
         self._idle: dict[str, asyncio.Queue[Any]] = {step.name: asyncio.Queue() for step in plan.steps}
         self._actors: list[Any] = []
         self._starting: set[asyncio.Task[None]] = set()
@@ -155,7 +158,9 @@ class _Actors:
 
     async def _run_episode(self, ref: EpisodeRef) -> tuple[int, int]:
         """Does what :func:`rsjax.tools.ingest.work_items.run_episode` does, each step on an actor of its own."""
-        work, ran, clips = EpisodeWork(self._plan, ref), 0, 0
+        work = EpisodeWork(self._plan, ref)
+        ran = 0
+        clips = 0
         for step in self._plan.steps:
             mark = work.mark(step.name)
             if mark is None:
@@ -227,7 +232,8 @@ class _Actor:
     """One step's worker, in a process of the cluster."""
 
     def __init__(self, plan: IngestPlan, step: str) -> None:
-        self._plan, self._step = plan, next(each for each in plan.steps if each.name == step)
+        self._plan = plan
+        self._step = next(each for each in plan.steps if each.name == step)
         self._prepared: set[str] = set()
         limit_threads(max(1, math.ceil(self._step.cpus)))
 

@@ -87,7 +87,8 @@ def summarise(
     }
     done = clips = cut = 0
     for ref in refs:
-        work, last = EpisodeWork(plan, ref), Mark()
+        work = EpisodeWork(plan, ref)
+        last = Mark()
         for step in plan.steps:
             mark = work.mark(step.name)
             if mark is None:

@@ -72,10 +72,12 @@ def _scan(path: Path, size: int, modified: int) -> VideoIndex:
     """Scans a file; ``size`` and ``modified`` make the cache scan a changed file again."""
     with open_container(path) as container:
         stream = container.streams.video[0]
-        height, width = stream.codec_context.height, stream.codec_context.width
+        height = stream.codec_context.height
+        width = stream.codec_context.width
         if not 0 < height * width <= MAX_PIXELS:
             raise EpisodeError.at(path, f"its header says pictures of {width} × {height}", kind="undecodable")
-        promised, time_base = stream.frames, stream.time_base
+        promised = stream.frames
+        time_base = stream.time_base
         avi = _is_avi(container)
         reorders = stream.codec_context.codec.reorder and (avi or stream.codec_context.has_b_frames)
         packets = _packets(path, container)
@@ -208,7 +210,8 @@ class VideoFrames:
     """
 
     def __init__(self, path: Path, numbers: Int64[np.ndarray, " n"] | None = None) -> None:
-        self.path, self._numbers = Path(path), numbers
+        self.path = Path(path)
+        self._numbers = numbers
 
     def __len__(self) -> int:
         return len(scan(self.path).stamps) if self._numbers is None else len(self._numbers)
@@ -240,7 +243,8 @@ def misread(path: Path, count: int = 5) -> int | None:
     """
     index = scan(path)
     last = min(len(index.labels), _COMPARED) - 1
-    chosen, known = np.unique(np.linspace(0, last, count).astype(int)).tolist(), set(index.labels.tolist())
+    chosen = np.unique(np.linspace(0, last, count).astype(int)).tolist()
+    known = set(index.labels.tolist())
     sought = dict[int, UInt8[np.ndarray, "H W 3"]]()
     with contextlib.closing(_Decoder(path, index)) as decoder:
         for number in reversed(chosen):  # in this order each read seeks
@@ -295,7 +299,8 @@ def _set_aside() -> None:
     """
     global _decoders, _lock
     _inherited.append(_decoders)
-    _decoders, _lock = OrderedDict(), threading.RLock()  # another thread of the parent may have held the lock
+    _decoders = OrderedDict()
+    _lock = threading.RLock()  # another thread of the parent may have held the old one
 
 
 os.register_at_fork(after_in_child=_set_aside)
@@ -328,7 +333,8 @@ class _Decoder:
     """An open file and the current decoding position in it."""
 
     def __init__(self, path: Path, index: VideoIndex) -> None:
-        self.path, self.index = path, index
+        self.path = path
+        self.index = index
         self._container = open_decoder(path)
         self._stream = self._container.streams.video[0]
         self._starts = np.flatnonzero(index.keys)

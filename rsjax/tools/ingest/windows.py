@@ -96,7 +96,8 @@ def index_windows(
         EpisodeError: as :func:`check_rate`.
     """
     check_rate(fps, config)
-    parts, short = [np.zeros((0, config.frames), np.int64)], 0
+    parts = [np.zeros((0, config.frames), np.int64)]
+    short = 0
     for first, end in spans:
         windows = first + _windows_of(timestamps[first:end], fps, config)
         short += not len(windows)
@@ -106,9 +107,12 @@ def index_windows(
 
 def _windows_of(times: Float[np.ndarray, " n"], fps: float, config: WindowConfig) -> Int[np.ndarray, "W T"]:
     """Returns the windows of one span, as frame numbers counted from the span's first frame."""
-    count, rate, clock = len(times), config.rate, times
+    count = len(times)
+    rate = config.rate
+    clock = times
     if not rate:  # as recorded
-        rate, clock = 1.0, np.arange(count, dtype=np.float64)
+        rate = 1.0
+        clock = np.arange(count, dtype=np.float64)
     clock = np.append(clock, clock[-1] + (1 / fps if config.rate else 1))  # a step nearest to this end is too late
     # Only even steps that are nearest to some frame start a window: a recording that stops for years has few of them.
     numbers = np.unique(np.floor((clock - clock[0]) * rate / config.hop + 0.5 + _TIE))
@@ -173,7 +177,8 @@ def judge(
     """
     frames = index.frames
     recorded = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
-    numbers, seconds = np.diff(frames, axis=1), np.diff(timestamps[frames], axis=1)
+    numbers = np.diff(frames, axis=1)
+    seconds = np.diff(timestamps[frames], axis=1)
     # Rounding to recorded frames makes some steps longer than 1 / rate although no frame is missing.
     steps = np.maximum(numbers * recorded, 1 / config.rate if config.rate else 0.0)
     torn = ((seconds > config.most_gap * steps) | (numbers < 1)).any(1)
@@ -207,5 +212,6 @@ def starts_by_reason(index: WindowIndex, reasons: Sequence[str]) -> dict[str, li
 def _window_means(motion: Float[np.ndarray, " N"], index: WindowIndex) -> Float[np.ndarray, " W"]:
     """Returns the mean motion after each window's first frame up to its last; the first frame's own lies before it."""
     sums = np.concatenate([[0.0], np.cumsum(motion, dtype=np.float64)])
-    first, last = index.frames[:, 0], index.frames[:, -1]
+    first = index.frames[:, 0]
+    last = index.frames[:, -1]
     return (sums[last + 1] - sums[first + 1]) / np.maximum(last - first, 1)

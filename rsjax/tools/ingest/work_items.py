@@ -104,7 +104,9 @@ class EpisodeWork:
     """The work items of one episode: their outputs and marks."""
 
     def __init__(self, plan: IngestPlan, ref: EpisodeRef) -> None:
-        self.plan, self.ref, self.keys = plan, ref, plan.keys(ref)
+        self.plan = plan
+        self.ref = ref
+        self.keys = plan.keys(ref)
 
     def output(self, step: str) -> Path:
         """Returns the path of a work item's output. An episode's name never leads out of the folder."""
@@ -174,7 +176,9 @@ def run_episode(plan: IngestPlan, ref: EpisodeRef, prepared: set[str]) -> tuple[
     Raises:
         UserError: no work item could be run here, for example because the disk is full or a package is missing.
     """
-    work, ran, clips = EpisodeWork(plan, ref), 0, 0
+    work = EpisodeWork(plan, ref)
+    ran = 0
+    clips = 0
     for step in plan.steps:
         mark = work.mark(step.name)
         if mark is None:
@@ -199,7 +203,9 @@ def run_item(work: EpisodeWork, step: Step, prepared: set[str]) -> Mark:
     if step.prepare is not None and step.name not in prepared:
         step.prepare()
         prepared.add(step.name)
-    wall, cpu, output = time.monotonic(), time.process_time(), work.output(step.name)
+    wall = time.monotonic()
+    cpu = time.process_time()
+    output = work.output(step.name)
     temporary = output.with_name(f"{output.name}.{os.uname().nodename}-{os.getpid()}.tmp")
     with disk_guard(output):
         output.parent.mkdir(parents=True, exist_ok=True)

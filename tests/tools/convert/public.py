@@ -79,7 +79,8 @@ def conv2d(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | None = None, st
 
 def group_norm(x: np.ndarray, groups: int = 32) -> np.ndarray:
     grouped = x.reshape(len(x), groups, -1)
-    mean, var = grouped.mean(-1, keepdims=True), grouped.var(-1, keepdims=True)
+    mean = grouped.mean(-1, keepdims=True)
+    var = grouped.var(-1, keepdims=True)
     return ((grouped - mean) / np.sqrt(var + 1e-6)).reshape(x.shape)
 
 
@@ -88,7 +89,8 @@ class TokenizerNet:
 
     def __init__(self, tensors: Tensors, levels: int, res: int) -> None:
         self.t = {name: x.astype(np.float64) for name, x in tensors.items()}
-        self.levels, self.res = levels, res
+        self.levels = levels
+        self.res = res
 
     def conv(self, name: str, x: np.ndarray, stride: int = 1) -> np.ndarray:
         return conv2d(x, self.t[f"{name}.weight"], self.t.get(f"{name}.bias"), stride)
@@ -173,7 +175,9 @@ class GenieNet:
 
     def __init__(self, tensors: Tensors, layers: int, heads: int, mup: bool = False) -> None:
         self.t = {name: x.astype(np.float64) for name, x in tensors.items()}
-        self.layers, self.heads, self.mup = layers, heads, mup
+        self.layers = layers
+        self.heads = heads
+        self.mup = mup
 
     def linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self.t[f"{name}.weight"].T + self.t.get(f"{name}.bias", 0.0)
@@ -191,7 +195,9 @@ class GenieNet:
         *_, n, d = x.shape
         size = d // self.heads
         qkv = np.moveaxis(self.linear(f"{name}.qkv", x).reshape(*x.shape[:-1], 3, self.heads, size), -3, 0)
-        q, k, v = self.norm(f"{name}.norm", qkv[0]), self.norm(f"{name}.norm", qkv[1]), qkv[2]
+        q = self.norm(f"{name}.norm", qkv[0])
+        k = self.norm(f"{name}.norm", qkv[1])
+        v = qkv[2]
         scores = np.einsum("...qhe,...khe->...hqk", q, k) * (8 / size if self.mup else size**-0.5)
         if causal:
             scores = np.where(np.tril(np.ones((n, n), bool)), scores, -np.inf)

@@ -37,7 +37,8 @@ def autoencoder() -> tuple[Tensors, dict[str, Any]]:
     params = drawn(jax.eval_shape(lambda key: init(VAE, key), jax.random.key(0)))
     factor = np.full(3, -np.log(0.25), np.float32)
     params["latents"] = {"mean": np.zeros(3, np.float32), "log_deviation": factor}
-    settings, networks = cogvideox.autoencoder_settings(VAE, params), {n: params[n] for n in ("encoder", "decoder")}
+    settings = cogvideox.autoencoder_settings(VAE, params)
+    networks = {n: params[n] for n in ("encoder", "decoder")}
     return to_tensors(networks, cogvideox.autoencoder_table(networks)), settings
 
 
@@ -51,7 +52,8 @@ def written(folder: Path, tensors: Tensors, settings: dict[str, Any] | None) -> 
 
 def test_both_networks_come_back_to_the_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = replace(NET, learned_positions=(3, 2, 2))
-    tensors, (vae, settings) = transformer(config), autoencoder()
+    tensors = transformer(config)
+    (vae, settings) = autoencoder()
     convert("cogvideox", written(tmp_path / "a", tensors, cogvideox.transformer_settings(config)), tmp_path / "own")
     convert("cogvideox", written(tmp_path / "b", vae, settings), tmp_path / "own")
     out = capsys.readouterr().out
@@ -84,7 +86,8 @@ def test_both_networks_come_back_to_the_bit(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_networks_in_several_files_are_read_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names, tensors = ("x-00001-of-00002.safetensors", "x-00002-of-00002.safetensors"), transformer(NET)
+    names = ("x-00001-of-00002.safetensors", "x-00002-of-00002.safetensors")
+    tensors = transformer(NET)
     tensors["patch_embed.pos_embedding"] = np.zeros((1, 14, 32), np.float32)
     keys = sorted(tensors)
     for name, part in zip(names, (keys[::2], keys[1::2]), strict=True):
@@ -99,7 +102,8 @@ def test_networks_in_several_files_are_read_whole(tmp_path: Path, capsys: pytest
 
 
 def test_a_network_without_channels_for_an_image_gets_empty_ones() -> None:
-    saved, own = replace(NET, image="first_latent"), NET
+    saved = replace(NET, image="first_latent")
+    own = NET
     fresh, there = (drawn(shapes(saved_architecture(config))) for config in (own, saved))
     begun = completed(fresh, there)["patches"]["kernel"]
     np.testing.assert_array_equal(begun[:, :, :3], there["patches"]["kernel"])
@@ -159,7 +163,8 @@ def test_texts_need_a_directory_and_tasks(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_texts_are_those_of_the_encoder(tmp_path: Path) -> None:
-    torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    torch = pytest.importorskip("torch")
+    transformers = pytest.importorskip("transformers")
     tokenizers = pytest.importorskip("tokenizers")
     words = {"<pad>": 0, "</s>": 1, "<unk>": 2, "lift": 3, "the": 4, "cube": 5}
     backend = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<unk>"))

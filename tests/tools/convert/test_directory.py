@@ -33,7 +33,8 @@ def random_params(network: Tokenizer | Transformer) -> Any:
 
 def test_networks_come_back_as_they_were_saved(tmp_path: Path) -> None:
     """Both in one directory, whichever is written first."""
-    model, tokenizer = random_params(Transformer(MODEL)), random_params(Tokenizer(TOKENIZER))
+    model = random_params(Transformer(MODEL))
+    tokenizer = random_params(Tokenizer(TOKENIZER))
     save(tmp_path, MODEL, model)
     save(tmp_path, TOKENIZER, tokenizer)
     for (config, params), expected in (

@@ -46,7 +46,8 @@ class Evil:
 
 
 def test_reading_inverts_writing(tmp_path: Path) -> None:
-    rng, path = np.random.default_rng(0), tmp_path / "new" / "x.safetensors"
+    rng = np.random.default_rng(0)
+    path = tmp_path / "new" / "x.safetensors"
     whole = rng.normal(size=(3, 4, 5)).astype(np.float32)
     tensors: Tensors = {"a.weight": whole.transpose(2, 0, 1), "b": whole[:, 1:3, ::2], "n": np.array(7, np.int64)}
     tensors["c"] = rng.normal(size=6).astype(ml_dtypes.bfloat16)
@@ -63,7 +64,8 @@ def test_reading_inverts_writing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", PICKLED)
 def test_pytorch_loads_weights_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
     torch = pytest.importorskip("torch")
-    load, asked = torch.load, []
+    load = torch.load
+    asked = []
 
     def spy(file: Any, **options: Any) -> Any:
         asked.append(options["weights_only"])
@@ -117,7 +119,8 @@ def test_what_training_scripts_save_beside_tensors_is_left_out(tmp_path: Path, z
 @pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
 def test_omegaconfs_settings_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
     torch = pytest.importorskip("torch")
-    path, more = tmp_path / "x.pt", defaultdict(list, {"moments": [torch.zeros(1)]})
+    path = tmp_path / "x.pt"
+    more = defaultdict(list, {"moments": [torch.zeros(1)]})
     content = {"ema": {"a": torch.arange(2.0)}, "args": omega(monkeypatch), "more": more}
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
     for name in [name for name in sys.modules if name.partition(".")[0] == "omegaconf"]:
@@ -165,7 +168,8 @@ def test_pytorchs_tensors_that_numpy_lacks_are_named(tmp_path: Path, kind: str) 
 @pytest.mark.parametrize("suffix", PICKLED)
 def test_a_malicious_pickle_is_refused_and_does_not_run(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("torch")
-    path, marker = tmp_path / f"x{suffix}", tmp_path / "ran"
+    path = tmp_path / f"x{suffix}"
+    marker = tmp_path / "ran"
     path.write_bytes(pickle.dumps({"state_dict": {"a": Evil(marker)}}, protocol=2))
     with pytest.raises(ConvertError, match=r"\.safetensors") as caught:
         read_tensors(path)
@@ -176,7 +180,8 @@ def test_a_malicious_pickle_is_refused_and_does_not_run(tmp_path: Path, suffix: 
 
 
 def test_a_pickle_named_safetensors_does_not_run(tmp_path: Path) -> None:
-    path, marker = tmp_path / "x.safetensors", tmp_path / "ran"
+    path = tmp_path / "x.safetensors"
+    marker = tmp_path / "ran"
     path.write_bytes(pickle.dumps(Evil(marker)))
     with pytest.raises(ConvertError, match="not a safetensors file"):
         read_tensors(path)

@@ -16,7 +16,12 @@ from rsjax.tools.convert.genie import from_public, infer_config, read_settings, 
 from rsjax.tools.convert.table import public_shapes, to_tensors
 from tests.tools.convert.public import GenieNet, Tensors, genie_shapes, random_tensors
 
-LAYERS, WIDTH, HEADS, FRAMES, CELLS, CODES = 3, 16, 2, 3, 4, 8
+LAYERS = 3
+WIDTH = 16
+HEADS = 2
+FRAMES = 3
+CELLS = 4
+CODES = 8
 SETTINGS = {"num_layers": LAYERS, "num_heads": HEADS, "d_model": WIDTH, "image_vocab_size": CODES**2, "S": CELLS}
 
 
@@ -40,7 +45,8 @@ def test_the_published_sizes_have_the_published_names_and_shapes(width: int, pub
 
 @pytest.mark.parametrize(("qk_norm", "mup"), [(False, False), (True, True)], ids=["plain", "qk-norm and muP"])
 def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool, mup: bool) -> None:
-    public, rng = tensors(qk_norm), np.random.default_rng(0)
+    public = tensors(qk_norm)
+    rng = np.random.default_rng(0)
     config, params = from_public(Path("file"), public, SETTINGS | {"use_mup": mup, "qk_norm": qk_norm})
     assert (config.mup, config.qk_norm, config.action_inputs, config.use_depth) == (mup, qk_norm, 0, False)
     tokens = rng.integers(0, CODES**2, (2, FRAMES, 2, 2), np.int32)

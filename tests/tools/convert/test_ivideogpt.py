@@ -35,7 +35,8 @@ def llama_tensors(config: IVideoGPTConfig = LLAMA) -> Tensors:
     return random_tensors(public_shapes(llama_table(config), shapes))
 
 
-TOKENIZER, TRANSFORMER = tokenizer_tensors(), llama_tensors()
+TOKENIZER = tokenizer_tensors()
+TRANSFORMER = llama_tensors()
 
 
 @pytest.fixture
@@ -77,7 +78,8 @@ def test_weights_without_actions_start_a_model_with_actions_that_changes_nothing
     shapes = model.pretrained_shapes(tmp_path / "own")
     saved = load_weights(tmp_path / "own" / "world_model" / "weights", shapes)
     started = model.start(model.init(jax.random.key(0)), saved, tmp_path / "own")
-    tokens, actions = np.arange(20)[None], np.ones((1, 3, 3), np.float32)
+    tokens = np.arange(20)[None]
+    actions = np.ones((1, 3, 3), np.float32)
     mine, _ = LLaMA(model.architecture).apply({"params": started}, tokens, actions)
     theirs, _ = LLaMA(Architecture.create(alone, CLIPS)).apply({"params": saved}, tokens, None)
     np.testing.assert_array_equal(mine, theirs)

@@ -14,7 +14,8 @@ from rsjax.tools.convert.table import public_shapes, to_tensors
 from rsjax.tools.convert.tokenizer import Weights, from_public, infer_config, public_name, table
 from tests.tools.convert.public import Tensors, TokenizerNet, random_tensors, tokenizer_shapes
 
-MULT, BITS = (1, 1, 2), 6
+MULT = (1, 1, 2)
+BITS = 6
 GENERATIONS = {"older": (1, False), "newer": (2, True)}
 
 
@@ -25,7 +26,8 @@ def tensors(generation: str, seed: int = 0) -> Tensors:
 
 def training_file(generation: str) -> tuple[Tensors, Tensors, Tensors]:
     """Returns a whole training checkpoint, its raw weights and their moving average."""
-    raw, ema = tensors(generation, 0), tensors(generation, 1)
+    raw = tensors(generation, 0)
+    ema = tensors(generation, 1)
     rest = {
         "loss.discriminator.main.0.weight": (64, 3, 4, 4),
         "loss.discriminator.main.3.num_batches_tracked": (),

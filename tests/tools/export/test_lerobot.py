@@ -67,7 +67,8 @@ def test_what_is_exported_is_read_back(
     folder = tmp_path_factory.mktemp("lerobot")
     store = toy_store(folder / "store", count, frames, size, width, fps=fps)
     export_lerobot(store, folder / "out", LeRobotOptions(version, state=state, codec="h264", crf=1))
-    clips, episodes = records(store), read_all("lerobot", folder / "out")
+    clips = records(store)
+    episodes = read_all("lerobot", folder / "out")
     assert len(clips) == len(episodes)
     for clip, episode in zip(clips, episodes, strict=True):
         np.testing.assert_array_equal(episode.actions, clip["actions"])
@@ -176,7 +177,8 @@ def test_columns_have_the_types_that_lerobot_casts_to(tmp_path: Path, version: A
     info = export_lerobot(store, tmp_path / "out", LeRobotOptions(version, codec="h264"))
     schema = pq.read_schema(next((tmp_path / "out").glob("data/*/*.parquet")))
     for name in schema.names:
-        shape, kind = info["features"][name]["shape"], schema.field(name).type
+        shape = info["features"][name]["shape"]
+        kind = schema.field(name).type
         assert pa.types.is_fixed_size_list(kind) == (shape != [1])
         assert shape == [1] or shape == [kind.list_size]
     assert info["features"]["action"]["shape"] == [width]
@@ -210,7 +212,8 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     for fields in ({"crf": 64}, {"crf": 52, "codec": "h264"}, {"crf": -3}):
         with pytest.raises(UserError, match=r"export.crf is .*; it must be 0 … "):
             LeRobotOptions(**fields)  # type: ignore[arg-type]
-    fast, slow = toy_store(tmp_path / "fast"), toy_store(tmp_path / "slow", fps=2.0)
+    fast = toy_store(tmp_path / "fast")
+    slow = toy_store(tmp_path / "slow", fps=2.0)
     merge([fast.path, slow.path], tmp_path / "both")
     with pytest.raises(StoreError, match=r"has clips of 5 and 2 frames a second .* or give --fps"):
         export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "d")

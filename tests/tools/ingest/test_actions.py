@@ -17,7 +17,8 @@ EVERY = ActionConfig()
 
 def turn(axis: int, angle: float) -> np.ndarray:
     quaternion = np.zeros(4)
-    quaternion[axis], quaternion[3] = np.sin(angle / 2), np.cos(angle / 2)
+    quaternion[axis] = np.sin(angle / 2)
+    quaternion[3] = np.cos(angle / 2)
     return quaternion
 
 
@@ -88,7 +89,8 @@ def test_turns_join_to_the_turn_from_end_to_end(turns: list[tuple[int, float]]) 
         poses.append(poses[-1] * scipy.Rotation.from_quat(turn(axis, angle)))
     places = np.stack([pose.as_quat() for pose in poses]).astype(np.float32)
     steps = np.stack([np.zeros(4), *(turn(axis, angle) for axis, angle in turns)]).astype(np.float32)
-    frames, layout = np.array([1, 4, 6]), (0,)
+    frames = np.array([1, 4, 6])
+    layout = (0,)
     expected = np.stack([(poses[1].inv() * poses[4]).as_quat(True), (poses[4].inv() * poses[6]).as_quat(True)])
     joined = sampled_actions(steps, frames, EVERY, Layout("delta", layout))
     differences = sampled_actions(places, frames, ActionConfig(kind="delta"), Layout("absolute", layout))
@@ -109,7 +111,8 @@ def test_signs_of_quaternions_do_not_change_what_leads_from_one_to_the_other(fli
     smooth = np.stack([turn(1, 0.3 * step) for step in range(6)]).astype(np.float32)
     signs = np.where(flips, -1.0, 1.0)[:, None].astype(np.float32)
     config = ActionConfig(compose=compose, kind="delta")  # type: ignore[arg-type]
-    frames, layout = np.arange(1, 6, 2), Layout("absolute", (0,))
+    frames = np.arange(1, 6, 2)
+    layout = Layout("absolute", (0,))
     made = sampled_actions(smooth * signs, frames, config, layout)
     np.testing.assert_allclose(made, sampled_actions(smooth, frames, config, layout), atol=1e-6)
 

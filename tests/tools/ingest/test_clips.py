@@ -27,7 +27,8 @@ class Records(list):
 
 
 def clips(made: Episode, config: ClipConfig = CONFIG, **annotations: Any) -> tuple[list[Record], dict[str, Any]]:
-    generator, kept = cut(Annotated(made, task=made.task, segments=made.segments, **annotations), config), []
+    generator = cut(Annotated(made, task=made.task, segments=made.segments, **annotations), config)
+    kept = []
     while True:
         try:
             kept.append(next(generator))
@@ -235,7 +236,8 @@ def test_a_short_episode_gives_nothing_and_says_so() -> None:
         "window": "4 frames at 2 Hz take 16 of 10 fps",
         "cure": "raise --windows.rate or lower --windows.frames",
     }
-    made, recorded = episode("a", count=5), ClipConfig(WindowConfig(frames=8, rate=0), 8, 6)
+    made = episode("a", count=5)
+    recorded = ClipConfig(WindowConfig(frames=8, rate=0), 8, 6)
     short = clips(made, recorded, shots=[(0, 3), (3, 5)])[1]["short"]
     assert short == {
         "spans": 2,

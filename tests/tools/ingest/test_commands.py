@@ -26,7 +26,8 @@ class Command:
     """Runs a command in this process."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch, self._capsys = monkeypatch, capsys
+        self._monkeypatch = monkeypatch
+        self._capsys = capsys
 
     def __call__(self, module: ModuleType, *arguments: object) -> str:
         """What it prints."""

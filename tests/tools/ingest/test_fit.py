@@ -19,7 +19,8 @@ def test_a_spot_its_depth_and_its_track_stay_in_one_place(
     fit: Fit, height: int, width: int, x: float, y: float
 ) -> None:
     """The depth camera has half the resolution of the other."""
-    row, column = int(y * height) // 2 * 2, int(x * width) // 2 * 2
+    row = int(y * height) // 2 * 2
+    column = int(x * width) // 2 * 2
     picture = np.zeros((height, width, 3), np.uint8)
     cv2.circle(picture, (column, row), 6, (255, 255, 255), -1)
     depth = np.ones((height // 2, width // 2), np.float32)
@@ -45,7 +46,8 @@ def test_a_crop_is_the_middle_square_and_hides_points_outside_it(height: int, wi
     assume(height != width)
     picture = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)
     side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
+    top = (height - side) // 2
+    left = (width - side) // 2
     placement = Placement.create("crop", height, width, size)
     middle = picture[top : top + side, left : left + side]
     np.testing.assert_array_equal(placement.picture(picture), cv2.resize(middle, (size, size), None, 0, 0, 3))
@@ -77,7 +79,8 @@ def test_square_pictures_are_only_shrunk(fit: Fit) -> None:
     placement = Placement.create(fit, 48, 48, 16)
     expected = cv2.resize(picture, (16, 16), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(placement.picture(picture), expected)
-    points, seen = np.array([[[0.3, 1.2]]], np.float32), np.array([[True]])
+    points = np.array([[[0.3, 1.2]]], np.float32)
+    seen = np.array([[True]])
     np.testing.assert_array_equal(placement.tracks(points, seen)[0], points)
     assert placement.tracks(points, seen)[1].all() and placement.words == ""
 

@@ -77,7 +77,8 @@ def test_a_store_has_statistics_and_labels_that_training_reads(mixed: tuple[Inge
 
 def test_no_episode_is_in_both_splits(mixed: tuple[IngestSummary, Store]) -> None:
     _, store = mixed
-    train, test = set(episodes(store, "train")), set(episodes(store, "test"))
+    train = set(episodes(store, "train"))
+    test = set(episodes(store, "test"))
     assert len(train) == 4 and len(test) == 1 and not train & test
     assert store.manifest["episodes"] == {"train": sorted(train), "test": sorted(test)}
 

@@ -140,7 +140,8 @@ def test_memory_does_not_grow_with_the_episodes(tmp_path: Path) -> None:
         return most
 
     peak(1)
-    few, many = peak(3), peak(12)
+    few = peak(3)
+    many = peak(12)
     assert many < few + 1_000_000  # the pixels of nine more episodes are 20 MB
 
 

@@ -23,7 +23,8 @@ def decoded(payload: bytes, where: str) -> np.ndarray:
 
 def test_pictures_are_rgb_in_the_order_asked_for(tmp_path: Path) -> None:
     red, blue = np.zeros((2, 4, 6, 3), np.uint8)
-    red[..., 0], blue[..., 2] = 200, 100
+    red[..., 0] = 200
+    blue[..., 2] = 100
     paths = [write(tmp_path / f"{n}.png", image[..., ::-1]) for n, image in enumerate((red, blue))]
     frames = PictureFiles(paths)
     assert len(frames) == 2

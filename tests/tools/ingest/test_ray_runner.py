@@ -59,7 +59,9 @@ def test_workers_share_a_gpu_and_survive_what_the_pool_survives(tmp_path: Path, 
     source = Source(6, broken=(4,))
     plan = noting_plan(tmp_path, source, once="episode_001", deadly="episode_003", fails="episode_002")
     plan = with_needs(plan, (0.5, 0.25), (1.0, 0.0))
-    refs, ran, free = list(source.episodes()), list[tuple[int, int]](), list[float]()
+    refs = list(source.episodes())
+    ran = list[tuple[int, int]]()
+    free = list[float]()
 
     def settle(ref: EpisodeRef, items: int, clips: int) -> None:
         ran.append((items, clips))

@@ -159,10 +159,13 @@ def remuxed(source: Path, path: Path, first: int, begins: int) -> Path:
     """The packets from frame ``first`` on, of a file that is shown from frame ``begins`` on: so trimming tools cut."""
     options = {"avoid_negative_ts": "disabled", "use_editlist": "1"}
     with av.open(str(source)) as recorded, av.open(str(path), "w", options=options) as out:
-        stream, tick = out.add_stream_from_template(recorded.streams.video[0]), scan(source).stamps[1]
+        stream = out.add_stream_from_template(recorded.streams.video[0])
+        tick = scan(source).stamps[1]
         for packet in recorded.demux(video=0):
             if packet.pts is not None and packet.dts is not None and packet.pts >= first * tick:
-                packet.pts, packet.dts, packet.stream = packet.pts - begins * tick, packet.dts - begins * tick, stream
+                packet.pts = packet.pts - begins * tick
+                packet.dts = packet.dts - begins * tick
+                packet.stream = stream
                 out.mux(packet)
     return path
 
@@ -188,7 +191,9 @@ def test_pictures_of_several_sizes_are_reported(tmp_path: Path) -> None:
     for side in (32, 64):
         with av.open(str(tmp_path / f"{side}.h264"), "w", format="h264") as out:
             stream = out.add_stream("libx264", rate=30, options={"bf": "0"})
-            stream.height, stream.width, stream.pix_fmt = side, side, "yuv420p"
+            stream.height = side
+            stream.width = side
+            stream.pix_fmt = "yuv420p"
             for _ in range(3):
                 out.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((side, side, 3), np.uint8))))
             out.mux(stream.encode())
@@ -199,7 +204,8 @@ def test_pictures_of_several_sizes_are_reported(tmp_path: Path) -> None:
         packets = [packet for packet in source.demux(video=0) if packet.size]
         for number, packet in enumerate(packets):
             packet.pts = packet.dts = number * 33
-            packet.time_base, packet.stream = Fraction(1, 1000), stream
+            packet.time_base = Fraction(1, 1000)
+            packet.stream = stream
             out.mux(packet)
     frames = VideoFrames(tmp_path / "both.mkv")
     assert frames.read([0, 1]).shape == (2, 32, 32, 3)

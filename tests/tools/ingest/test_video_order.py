@@ -34,10 +34,13 @@ def write(path: Path, name: str, stamps: Any = None) -> Path:
     codec, options = OPTIONS[name]
     with av.open(str(path), "w") as out:
         stream: Any = out.add_stream(codec, rate=30, options=options)
-        stream.height, stream.width, stream.pix_fmt = 32, 32, "yuv420p"
+        stream.height = 32
+        stream.width = 32
+        stream.pix_fmt = "yuv420p"
         for number in range(COUNT):
             frame = av.VideoFrame.from_ndarray(picture(number), format="rgb24")
-            frame.pts, frame.time_base = int(number if stamps is None else stamps[number]), Fraction(1, 30)
+            frame.pts = int(number if stamps is None else stamps[number])
+            frame.time_base = Fraction(1, 30)
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
     return path
@@ -49,7 +52,8 @@ def copied(source: Path, path: Path) -> Path:
         stream = out.add_stream_from_template(recorded.streams.video[0])
         for packet in recorded.demux(video=0):
             if packet.dts is not None:
-                packet.pts, packet.stream = packet.dts, stream
+                packet.pts = packet.dts
+                packet.stream = stream
                 out.mux(packet)
     return path
 

@@ -35,7 +35,8 @@ def even_windows(fps: float, spans: list[Span], config: WindowConfig) -> WindowI
 def spans(draw: st.DrawFn) -> list[Span]:
     """In order, without overlap."""
     lengths = draw(st.lists(st.tuples(st.integers(0, 9), st.integers(1, 400)), max_size=5))
-    parts, at = [], 0
+    parts = []
+    at = 0
     for gap, length in lengths:
         parts.append((at + gap, at + gap + length))
         at += gap + length
@@ -162,9 +163,11 @@ def test_the_segment_that_holds_most_frames_names_the_window() -> None:
 def test_each_filter_leaves_out_what_it_names() -> None:
     index = even_windows(10, [(0, 60)], WindowConfig(frames=3, rate=2, hop=2))
     assert index.frames[:, 0].tolist() == [0, 10, 20, 30, 40]
-    times, motion = np.arange(60) / 10, np.full(60, 5.0)
+    times = np.arange(60) / 10
+    motion = np.full(60, 5.0)
     times[5:] += 3  # the recording stopped
-    motion[11:21], motion[31:41] = 0.1, 90
+    motion[11:21] = 0.1
+    motion[31:41] = 90
     config = WindowConfig(frames=3, rate=2, hop=2, least_motion=1, most_motion=50, key_frame=True)
     reasons = judge(index, times, motion, [3, 20, 35], config)
     assert reasons == ["gap", "still", "", "shaking", "no key frame"]

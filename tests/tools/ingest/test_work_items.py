@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[3]
 
 def finish(plan: IngestPlan, workers: int = 0) -> IngestSummary:
     """Runs what is missing, and counts; every episode is settled once, and the numbers add up."""
-    refs, settled = list(plan.source.episodes()), list[str]()
+    refs = list(plan.source.episodes())
+    settled = list[str]()
     run_on_this_machine(plan, refs, lambda ref, items, clips: settled.append(ref.id), workers)
     assert sorted(settled) == [ref.id for ref in refs]
     summary = summarise(plan, refs)
@@ -42,7 +43,8 @@ def test_every_step_runs_once_and_sees_the_one_before(tmp_path: Path) -> None:
 
 def test_a_run_counts_what_it_did_itself(tmp_path: Path) -> None:
     plan = noting_plan(tmp_path, Source(3), seconds=0.02)
-    refs, ran = list(plan.source.episodes()), list[tuple[int, int]]()
+    refs = list(plan.source.episodes())
+    ran = list[tuple[int, int]]()
     run_on_this_machine(plan, refs[:2], lambda ref, items, clips: ran.append((items, clips)))
     run_on_this_machine(plan, refs, lambda ref, items, clips: ran.append((items, clips)))
     assert ran == [(2, 2), (2, 2), (0, 0), (0, 0), (2, 2)]

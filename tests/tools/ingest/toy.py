@@ -100,7 +100,8 @@ class Source:
         number = ref.location["number"]
         if number in self.broken:
             raise EpisodeError(f"video_{number}.mp4: truncated; copy it again")
-        frames, deep = 5 if number in self.short else 40, self.depth or number < self.deep or number == self.only
+        frames = 5 if number in self.short else 40
+        deep = self.depth or number < self.deep or number == self.only
         return episode(ref.id, frames, deep, fingerprint=ref.fingerprint)
 
 

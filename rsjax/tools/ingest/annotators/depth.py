@@ -138,12 +138,14 @@ def metric_depth(depth: Float32[np.ndarray, "N H W"]) -> DepthMaps:
 
 def _extent(maps: Float32[np.ndarray, "N H W"]) -> tuple[float, float]:
     """Returns the least and the greatest value; raises :class:`ValueError` if one is not finite."""
-    low, high = np.inf, -np.inf
+    low = np.inf
+    high = -np.inf
     for start in range(0, len(maps), CHUNK):
         chunk = maps[start : start + CHUNK]
         if not np.isfinite(chunk).all():
             raise ValueError("depth is not finite everywhere")
-        low, high = min(low, float(chunk.min())), max(high, float(chunk.max()))
+        low = min(low, float(chunk.min()))
+        high = max(high, float(chunk.max()))
     return low, high
 
 

@@ -65,7 +65,8 @@ def measure_motion(frames: Frames, timestamps: Float[np.ndarray, " N"], flow: Fl
         speed = np.linalg.norm(field * unit.astype(np.float32), axis=-1).reshape(len(field), -1)
         rows = slice(start + 1, start + len(pictures))
         seconds = np.diff(timestamps[start : start + len(pictures)])
-        mean[rows], high[rows] = speed.mean(1) / seconds, np.percentile(speed, 95, axis=1) / seconds
+        mean[rows] = speed.mean(1) / seconds
+        high[rows] = np.percentile(speed, 95, axis=1) / seconds
     return Motion(mean, high)
 
 

@@ -43,7 +43,8 @@ class Annotator:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value, least = getattr(self, field.name), self.least.get(field.name, 1)
+            value = getattr(self, field.name)
+            least = self.least.get(field.name, 1)
             message = f"{self.name}: {field.name} is {value}; it must be at least {least}"
             require(field.type is not int or value >= least, message)
 

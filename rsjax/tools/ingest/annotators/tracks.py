@@ -95,12 +95,15 @@ class LucasKanade(GridTracker):
         grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
         size = np.array(pictures.shape[2:0:-1], np.float32)
         place = points.astype(np.float32) * size - 0.5
-        seen, patch = np.ones(len(points), bool), _patches(grey[0], place, self.window)
-        places, visible = [place], [seen]
+        seen = np.ones(len(points), bool)
+        patch = _patches(grey[0], place, self.window)
+        places = [place]
+        visible = [seen]
         for before, after in itertools.pairwise(grey):
             stays = np.abs(_patches(after, place, self.window) - patch).max(1, initial=0.0) <= self.still
             going = np.flatnonzero(seen & ~stays)
-            place, seen = place.copy(), stays
+            place = place.copy()
+            seen = stays
             place[going], seen[going] = self._step(before, after, place[going])
             now = _patches(after, place, self.window)
             patch = np.where(seen[:, None], now, patch)
@@ -127,8 +130,10 @@ class LucasKanade(GridTracker):
 
 def _likeness(before: np.ndarray, after: np.ndarray, start: Points, end: Points, side: int) -> np.ndarray:
     """Correlates the patches around two sets of points; the result is about 1 where both patches are uniform."""
-    left, right = _patches(before, start, side), _patches(after, end, side)
-    left, right = left - left.mean(1, keepdims=True), right - right.mean(1, keepdims=True)
+    left = _patches(before, start, side)
+    right = _patches(after, end, side)
+    left = left - left.mean(1, keepdims=True)
+    right = right - right.mean(1, keepdims=True)
     even = np.float32(side * side)  # a variance of one grey level is noise
     scale = np.sqrt((left**2).sum(1) * (right**2).sum(1))
     return ((left * right).sum(1) + even) / (scale + even)
@@ -156,7 +161,8 @@ def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth
         depth: depth maps to pass on to ``follow``.
     """
     count = len(frames)
-    points, visible = np.zeros((0, count, 2), np.float32), np.zeros((0, count), bool)
+    points = np.zeros((0, count, 2), np.float32)
+    visible = np.zeros((0, count), bool)
     for start in range(0, max(count - 1, 1), span):
         end = min(start + span + 1, count)
         seeds = grid_points(grid, points[visible[:, start], start])
@@ -196,11 +202,13 @@ def window_tracks(tracked: Tracked, frames: Int[np.ndarray, " T"] | Sequence[int
     first = np.flatnonzero(tracked.visible[:, frames[0]])
     if not len(first):
         raise ValueError(f"no point is seen in frame {frames[0]}")
-    points, visible = tracked.points[first][:, frames], tracked.visible[first][:, frames]
+    points = tracked.points[first][:, frames]
+    visible = tracked.visible[first][:, frames]
     steps = np.linalg.norm(np.diff(points, axis=1), axis=-1) * (visible[:, 1:] & visible[:, :-1])
     if len(first) > count:
         order = np.argsort(-steps.sum(1), kind="stable")
-        most, rest = order[: count // 2], np.sort(order[count // 2 :])
+        most = order[: count // 2]
+        rest = np.sort(order[count // 2 :])
         spread = rest[np.linspace(0, len(rest) - 1, count - len(most)).round().astype(int)]
         chosen = np.concatenate([most, spread])
     else:
@@ -232,7 +240,8 @@ class SpatialTracker(GridTracker, Network):
     def follow(self, pictures: Pictures, points: Points, depth: Maps | None = None) -> Followed:
         torch = library("torch", self.title)
         model = self.load()
-        size, count = np.array(pictures.shape[2:0:-1], np.float32), len(pictures)
+        size = np.array(pictures.shape[2:0:-1], np.float32)
+        count = len(pictures)
         queries = np.concatenate([np.zeros((len(points), 1)), points * size - 0.5], 1).astype(np.float32)
         # for fewer frames than half its window its output is zeros, with no point visible
         kept = np.arange(max(count, self.window)).clip(max=count - 1)
@@ -241,7 +250,8 @@ class SpatialTracker(GridTracker, Network):
         rows = torch.from_numpy(queries)[None].to(self.device)
         with torch.no_grad():
             places, seen, _ = model(video, video_depth=maps, queries=rows, wind_length=self.window)
-        places, seen = places[0, :count].permute(1, 0, 2).cpu().numpy(), seen[0, :count].permute(1, 0).cpu().numpy()
+        places = places[0, :count].permute(1, 0, 2).cpu().numpy()
+        seen = seen[0, :count].permute(1, 0).cpu().numpy()
         return _cleaned((places[..., :2] + 0.5) / size, seen.astype(bool), points)
 
     def build(self) -> Any:
@@ -283,7 +293,8 @@ class BootsTapir(GridTracker, Network):
         rows = np.concatenate([np.zeros((len(points), 1)), points[:, ::-1] * self.side], 1)  # frame, y, x
         with torch.no_grad():
             found = model(video, torch.from_numpy(rows.astype(np.float32))[None].to(self.device))
-            hidden, far = torch.sigmoid(found["occlusion"][0]), torch.sigmoid(found["expected_dist"][0])
+            hidden = torch.sigmoid(found["occlusion"][0])
+            far = torch.sigmoid(found["expected_dist"][0])
         seen = ((1 - hidden) * (1 - far) > 0.5).cpu().numpy()
         return _cleaned(found["tracks"][0].cpu().numpy() / self.side, seen, points)
 
@@ -307,5 +318,6 @@ def _cleaned(places: np.ndarray, seen: np.ndarray, points: Points) -> Followed:
     if not np.isfinite(places).all():
         raise AnnotationError("the tracker gave places that are not finite; check its weights and precision")
     seen = seen & ((places >= 0) & (places < 1)).all(-1)
-    places[:, 0], seen[:, 0] = points, True
+    places[:, 0] = points
+    seen[:, 0] = True
     return places.astype(np.float32), seen

@@ -75,7 +75,9 @@ class AgiBot:
     name = "agibot"
 
     def __init__(self, root: Path, cameras: Sequence[str], tasks: Sequence[str]) -> None:
-        self._root, self._cameras, self._only = root, tuple(cameras), tuple(tasks)
+        self._root = root
+        self._cameras = tuple(cameras)
+        self._only = tuple(tasks)
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists every episode on disk or in ``task_info``, task by task; an episode not on disk cannot be read."""
@@ -109,7 +111,9 @@ class AgiBot:
         path = inside(self._root, f"proprio_stats/{place}/proprio_stats.h5")
         with open_file(path) as file:
             proprio = Proprio(file, path)
-            times, states, actions = proprio.seconds(), proprio.states(), _actions(proprio)
+            times = proprio.seconds()
+            states = proprio.states()
+            actions = _actions(proprio)
         folder = inside(self._root, f"observations/{place}")
         segments, bad = _segments(location["segments"], len(times))
         depth, why_not = _depth(folder / "depth", len(times))
@@ -137,7 +141,8 @@ class AgiBot:
         return checked(episode, path)
 
     def _tasks(self) -> list[str]:
-        info, observations = self._root / "task_info", self._root / "observations"
+        info = self._root / "task_info"
+        observations = self._root / "observations"
         if not exists(info) and not exists(observations):
             raise SourceError(f"{self._root}: has neither task_info nor observations; unpack the data set")
         tasks = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
@@ -180,7 +185,8 @@ class Proprio:
     """
 
     def __init__(self, file: h5py.File, path: Path) -> None:
-        self._file, self._path = file, path
+        self._file = file
+        self._path = path
         self.notes: dict[str, Any] = {"empty": [], "scattered": {}, "flipped": {}}
         self._stamps = self._rows("timestamp", 1)[:, 0]
         self._count = len(self._stamps)
@@ -308,10 +314,12 @@ def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
 
 def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list[Any]]:
     """Returns the data set's own segments of the episode, and the entries that are not valid segments."""
-    good, bad = [], []
+    good = []
+    bad = []
     for entry in entries:
         try:
-            start, end = int(entry["start_frame"]), min(int(entry["end_frame"]), count)
+            start = int(entry["start_frame"])
+            end = min(int(entry["end_frame"]), count)
             if not 0 <= start < end:
                 raise ValueError(f"{start} … {end}")
             good.append(Segment(start, end, words_of(entry.get("action_text")), words_of(entry.get("skill"))))

@@ -18,7 +18,8 @@ from rsjax.files import regular
 from rsjax.tools.ingest.episode import EpisodeError, EpisodeRef, SourceError, data_file, fingerprint, reason
 
 MAX_CELLS = 2**24  # numbers in one episode's table; more mean a damaged header
-_MOST_BYTES, _MOST_ROWS = 2**32, 2**28  # of a Parquet file, which many episodes may share
+_MOST_BYTES = 2**32  # of a Parquet file, which many episodes may share
+_MOST_ROWS = 2**28  # likewise
 
 
 @contextmanager

@@ -134,11 +134,13 @@ class Folder:
     name = "folder"
 
     def __init__(self, root: Path, config: FolderConfig) -> None:
-        self._root, self._config = root, config
+        self._root = root
+        self._config = config
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists folders first, then the files that make up flat episodes, each by name."""
-        folders, flat = subfolders(self._root), 0
+        folders = subfolders(self._root)
+        flat = 0
         for folder in folders:
             yield self._ref(folder.name, flat=False)
         by_name: dict[str, list[Path]] = {}
@@ -162,7 +164,8 @@ class Folder:
             raise EpisodeError.at(place, f"cannot be read ({error.strerror})", "check its permissions") from error
 
     def _read(self, ref: EpisodeRef, name: str, flat: bool, place: Path) -> Episode:
-        config, files = self._config, self._files(name, flat)
+        config = self._config
+        files = self._files(name, flat)
         cameras, depth = find_cameras(files, flat)
         table_path = find_table(files, place)
         if not cameras:
@@ -171,7 +174,8 @@ class Folder:
         count = len(next(iter(cameras.values())))
         json_path = place.with_name(f"{name}.json") if flat else place / "episode.json"
         task, own_fps, segments = read_description(json_path, count)
-        table, fps = read_table(table_path), own_fps or config.fps
+        table = read_table(table_path)
+        fps = own_fps or config.fps
         chosen, others = choose_columns(table, config.action, table_path)
         actions, names = columns(table, chosen, table_path)
         times = _times(table, cameras, fps, count, place)
@@ -270,7 +274,8 @@ def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment,
     """
     try:
         values = read_json(path) if exists(path) else {}
-        fps, task = float(values.get("fps") or 0), values.get("task")
+        fps = float(values.get("fps") or 0)
+        task = values.get("task")
         if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
             raise ValueError(f"fps {fps}, task {task!r}")
         segments = [_segment(path, place, entry, count) for place, entry in enumerate(values.get("segments") or ())]
@@ -299,12 +304,14 @@ def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], 
     frames: Frames
     for path in files:
         if path.suffix.lower() in VIDEOS:
-            name, frames = "main" if flat else path.stem, VideoFrames(media(path))
+            name = "main" if flat else path.stem
+            frames = VideoFrames(media(path))
         elif path.is_dir() and path.suffix == _DEPTH:
             depth[path.stem] = PictureFiles(_pictures(path, (".png",)), depth=True)
             continue
         elif path.is_dir() and (pictures := _pictures(path, PICTURES)):
-            name, frames = path.name, PictureFiles(pictures)
+            name = path.name
+            frames = PictureFiles(pictures)
         else:
             continue
         if name in cameras:

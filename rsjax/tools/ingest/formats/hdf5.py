@@ -88,16 +88,22 @@ class H5Frames:
     """
 
     def __init__(self, path: Path, key: str, stored: Stored = "upright", depth: bool = False) -> None:
-        self._path, self._key, self._stored, self._depth = path, key, stored, depth
+        self._path = path
+        self._key = key
+        self._stored = stored
+        self._depth = depth
         with open_file(path) as file:
             data = member(file, key, path)
             if not isinstance(data, h5py.Dataset) or data.shape is None:
                 raise EpisodeError.at(path, f"{key} is no array", f"render it again or {LEAVE_OUT}")
-            shape, kind = data.shape, data.dtype
+            shape = data.shape
+            kind = data.dtype
         if depth:
-            fits, expected = kind.kind == "f" and len(shape) in (3, 4) and shape[3:] in ((), (1,)), "floats (N, H, W)"
+            fits = kind.kind == "f" and len(shape) in (3, 4) and shape[3:] in ((), (1,))
+            expected = "floats (N, H, W)"
         else:
-            fits, expected = kind == np.uint8 and len(shape) == 4 and shape[3] == 3, "uint8 (N, H, W, 3)"
+            fits = kind == np.uint8 and len(shape) == 4 and shape[3] == 3
+            expected = "uint8 (N, H, W, 3)"
         if not fits or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
             raise EpisodeError.at(path, f"{key} is {kind} {shape}, should be {expected}", "render it again")
         self._count = int(shape[0])

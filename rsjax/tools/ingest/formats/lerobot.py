@@ -155,8 +155,12 @@ class LeRobot:
     def __init__(
         self, root: Path, info: Info, tasks: dict[int, str], declared: Declared, action: str, state: str
     ) -> None:
-        self._root, self._info, self._tasks, self._declared = root, info, tasks, declared
-        self._action, self._state = action, state
+        self._root = root
+        self._info = info
+        self._tasks = tasks
+        self._declared = declared
+        self._action = action
+        self._state = state
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists ``meta/episodes``; a bad or repeated entry becomes a reference that cannot be read."""
@@ -230,7 +234,8 @@ class LeRobot:
                 yield str(path.relative_to(meta)), error
 
     def _ref(self, number: int, row: dict[str, Any]) -> EpisodeRef:
-        info, length = self._info, int(row["length"])
+        info = self._info
+        length = int(row["length"])
         if number < 0 or length < 0:
             raise ValueError(f"episode_index {number}, length {length}")
 
@@ -263,7 +268,8 @@ class LeRobot:
         Returns:
             A note if the metadata state another range of rows; only this check reads that range.
         """
-        count, number = len(times), location["episode"]
+        count = len(times)
+        number = location["episode"]
         if count != location["length"]:
             problem = f"{count} rows of episode {number}, metadata say {location['length']}"
             raise EpisodeError.at(path, problem, kind="length")
@@ -344,7 +350,8 @@ def read_rows(root: Path, template: str, location: dict[str, Any], columns: Sequ
     Raises:
         EpisodeError: the named file cannot be read, or no file has a row of the episode.
     """
-    named, number = inside(root, location["data"]), location["episode"]
+    named = inside(root, location["data"])
+    number = location["episode"]
     failure = EpisodeError.at(named, f"has no row of episode {number}, nor has any other file", kind="length")
     shared = "rows" in location
     for path in (named, *(_others(root, template, named, number) if shared else ())):

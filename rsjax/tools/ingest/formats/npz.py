@@ -118,7 +118,8 @@ class NpzFolder:
 
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one file; its pictures are unpacked when they are read."""
-        path, how = inside(self.folder, location_of(ref)["file"]), self.settings
+        path = inside(self.folder, location_of(ref)["file"])
+        how = self.settings
         frames = NpzFrames(path, how.frames)
         count = len(frames)
         commands = _numbers(path, how.actions)
@@ -163,13 +164,16 @@ class NpzFrames:
     """
 
     def __init__(self, path: Path, name: str, depth: bool = False) -> None:
-        self._path, self._name, self._depth = path, name, depth
+        self._path = path
+        self._name = name
+        self._depth = depth
         shape, dtype = _header(path, name) or ((), "none")
         if depth:
-            fits, expected = dtype == np.uint16 or dtype.kind == "f", "floats or uint16 (T, H, W)"  # type: ignore
-            fits = fits and len(shape) == 3
+            fits = (dtype == np.uint16 or dtype.kind == "f") and len(shape) == 3  # type: ignore
+            expected = "floats or uint16 (T, H, W)"
         else:
-            fits, expected = dtype == np.uint8 and len(shape) == 4 and shape[3] == 3, "uint8 (T, H, W, 3)"
+            fits = dtype == np.uint8 and len(shape) == 4 and shape[3] == 3
+            expected = "uint8 (T, H, W, 3)"
         if not fits or not 0 < shape[1] * shape[2] <= MAX_PIXELS:
             raise EpisodeError.at(path, f"{name} is {dtype} {shape}, should be {expected}", _SAVE)
         self._count = int(shape[0])

@@ -61,7 +61,8 @@ def from_json(kind: type[T], values: Any, where: Path | str) -> T:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Returns whether a value that was parsed from JSON is of a type."""
-    origin, inner = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    inner = get_args(hint)
     if origin in (types.UnionType, Union):
         return any(_fits(value, one) for one in inner)
     if origin is Literal:
@@ -77,7 +78,8 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def _describe(hint: Any, many: bool = False) -> str:
     """Returns a description of a type's values in words."""
-    origin, inner = get_origin(hint), [one for one in get_args(hint) if one not in (types.NoneType, ...)]
+    origin = get_origin(hint)
+    inner = [one for one in get_args(hint) if one not in (types.NoneType, ...)]
     if origin in (types.UnionType, Union):
         return " or ".join(_describe(one, many) for one in inner)
     if origin is Literal:

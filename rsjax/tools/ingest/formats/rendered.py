@@ -93,7 +93,8 @@ class _Scene:
     """The open renderer of one model and camera, and its last views."""
 
     def __init__(self, key: tuple[object, ...], frames: RenderedStates) -> None:
-        self.key, self.process = key, os.getpid()
+        self.key = key
+        self.process = os.getpid()
         self._playback = Playback(frames.model, frames.camera, frames.size)
         self._views: dict[bytes, View] = {}
 

@@ -176,7 +176,8 @@ class RldsSource:
 
     def _depth(self, example: Example, key: str) -> Depths:
         """Returns the depth maps of a feature: encoded pictures, or numbers one after the other."""
-        name, scale = f"steps/{key}", self.keys.depth_scale
+        name = f"steps/{key}"
+        scale = self.keys.depth_scale
         if example.is_bytes(name):
             return EncodedFrames(example.blobs(name), f"{example.where}: {name}", scale)
         height, width = self.sides.get(key, (0, 0))
@@ -230,7 +231,8 @@ def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
 
 def _metadata(example: Example) -> dict[str, Any]:
     """Returns those features of the episode itself that are a single text or number."""
-    prefix, values = "episode_metadata/", {}
+    prefix = "episode_metadata/"
+    values = {}
     for name in example.names():
         if name.startswith(prefix) and len(value := example.plain(name)) == 1:
             values[name.removeprefix(prefix)] = value[0]

@@ -94,7 +94,8 @@ def open_source(path: Path, filter: str = "", depth: bool = False, size: int = 1
 
 def open_demos(path: Path, convention: Convention, filter: str, depth: bool, size: int = 0) -> "DemoSource":
     """Opens a data set of this layout. Arguments and errors as in :func:`open_source`."""
-    folder, files = path.parent, [path]
+    folder = path.parent
+    files = [path]
     if not path.is_file():
         folder = path
         files = sorted({file for ending in ("hdf5", "h5") for file in path.glob(f"**/*.{ending}") if file.is_file()})
@@ -148,7 +149,8 @@ class DemoSource:
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists each file's demos by their numbers. A file that cannot be read is one entry, which ``read`` refuses."""
         for file in self.files:
-            path, stem = self.folder / file, file.rpartition(".")[0].replace("/", "-")
+            path = self.folder / file
+            stem = file.rpartition(".")[0].replace("/", "-")
             try:
                 demos = self.demos(path)
             except EpisodeError as error:
@@ -161,7 +163,8 @@ class DemoSource:
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one demo."""
         location = location_of(ref)
-        path, demo = inside(self.folder, location["file"]), location["demo"]
+        path = inside(self.folder, location["file"])
+        demo = location["demo"]
         with open_file(path) as file:
             group = member(file, f"data/{demo}", path)
             if not isinstance(group, h5py.Group) or not isinstance(member(group, "obs", path), h5py.Group | None):
@@ -207,7 +210,8 @@ class DemoSource:
         Raises:
             EpisodeError: pictures have another shape or type, or a demo without pictures cannot be rendered.
         """
-        observed, stored = group.get("obs", {}), self.convention.stored
+        observed = group.get("obs", {})
+        stored = self.convention.stored
         keys = _picture_keys(observed, self.convention)
         if not keys and self.size:
             return rendered(group, path, self.size)
@@ -255,7 +259,8 @@ def _picture_keys(observed: Any, how: Convention) -> dict[str, str]:
 
 def _states(observed: Any, how: Convention, path: Path) -> tuple[Float32[np.ndarray, "N S"] | None, dict[str, int]]:
     """Returns the measured states, and in how many rows of which field the sign of a quaternion was flipped back."""
-    parts, flipped = [], {}
+    parts = []
+    flipped = {}
     for key in (key for key in how.states if key in observed):
         part = rows(observed, key, path)
         if key in how.quaternions and part.shape[1] == 4:

@@ -90,10 +90,12 @@ class StoreSource:
 
     def read(self, ref: EpisodeRef) -> Episode:
         """Reads one clip."""
-        split, number = ref.location["split"], ref.location["record"]
+        split = ref.location["split"]
+        number = ref.location["record"]
         try:
             source = self.store.source(split)
-            record, place = source[number], source.locate(number)
+            record = source[number]
+            place = source.locate(number)
         except (StoreError, IndexError) as error:
             raise EpisodeError(f"{self.store.path}: {split} record {number}: {error}") from error
         where = f"{self.store.path / place['file']}: {split} record {number}"

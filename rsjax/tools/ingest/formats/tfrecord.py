@@ -19,7 +19,8 @@ from jaxtyping import Float32
 from rsjax.tools.ingest.episode import EpisodeError, EpisodeRef, data_file, fingerprint
 from rsjax.tools.ingest.formats.files import broken, inside, location_of, reading
 
-_HEAD, _FOOT = 12, 4  # bytes around a payload
+_HEAD = 12  # bytes before a payload
+_FOOT = 4  # bytes after it
 _PROTO = """
 name: "rsjax/example.proto" package: "tensorflow" syntax: "proto3"
 message_type { name: "BytesList" field { name: "value" number: 1 type: TYPE_BYTES label: LABEL_REPEATED } }

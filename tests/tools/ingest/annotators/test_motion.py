@@ -38,7 +38,8 @@ def test_still_pictures_do_not_move_and_time_gaps_count():
 
 def test_every_frame_is_measured_across_chunks():
     class Counting:
-        name, version = "counting", 1
+        name = "counting"
+        version = 1
 
         def __call__(self, before, after):
             step = (after - before).astype(np.float32)[..., :1]

@@ -46,7 +46,8 @@ def test_a_known_error_is_measured():
 
 
 def test_points_that_have_not_moved_can_be_left_out():
-    still, moving = sliding_clip((0, 0)), sliding_clip((2, 0))
+    still = sliding_clip((0, 0))
+    moving = sliding_clip((2, 0))
     both = accuracy.track_accuracy([still, moving], LucasKanade().follow)
     some = accuracy.track_accuracy([still, moving], LucasKanade().follow, moving_only=True)
     alone = accuracy.track_accuracy([moving], LucasKanade().follow)

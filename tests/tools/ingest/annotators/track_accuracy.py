@@ -77,21 +77,28 @@ def track_accuracy(clips: Iterable[Clip], follow: Follower, moving_only: bool = 
 def single_steps(clip: Clip) -> Iterator[Clip]:
     """Cuts a clip into pairs of consecutive frames, each with the points visible in its first one."""
     for t in range(len(clip.rgb) - 1):
-        there, both = clip.visible[:, t], slice(t, t + 2)
-        tracks, visible = clip.tracks[there, both], clip.visible[there, both]
+        there = clip.visible[:, t]
+        both = slice(t, t + 2)
+        tracks = clip.tracks[there, both]
+        visible = clip.visible[there, both]
         depth = None if clip.depth is None else clip.depth[both]
         yield replace(clip, rgb=clip.rgb[both], depth=depth, tracks=tracks, visible=visible)
 
 
 def color_round_trip(clips: Iterable[Clip], near: float, far: float, scale: Scale) -> tuple[float, float, float]:
     """Returns the mean and greatest error in metres, and AbsRel, of depth turned into 8-bit colours and back."""
-    total, greatest, relative, count = 0.0, 0.0, 0.0, 0
+    total = 0.0
+    greatest = 0.0
+    relative = 0.0
+    count = 0
     for depth in (clip.depth for clip in clips if clip.depth is not None):
         colors = depth_to_color(depth, near, far, scale).astype(np.uint8)
         wanted = depth.clip(near, far)
         error = np.abs(color_to_depth(colors, near, far, scale) - wanted)
-        total, greatest = total + float(error.sum(dtype=np.float64)), max(greatest, float(error.max()))
-        relative, count = relative + float((error / wanted).sum(dtype=np.float64)), count + error.size
+        total = total + float(error.sum(dtype=np.float64))
+        greatest = max(greatest, float(error.max()))
+        relative = relative + float((error / wanted).sum(dtype=np.float64))
+        count = count + error.size
     return total / count, greatest, relative / count
 
 

@@ -22,7 +22,8 @@ def read_first(name: str, path: Path, **options: Any) -> Episode:
 
 def error_of(name: str, path: Path, number: int = 0, **options: Any) -> str:
     """Returns the message of the one episode that cannot be read."""
-    source, messages = open_source(name, path, **options), {}
+    source = open_source(name, path, **options)
+    messages = {}
     for place, ref in enumerate(source.episodes()):
         try:
             source.read(ref)

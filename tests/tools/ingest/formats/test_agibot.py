@@ -15,7 +15,8 @@ from tests.tools.ingest.formats.reading import error_of, read_first
 from tests.tools.ingest.formats.videos import numbers_of, write_video
 
 COUNT = 8
-TASK, EPISODE = "327", "648642"
+TASK = "327"
+EPISODE = "648642"
 Edit = Callable[[dict[str, Any]], None]
 
 

@@ -49,7 +49,8 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 def read_everything(name: str, root: Path) -> tuple[int, list[str]]:
     """How many episodes are listed, and the messages of errors."""
-    listed, messages = 0, []
+    listed = 0
+    messages = []
     try:
         source = open_source(name.partition(" ")[0], root)
         for ref in source.episodes():
@@ -101,7 +102,8 @@ def test_damage_to_one_file(whole: tuple[str, Path], data: st.DataObject) -> Non
 @contextlib.contextmanager
 def forbidden(path: Path) -> Iterator[None]:
     """Nobody may read it, not even root, who reads as somebody else."""
-    mode, user = path.stat().st_mode, os.geteuid()
+    mode = path.stat().st_mode
+    user = os.geteuid()
     path.chmod(0)
     try:
         if user == 0:
@@ -127,7 +129,8 @@ def test_what_may_not_be_read(whole: tuple[str, Path]) -> None:
 
 
 def test_a_folder_in_place_of_a_file(whole: tuple[str, Path], tmp_path: Path) -> None:
-    name, root = whole[0], shutil.copytree(whole[1], tmp_path / "set")
+    name = whole[0]
+    root = shutil.copytree(whole[1], tmp_path / "set")
     for path in [path for path in root.rglob("*") if path.is_file() and path.suffix != ".json"]:
         path.unlink()
         path.mkdir()
@@ -148,7 +151,8 @@ PAGE = b'\n<!DOCTYPE html>\n<html lang="en"><head><title>Sign in</title></head><
 def test_what_a_download_left_in_place_of_a_file_is_named(
     whole: tuple[str, Path], tmp_path: Path, content: bytes, words: str
 ) -> None:
-    name, root = whole[0], shutil.copytree(whole[1], tmp_path / "set")
+    name = whole[0]
+    root = shutil.copytree(whole[1], tmp_path / "set")
     for path in [path for path in sorted(root.rglob("*")) if path.is_file()]:
         payload = path.read_bytes()
         path.write_bytes(content)

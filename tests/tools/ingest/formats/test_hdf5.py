@@ -73,7 +73,8 @@ def test_a_demo_of_another_file_is_refused(tmp_path: Path) -> None:
 
 def test_links_that_lead_in_a_circle_are_reported(path: Path) -> None:
     with h5py.File(path, "a") as file:
-        file["one"], file["two"] = h5py.SoftLink("/two"), h5py.SoftLink("/one")
+        file["one"] = h5py.SoftLink("/two")
+        file["two"] = h5py.SoftLink("/one")
     with pytest.raises(EpisodeError, match=r"a.h5: "), open_file(path) as file:
         rows(file, "one", path)
 

@@ -23,7 +23,10 @@ from tests.tools.ingest.formats.toy_demos import write_demos
 from tests.tools.ingest.formats.toy_tfrecord import bridge_episode, write_bridge
 from tests.tools.ingest.formats.videos import close_videos, write_video
 
-EPISODES, FIRST, STEPS, SIDE = 50, 10, 12, 128
+EPISODES = 50
+FIRST = 10
+STEPS = 12
+SIDE = 128
 MOST = 16 * 2**20  # bytes; fifty episodes that are held take 29 MB and more
 NOISE = np.random.default_rng(0).integers(0, 255, (STEPS, SIDE, SIDE, 3), np.uint8)
 

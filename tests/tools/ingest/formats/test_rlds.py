@@ -205,7 +205,8 @@ def test_the_bundled_bridge_episodes() -> None:
         assert list(episode.cameras) == ["image_0", "image_1", "image_2"] and episode.meta["blank"] == ["image_3"]
         assert all(frames.read(range(10)).shape == (10, 64, 64, 3) for frames in episode.cameras.values())
         assert episode.actions.shape == (10, 7) and episode.actions[:, :6].any()
-        moved, rows = np.diff(np.asarray(episode.states)[:, :3], axis=0)[1:-1], episode.actions[:, :3]
+        moved = np.diff(np.asarray(episode.states)[:, :3], axis=0)[1:-1]
+        rows = episode.actions[:, :3]
         missed.append([np.abs(moved - others).mean() for others in (rows[1:-2], rows[2:-1], rows[3:])])
     before, own, after = np.mean(missed, axis=0)
     assert own < 0.6 * after and own < before  # row t is what moved the arm into frame t; the arm lags a little

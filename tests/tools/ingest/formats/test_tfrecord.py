@@ -39,7 +39,8 @@ def test_a_truncated_file_keeps_what_is_before_the_cut(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     path = write_records(tmp_path_factory.mktemp("cut") / "a.tfrecord", PAYLOADS)
-    whole, kept = path.read_bytes(), list(spans(path))
+    whole = path.read_bytes()
+    kept = list(spans(path))
     cut = data.draw(st.integers(1, len(whole) - 1))
     path.write_bytes(whole[:cut])
     complete = [span for span in kept if span[0] + 16 + span[1] <= cut]

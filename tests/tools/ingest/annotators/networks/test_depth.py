@@ -98,7 +98,8 @@ def test_depth_anything_gives_maps_of_the_pictures_size(depth_anything, kind, un
 @pytest.mark.parametrize("kind", ["relative", "metric"])
 def test_depth_anything_gives_the_librarys_own_numbers(depth_anything, kind):
     transformers = pytest.importorskip("transformers")
-    folder, frames = depth_anything(kind), sliding(3, (1, 0), (28, 28))
+    folder = depth_anything(kind)
+    frames = sliding(3, (1, 0), (28, 28))
     depth = DepthAnything(folder, batch=2)(episode(frames), "top")
     model = transformers.DepthAnythingForDepthEstimation.from_pretrained(folder)
     inputs = transformers.DPTImageProcessor.from_pretrained(folder)(list(frames.pictures), return_tensors="pt")

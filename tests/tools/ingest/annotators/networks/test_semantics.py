@@ -111,7 +111,8 @@ def test_only_parts_without_text_are_asked_about_and_key_pictures_become_frames(
 
 
 def test_a_key_picture_counts_before_the_peak_of_motion(tmp_path):
-    recording, motion = episode(FRAMES, "", PARTS), np.eye(20)[18]
+    recording = episode(FRAMES, "", PARTS)
+    motion = np.eye(20)[18]
     own = OwnSemantics()(recording, "top", motion)
     assert own.parts[1].key_by == "motion" and own.parts[1].key_frames != (12,)
     found = complete(own, recording, "top", saying(json.dumps(GOOD)), InternVL(tmp_path, pictures=4))
@@ -139,7 +140,8 @@ def test_the_real_network_sees_every_picture_and_is_checked(tmp_path, monkeypatc
     recording = episode(FRAMES, "", PARTS)
     settings = InternVL(save_small(tmp_path), pictures=3, tries=2, new_tokens=4)
     model, _ = settings.load()
-    shapes, generate = [], model.generate
+    shapes = []
+    generate = model.generate
     monkeypatch.setattr(model, "generate", lambda **x: shapes.append(x["pixel_values"].shape) or generate(**x))
     with pytest.raises(AnnotationError, match="episode e0: no valid answer in 2 tries"):
         settings(recording, "top")

@@ -38,7 +38,8 @@ def tinted(count, step, seed, tint):
 
 @pytest.mark.parametrize("count", [1, 49, 50, 51, 100, 101, 173])
 def test_windows_cover_every_frame_once(count):
-    stub, rng = Stub(), np.random.default_rng(count)
+    stub = Stub()
+    rng = np.random.default_rng(count)
     wanted = rng.random(count) < 0.3
     pictures = np.where(wanted[:, None, None, None], 255, 0) * np.ones((1, 27, 48, 3))
     found = transition_probabilities(stub, pictures.astype(np.uint8), "cpu")
