@@ -147,8 +147,7 @@ def presets() -> dict[str, dict[str, Any]]:
     import jax
 
     from rsjax.config import presets
-    from rsjax.models import create_model
-    from rsjax.models.base import create_autoencoder
+    from rsjax.models.base import create_autoencoder, create_model
 
     found = {}
     for name in presets.PRESETS:

@@ -198,7 +198,7 @@ def test_bugs_keep_their_traceback(bug: Exception) -> None:
 
 def test_two_presets_of_one_name_are_refused() -> None:
     with pytest.raises(ConfigError, match="two presets are named 'debug'"):
-        presets.collect(presets.debug, presets.tiny, presets.debug)
+        presets.collect(presets.debug(), presets.tiny(), presets.debug())
 
 
 def test_nothing_near_suggests_nothing() -> None:

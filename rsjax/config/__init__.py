@@ -7,9 +7,7 @@ A field made with :func:`runtime` changes the speed or the logging of a run, not
 out, so changing it never invalidates finished work.
 """
 
-from rsjax.config.cogvideox import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.config.data import ClipShape, DataConfig
-from rsjax.config.diffusion import DenoiseConfig, NoiseConfig
 from rsjax.config.fields import (
     ConfigError,
     check_numbers,
@@ -21,9 +19,7 @@ from rsjax.config.fields import (
     sampling_settings,
     to_dict,
 )
-from rsjax.config.irasim import DiTConfig, IRASimConfig, KLConfig
-from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig, TopKConfig
-from rsjax.config.model import FAMILIES, ModelConfig, register_family
+from rsjax.config.model import ModelConfig, families, register_family
 from rsjax.config.run import Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import (
@@ -39,41 +35,29 @@ from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import ComponentConfig, CurriculumStageConfig, LoopConfig, OptimizerConfig
 
 __all__ = [
-    "FAMILIES",
-    "CausalVAEConfig",
     "ClipShape",
-    "CogVideoXConfig",
     "ComponentConfig",
-    "ConditionalVQConfig",
     "Config",
     "ConfigError",
     "CurriculumStageConfig",
     "DataConfig",
-    "DenoiseConfig",
-    "DiTConfig",
     "EvalConfig",
     "GenieConfig",
-    "GuidedDenoiseConfig",
-    "IRASimConfig",
-    "IVideoGPTConfig",
-    "KLConfig",
     "LoopConfig",
     "LossConfig",
     "MaskConfig",
     "ModelConfig",
-    "NoiseConfig",
     "OptimizerConfig",
     "RoboScapeConfig",
     "SampleConfig",
     "SimConfig",
-    "TextConfig",
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",
-    "TopKConfig",
     "TransformerConfig",
     "check_numbers",
     "content_key",
+    "families",
     "from_dict",
     "register_family",
     "require",

@@ -5,6 +5,7 @@ Each family is registered under a name. ``Config.model`` is one of them, chosen 
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from importlib import import_module
 from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from rsjax.config.data import ClipShape
@@ -22,16 +23,10 @@ class ModelConfig:
         family: its registered name.
         uses_tokenizer: whether a tokenizer is trained before the model: that of ``Config.tokenizer``, or the family's
             own (:attr:`own_autoencoder`).
-        step_seconds: seconds per step of autoencoder and of model in the family's small preset, on the machine of
-            :mod:`rsjax.tools.studies.paper.budget` while it is idle; None: estimated from their operations.
-        episode_seconds: seconds by which an imagined episode of Lift takes longer than a simulated one, on 2 cores of
-            an Intel Ice Lake.
     """
 
     family: ClassVar[str] = ""
     uses_tokenizer: ClassVar[bool] = False
-    step_seconds: ClassVar[tuple[float, float] | None] = None
-    episode_seconds: ClassVar[float] = 0.0
 
     def check(self, clips: ClipShape) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the model does not fit clips of this shape."""
@@ -88,7 +83,8 @@ class ModelConfig:
         return family(values["family"]), {name: value for name, value in values.items() if name != "family"}
 
 
-FAMILIES: dict[str, type[ModelConfig]] = {}
+FAMILIES: dict[str, type[ModelConfig]] = {}  # those whose settings have been imported; families() imports all
+BASELINES = ("cogvideox", "irasim", "ivideogpt")  # their settings are in rsjax/models/NAME/config.py
 
 
 def register_family(name: str) -> Callable[[M], M]:
@@ -107,16 +103,23 @@ def register_family(name: str) -> Callable[[M], M]:
     return register
 
 
+def families() -> dict[str, type[ModelConfig]]:
+    """Returns the settings class of every family by name."""
+    for name in BASELINES:
+        import_module(f"rsjax.models.{name}.config")
+    return FAMILIES
+
+
 def family(name: str) -> type[ModelConfig]:
     """Returns the settings class of the family called ``name``.
 
     Raises:
         ConfigError: the name is unknown; the message suggests the closest and lists all.
     """
-    if name not in FAMILIES:
-        names = ", ".join(sorted(FAMILIES))
-        raise ConfigError(f"unknown model {name!r}{did_you_mean(name, FAMILIES)} (models: {names})")
-    return FAMILIES[name]
+    known = families()
+    if name not in known:
+        raise ConfigError(f"unknown model {name!r}{did_you_mean(name, known)} (models: {', '.join(sorted(known))})")
+    return known[name]
 
 
 def converted(model: ModelConfig, name: str) -> ModelConfig:

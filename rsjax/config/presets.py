@@ -1,6 +1,5 @@
 """The presets: complete named configurations, one function each."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from rsjax.config import (
@@ -17,17 +16,14 @@ from rsjax.config import (
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
-    cogvideox_presets,
-    irasim_presets,
-    ivideogpt_presets,
 )
-from rsjax.config.cogvideox_presets import cogvideox_2b, cogvideox_5b_i2v
 from rsjax.config.curriculum import parse_stage
-from rsjax.config.irasim_presets import irasim_b, irasim_l, irasim_s, irasim_xl
-from rsjax.config.ivideogpt_presets import ivideogpt_64, ivideogpt_256
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.config.run import FULL_SIZE_EVAL
 from rsjax.errors import did_you_mean
+from rsjax.models.cogvideox.presets import cogvideox_2b, cogvideox_5b_i2v, cogvideox_tiny
+from rsjax.models.irasim.presets import irasim_b, irasim_l, irasim_s, irasim_tiny, irasim_xl
+from rsjax.models.ivideogpt.presets import ivideogpt_64, ivideogpt_256, ivideogpt_tiny
 
 
 def debug() -> Config:
@@ -171,21 +167,6 @@ def genie_35m_actions() -> Config:
     return _full_size("genie_35m_actions", GenieConfig())
 
 
-def ivideogpt_tiny() -> Config:
-    """Returns iVideoGPT on the clips of :func:`tiny`, trained for about as long."""
-    return ivideogpt_presets.ivideogpt_tiny(tiny())
-
-
-def irasim_tiny() -> Config:
-    """Returns IRASim on the clips of :func:`tiny`, trained for about as long."""
-    return irasim_presets.irasim_tiny(tiny())
-
-
-def cogvideox_tiny() -> Config:
-    """Returns CogVideoX on the clips of :func:`tiny`, trained for about as long."""
-    return cogvideox_presets.cogvideox_tiny(tiny())
-
-
 def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     """Returns a preset with 256² pixels, 16 frames of 16×16 tokens, 32 blocks, and the paper's λ and γ (the defaults).
 
@@ -231,27 +212,42 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     )
 
 
-def collect(*makers: Callable[[], Config]) -> dict[str, Config]:
-    """Returns the configurations of ``makers`` by name.
+def collect(*configs: Config) -> dict[str, Config]:
+    """Returns the configurations by name.
 
     Raises:
         ConfigError: two have the same name.
     """
     presets: dict[str, Config] = {}
-    for make in makers:
-        config = make()
+    for config in configs:
         if config.name in presets:
             raise ConfigError(f"two presets are named {config.name!r}; rename one of them in rsjax/config/presets.py")
         presets[config.name] = config
     return presets
 
 
-ROBOSCAPE = (debug, tiny, multitask, roboscape_s, roboscape_m, roboscape_l)
-GENIE = (genie_35m, genie_138m, genie_35m_actions)
-IVIDEOGPT = (ivideogpt_64, ivideogpt_256, ivideogpt_tiny)
-IRASIM = (irasim_s, irasim_b, irasim_l, irasim_xl, irasim_tiny)
-COGVIDEOX = (cogvideox_2b, cogvideox_5b_i2v, cogvideox_tiny)
-PRESETS = collect(*ROBOSCAPE, *GENIE, *IVIDEOGPT, *IRASIM, *COGVIDEOX)
+PRESETS = collect(
+    debug(),
+    tiny(),
+    multitask(),
+    roboscape_s(),
+    roboscape_m(),
+    roboscape_l(),
+    genie_35m(),
+    genie_138m(),
+    genie_35m_actions(),
+    ivideogpt_64(),
+    ivideogpt_256(),
+    ivideogpt_tiny(tiny()),
+    irasim_s(),
+    irasim_b(),
+    irasim_l(),
+    irasim_xl(),
+    irasim_tiny(tiny()),
+    cogvideox_2b(),
+    cogvideox_5b_i2v(),
+    cogvideox_tiny(tiny()),
+)
 
 
 def get(name: str) -> Config:

@@ -6,6 +6,7 @@ A family consists of a subclass of :class:`rsjax.config.ModelConfig` (its settin
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from rsjax.clip import Video
 from rsjax.config import Config, ConfigError, ModelConfig
+from rsjax.config.model import BASELINES
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
@@ -273,6 +275,7 @@ class WorldModel(Trainable[B], Protocol[B]):
         return {}
 
 
+BUILT_IN = ("roboscape", "genie", *BASELINES)  # each is implemented in rsjax/models/NAME/model.py
 MODELS: dict[type[ModelConfig], type[WorldModel[Any]]] = {}
 
 
@@ -306,6 +309,8 @@ def with_random_files(config: Config, folder: Path) -> Config:
 
 
 def _implementation(config: Config) -> type[WorldModel[Any]]:
+    if config.model.family in BUILT_IN:
+        import_module(f"rsjax.models.{config.model.family}.model")
     kind = MODELS.get(type(config.model))
     if kind is None:
         raise ConfigError(f"model family {config.model.family!r} has settings but no implementation; import its module")

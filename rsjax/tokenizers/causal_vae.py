@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.config import CausalVAEConfig
-from rsjax.config.cogvideox import DECODED, ENCODED
 from rsjax.layers.convolution import Dtype
 from rsjax.layers.convolution import convolve as convolve_bf16
 from rsjax.layers.group_norm import GroupNorm
+from rsjax.models.cogvideox.config import DECODED, ENCODED, CausalVAEConfig
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Downsample, Upsample
 from rsjax.trainable import Params

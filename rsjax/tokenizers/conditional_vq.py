@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.config import ConditionalVQConfig
 from rsjax.layers.group_norm import GroupNorm
+from rsjax.models.ivideogpt.config import ConditionalVQConfig
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Map, decode, encode
 

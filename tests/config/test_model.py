@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from rsjax.config import (
-    FAMILIES,
     Config,
     ConfigError,
     GenieConfig,
@@ -16,6 +15,7 @@ from rsjax.config import (
     ModelConfig,
     RoboScapeConfig,
     SampleConfig,
+    families,
     from_dict,
     presets,
     register_family,
@@ -36,7 +36,7 @@ def as_read(values: dict[str, Any]) -> Config:
     return from_dict(Config, json.loads(json.dumps(values)))
 
 
-@pytest.mark.parametrize("model", [*CHANGED, *(kind() for kind in FAMILIES.values())], ids=lambda model: model.family)
+@pytest.mark.parametrize("model", [*CHANGED, *(kind() for kind in families().values())], ids=lambda model: model.family)
 def test_every_family_survives_json(model: ModelConfig) -> None:
     config = replace(DEBUG, model=model)
     values = to_dict(config)
@@ -71,7 +71,7 @@ def test_fields_of_one_name_and_unlike_types_stay_with_their_family(preset: str,
 
 @pytest.mark.parametrize("name", ["roboscape", "genie"])
 def test_a_model_of_the_family_already_stays_as_it_is(name: str) -> None:
-    config = replace(DEBUG, model=replace(FAMILIES[name](), width=64))  # type: ignore[call-arg]
+    config = replace(DEBUG, model=replace(families()[name](), width=64))  # type: ignore[call-arg]
     assert config.with_family(name) == config
 
 
@@ -106,7 +106,7 @@ def test_two_families_of_one_name_are_refused() -> None:
         class Another(ModelConfig):
             pass
 
-    assert FAMILIES["genie"] is GenieConfig
+    assert families()["genie"] is GenieConfig
 
 
 def test_frames_that_are_masked_whole_must_be_read_otherwise() -> None:

@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from rsjax.config import GenieConfig, RoboScapeConfig, presets
-from rsjax.models import create_model
+from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.describe import by_part, count
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
-from rsjax.config import Config, ConfigError, KLConfig, presets, to_dict
+from rsjax.config import Config, ConfigError, presets, to_dict
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.irasim.config import KLConfig
 from tests.models import families
 
 GENIE, IVIDEOGPT, IRASIM, COGVIDEOX = (make() for make in families.FAMILIES.values())

@@ -10,10 +10,10 @@ import pytest
 
 import rsjax
 from rsjax.clip import Video
-from rsjax.config import FAMILIES, Config, LoopConfig, ModelConfig, register_family
+from rsjax.config import Config, LoopConfig, ModelConfig, register_family
+from rsjax.config.model import FAMILIES
 from rsjax.errors import UserError
-from rsjax.models import WorldModel
-from rsjax.models.base import MODELS, implements
+from rsjax.models.base import MODELS, WorldModel, implements
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.tokenize import described, prepare_store
 from rsjax.tools.bench import parts

@@ -7,7 +7,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.config import Config, ModelConfig, register_family
-from rsjax.models import WorldModel, implements
+from rsjax.models.base import WorldModel, implements
 
 
 @register_family("toy")

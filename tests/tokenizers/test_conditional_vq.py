@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import ConditionalVQConfig, ConfigError, TokenizerTrainConfig
+from rsjax.config import ConfigError, TokenizerTrainConfig
 from rsjax.layers import convolution
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
+from rsjax.models.ivideogpt.config import ConditionalVQConfig
 from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ
 from rsjax.tools.convert.ivideogpt import infer_tokenizer, tokenizer_from_public, tokenizer_shapes, tokenizer_table
 from rsjax.tools.convert.table import public_shapes, to_tensors

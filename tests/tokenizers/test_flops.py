@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Config, KLConfig, TokenizerConfig
+from rsjax.config import Config, TokenizerConfig
 from rsjax.models.base import create_autoencoder
+from rsjax.models.irasim.config import KLConfig
 from rsjax.tokenizers.conditional_vq import Codebook, CrossAttention
 from rsjax.tokenizers.flops import products, tokenizer_flops
 from rsjax.tokenizers.magvit2 import Tokenizer

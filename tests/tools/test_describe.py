@@ -14,7 +14,7 @@ from rich.console import Console
 from experiments import describe as command
 from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
-from rsjax.models import create_model
+from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.transformer import empty_cache

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, Config, TokenizerTrainConfig, require
-from rsjax.config.cogvideox import COMPRESSION, padded_frames
+from rsjax.config import Config, TokenizerTrainConfig, require
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
+from rsjax.models.cogvideox.config import COMPRESSION, CausalVAEConfig, CogVideoXConfig, padded_frames
 from rsjax.models.diffusion import latents as distributions
 from rsjax.models.saved import check_alike, read_model
 from rsjax.tokenizers import causal_vae as vae

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
-from rsjax.config import ClipShape, CogVideoXConfig, Config, TextConfig
+from rsjax.config import ClipShape, Config
 from rsjax.config.config_fields import with_values
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
@@ -24,6 +24,7 @@ from rsjax.data.store import Store
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.cogvideox import pretrained
 from rsjax.models.cogvideox.autoencoder import CausalCodec, CausalVAETraining, notes_on_filling
+from rsjax.models.cogvideox.config import CogVideoXConfig, TextConfig
 from rsjax.models.cogvideox.rollout import rollout
 from rsjax.models.cogvideox.text import EMPTY, check_store, check_tasks, empty_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, forward_flops

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from rsjax.config import CogVideoXConfig
 from rsjax.errors import UserError
+from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.cogvideox.transformer import Architecture, shapes
 from rsjax.models.saved import check_alike, read_model
 from rsjax.progress import note

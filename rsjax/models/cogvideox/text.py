@@ -16,9 +16,9 @@ import safetensors.numpy
 from jaxtyping import Float32
 
 from rsjax.clip import UNKNOWN
-from rsjax.config import TextConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError, first_line
+from rsjax.models.cogvideox.config import TextConfig
 from rsjax.progress import note
 
 EMBEDDINGS, TEXTS = "embeddings", "texts"

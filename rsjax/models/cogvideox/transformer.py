@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Key
 
-from rsjax.config import CogVideoXConfig
-from rsjax.config.cogvideox import latent_frames
 from rsjax.config.data import ClipShape
 from rsjax.layers.attention import Dense, attend_cells
+from rsjax.models.cogvideox.config import CogVideoXConfig, latent_frames
 from rsjax.models.diffusion.layers import PERIOD, TimeEmbedding, grid_positions, positions
 from rsjax.trainable import Params
 

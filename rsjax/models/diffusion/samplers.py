@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from rsjax.config import DenoiseConfig, NoiseConfig
+from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig
 from rsjax.models.diffusion.schedule import Latents, alphas
 
 PAST = 3  # outputs that PNDM remembers

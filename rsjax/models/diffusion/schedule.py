@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from rsjax.config import NoiseConfig
+from rsjax.models.diffusion.config import NoiseConfig
 
 Latents: TypeAlias = Float[Array, "*N"]
 

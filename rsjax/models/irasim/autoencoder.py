@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import Config, KLConfig, TokenizerTrainConfig
+from rsjax.config import Config, TokenizerTrainConfig
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
 from rsjax.models.diffusion import latents as distributions
 from rsjax.models.irasim import pretrained
+from rsjax.models.irasim.config import KLConfig
 from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.autoencoder import Autoencoder

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
-from rsjax.config import ClipShape, Config, IRASimConfig
+from rsjax.config import ClipShape, Config
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
@@ -23,6 +23,7 @@ from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.diffusion.schedule import add_noise, target
 from rsjax.models.irasim import pretrained
 from rsjax.models.irasim.autoencoder import KLCodec, KLTraining
+from rsjax.models.irasim.config import IRASimConfig
 from rsjax.models.irasim.dit import Architecture, DiT, architecture, forward_flops
 from rsjax.models.irasim.rollout import rollout
 from rsjax.tokenizers.tokenize import described, prepare_store

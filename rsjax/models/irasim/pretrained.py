@@ -9,10 +9,11 @@ from typing import TypeVar
 
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from rsjax.config import Config, ConfigError, IRASimConfig, KLConfig, from_dict
+from rsjax.config import Config, ConfigError, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.files import read_json
+from rsjax.models.irasim.config import IRASimConfig, KLConfig
 from rsjax.models.irasim.dit import Architecture, architecture
 from rsjax.models.saved import check_family
 from rsjax.progress import note

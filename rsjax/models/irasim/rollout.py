@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from rsjax.config import IRASimConfig
 from rsjax.data.normalization import with_sums
 from rsjax.devices import divide
 from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.models.irasim.config import IRASimConfig
 from rsjax.models.irasim.dit import Architecture, DiT
 from rsjax.trainable import Params
 

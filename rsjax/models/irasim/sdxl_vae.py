@@ -8,7 +8,7 @@ Axes: B images, H×W pixels, h×w cells, z latent channels.
 import flax.linen as nn
 from jaxtyping import Array, Float
 
-from rsjax.config import KLConfig
+from rsjax.models.irasim.config import KLConfig
 from rsjax.tokenizers.vae_blocks import Map, decode, encode
 
 

@@ -19,12 +19,13 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Key
 
 from rsjax.clip import Video
-from rsjax.config import ConditionalVQConfig, Config, IVideoGPTConfig, TokenizerTrainConfig, require
+from rsjax.config import Config, TokenizerTrainConfig, require
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.devices import divide
 from rsjax.errors import UserError
+from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.saved import check_alike, read_model, saved_inputs
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import each_pass, images_per_pass

@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.clip import Video
-from rsjax.config import ClipShape, Config, IVideoGPTConfig
+from rsjax.config import ClipShape, Config
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
@@ -23,6 +23,7 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, WorldModel, implements
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
+from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.models.ivideogpt.rollout import generate
 from rsjax.models.ivideogpt.sequence import Layout

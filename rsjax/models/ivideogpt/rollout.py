@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import TopKConfig
 from rsjax.devices import divide
 from rsjax.layers.attention import KeyValues
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec
+from rsjax.models.ivideogpt.config import TopKConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA, empty_cache, folded
 from rsjax.trainable import Params
 

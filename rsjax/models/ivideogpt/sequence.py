@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from rsjax.config import IVideoGPTConfig
+from rsjax.models.ivideogpt.config import IVideoGPTConfig
 
 
 @dataclass(frozen=True)

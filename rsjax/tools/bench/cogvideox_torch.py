@@ -11,8 +11,8 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from torch import Tensor, nn
 
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, Config
-from rsjax.config.cogvideox import COMPRESSION, padded_frames
+from rsjax.config import Config
+from rsjax.models.cogvideox.config import COMPRESSION, CausalVAEConfig, CogVideoXConfig, padded_frames
 from rsjax.models.cogvideox.transformer import Architecture
 from rsjax.models.diffusion.schedule import alphas
 from rsjax.tools.bench.torch_work import TorchWork

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaForCausalLM
 
-from rsjax.config import ClipShape, Config, IVideoGPTConfig
+from rsjax.config import ClipShape, Config
+from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.tools.bench.ivideogpt_vq_torch import ConditionalVQTorch
 from rsjax.tools.bench.torch_work import TorchWork

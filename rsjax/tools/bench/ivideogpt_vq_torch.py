@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rsjax.config import ConditionalVQConfig
+from rsjax.models.ivideogpt.config import ConditionalVQConfig
 
 
 class Resnet(nn.Module):

@@ -8,8 +8,9 @@ from typing import Any
 
 import jax
 
-from rsjax.config import CogVideoXConfig, Config, ConfigError, require
+from rsjax.config import Config, ConfigError, require
 from rsjax.errors import UserError
+from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.bench.timing import median_seconds
 

@@ -17,11 +17,12 @@ import jax
 import numpy as np
 
 from rsjax.clip import UNKNOWN
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, ConfigError
+from rsjax.config import ConfigError
 from rsjax.data.store import open_store
 from rsjax.errors import first_line
 from rsjax.files import write_file
 from rsjax.models.cogvideox import autoencoder
+from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig
 from rsjax.models.cogvideox.pretrained import saved_architecture
 from rsjax.models.cogvideox.text import EMPTY, write_texts
 from rsjax.models.cogvideox.transformer import shapes

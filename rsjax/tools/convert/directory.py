@@ -8,9 +8,10 @@ from typing import Literal, TypeVar
 
 import jax
 
-from rsjax.config import KLConfig, ModelConfig, TokenizerConfig, to_dict
+from rsjax.config import ModelConfig, TokenizerConfig, to_dict
 from rsjax.files import disk_guard, read_json, write_json
 from rsjax.models.irasim import autoencoder, dit, pretrained
+from rsjax.models.irasim.config import KLConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.pretrained import read_architecture
 from rsjax.models.roboscape.transformer import Transformer

@@ -15,8 +15,9 @@ from typing import Any
 
 import jax
 
-from rsjax.config import ConditionalVQConfig, ConfigError, IVideoGPTConfig, from_dict, to_dict
+from rsjax.config import ConfigError, from_dict, to_dict
 from rsjax.files import parse_json
+from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.sequence import Layout
 from rsjax.models.saved import Inputs, read_model, saved_inputs

@@ -12,8 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import ConfigError, KLConfig
+from rsjax.config import ConfigError
 from rsjax.models.irasim.autoencoder import SDXL_FACTOR, init
+from rsjax.models.irasim.config import KLConfig
 from rsjax.progress import note
 from rsjax.tools.convert.directory import load_kl_autoencoder, save
 from rsjax.tools.convert.files import (

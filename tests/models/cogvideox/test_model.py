@@ -12,18 +12,19 @@ import pytest
 import safetensors.numpy
 
 from rsjax.clip import Video
-from rsjax.config import CogVideoXConfig, ConfigError, GuidedDenoiseConfig, NoiseConfig, TextConfig, presets, to_dict
-from rsjax.config.cogvideox import latent_frames, padded_frames
+from rsjax.config import ConfigError, presets, to_dict
 from rsjax.config.config_fields import with_values
 from rsjax.data.normalization import Normalization
 from rsjax.errors import UserError
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.cogvideox.autoencoder import CausalCodec, filled
+from rsjax.models.cogvideox.config import CogVideoXConfig, GuidedDenoiseConfig, TextConfig, latent_frames, padded_frames
 from rsjax.models.cogvideox.model import latent_arrays
 from rsjax.models.cogvideox.pretrained import saved_architecture
 from rsjax.models.cogvideox.rollout import _chunk, rollout
 from rsjax.models.cogvideox.text import check_tasks, read_texts, texts_of, write_texts
 from rsjax.models.cogvideox.transformer import Architecture, forward_flops, shapes
+from rsjax.models.diffusion.config import NoiseConfig
 from rsjax.models.diffusion.schedule import alphas
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.tools.bench import inputs

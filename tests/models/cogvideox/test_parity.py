@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.models.cogvideox import autoencoder
+from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, shapes
 from rsjax.models.diffusion.samplers import denoise, make_plan
 from rsjax.models.diffusion.schedule import alphas

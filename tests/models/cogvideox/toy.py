@@ -4,8 +4,9 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, Config, GuidedDenoiseConfig, TextConfig
+from rsjax.config import Config
 from rsjax.models.base import create_autoencoder
+from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.models.cogvideox.transformer import Architecture, shapes
 from rsjax.trainable import Params
 from tests.models.irasim.toy import drawn

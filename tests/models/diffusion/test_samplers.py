@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, DenoiseConfig, NoiseConfig
+from rsjax.config import ConfigError
+from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig
 from rsjax.models.diffusion.samplers import denoise, make_plan
 from rsjax.models.diffusion.schedule import add_noise, alphas, target
 

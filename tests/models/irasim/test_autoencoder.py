@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import ConfigError, KLConfig
+from rsjax.config import ConfigError
 from rsjax.layers import convolution
 from rsjax.models.base import create_autoencoder
 from rsjax.models.irasim.autoencoder import KLCodec, decode, init, posterior
+from rsjax.models.irasim.config import KLConfig
 from rsjax.tools.convert.kl_autoencoder import from_public, infer_config, to_public
 from rsjax.trainable import StepContext
 from tests.models.irasim import toy

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import Config, DenoiseConfig, KLConfig
+from rsjax.config import Config
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import Assets, create_model
+from rsjax.models.diffusion.config import DenoiseConfig
+from rsjax.models.irasim.config import KLConfig
 from rsjax.models.irasim.dit import Architecture, forward_flops
 from rsjax.models.irasim.model import latent_arrays
 from rsjax.models.irasim.rollout import rollout

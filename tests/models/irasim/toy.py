@@ -7,8 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import Config, DenoiseConfig, IRASimConfig, KLConfig
+from rsjax.config import Config
 from rsjax.models.base import create_autoencoder, create_model
+from rsjax.models.diffusion.config import DenoiseConfig
+from rsjax.models.irasim.config import IRASimConfig, KLConfig
 from rsjax.trainable import Params
 from tests.tools.pipeline import toy
 

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Config, ConfigError, IVideoGPTConfig, TopKConfig, to_dict
+from rsjax.config import Config, ConfigError, to_dict
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.models.ivideogpt.autoencoder import ConditionalVQTraining
+from rsjax.models.ivideogpt.config import IVideoGPTConfig, TopKConfig
 from rsjax.models.ivideogpt.llama import LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.tokenizers.flops import products

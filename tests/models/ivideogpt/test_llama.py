@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import ClipShape, IVideoGPTConfig, TopKConfig
+from rsjax.config import ClipShape
 from rsjax.data.normalization import Normalization
 from rsjax.layers import attention
 from rsjax.models.base import Assets
+from rsjax.models.ivideogpt.config import IVideoGPTConfig, TopKConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.ivideogpt.rollout import pick, sample

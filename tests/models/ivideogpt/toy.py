@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import ClipShape, ConditionalVQConfig, IVideoGPTConfig
+from rsjax.config import ClipShape
+from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.tools.convert.ivideogpt import tokenizer_shapes
 from rsjax.trainable import Params

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from rsjax.config import Config, GenieConfig, LossConfig, MaskConfig, RoboScapeConfig, presets
-from rsjax.models import Genie, RoboScape, create_model
+from rsjax.models.base import create_model
+from rsjax.models.genie.model import Genie
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
+from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers.flops import products
 from rsjax.tools.bench import inputs

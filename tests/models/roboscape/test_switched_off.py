@@ -8,7 +8,7 @@ import pytest
 
 from rsjax.config import presets
 from rsjax.config.config_fields import with_values
-from rsjax.models import create_model
+from rsjax.models.base import create_model
 from rsjax.models.roboscape import model as roboscape
 from rsjax.tools.bench import inputs
 from rsjax.trainable import StepContext, combine

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import Config, ConfigError, TopKConfig, presets
+from rsjax.config import Config, ConfigError, presets
 from rsjax.data.normalization import Normalization
 from rsjax.models.base import Assets
+from rsjax.models.ivideogpt.config import TopKConfig
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.tools.bench.run import bench
 from rsjax.tools.convert.ivideogpt import llama_table, tokenizer_table

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from rsjax.config import Config, ConfigError, TextConfig, presets
+from rsjax.config import Config, ConfigError, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
+from rsjax.models.cogvideox.config import TextConfig
 from rsjax.models.cogvideox.text import texts_of
 from rsjax.tools.bench import parts
 from rsjax.tools.bench.run import PARTS, _shown, bench, ratios, table

@@ -9,10 +9,10 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import CausalVAEConfig, CogVideoXConfig, TextConfig
 from rsjax.errors import UserError
 from rsjax.models.base import create_model
 from rsjax.models.cogvideox.autoencoder import init
+from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, TextConfig
 from rsjax.models.cogvideox.pretrained import completed, saved_architecture
 from rsjax.models.cogvideox.text import read_texts
 from rsjax.models.cogvideox.transformer import shapes

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import FAMILIES, ModelConfig, TokenizerConfig, presets, to_dict
+from rsjax.config import ModelConfig, TokenizerConfig, families, presets, to_dict
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -82,7 +82,7 @@ def test_a_run_of_a_family_that_is_not_this_network_is_refused(tmp_path: Path, m
     class Pixels(ModelConfig):
         family = "pixels"
 
-    monkeypatch.setitem(FAMILIES, "pixels", Pixels)
+    monkeypatch.setitem(families(), "pixels", Pixels)
     (tmp_path / "config.json").write_text(json.dumps(to_dict(replace(presets.debug(), model=Pixels()))))
     with pytest.raises(UserError, match="holds a model of family 'pixels'; start from one of family robo"):
         load_world_model(tmp_path)

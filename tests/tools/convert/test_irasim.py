@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import KLConfig
 from rsjax.models.irasim.autoencoder import init
+from rsjax.models.irasim.config import KLConfig
 from rsjax.tools.convert.directory import load_irasim, load_kl_autoencoder
 from rsjax.tools.convert.files import write_safetensors
 from rsjax.tools.convert.kl_autoencoder import to_public

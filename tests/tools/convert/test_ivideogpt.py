@@ -8,7 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import ClipShape, ConditionalVQConfig, IVideoGPTConfig
+from rsjax.config import ClipShape
+from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
 from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.models.saved import Inputs

@@ -12,7 +12,7 @@ import numpy as np
 
 from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
 from rsjax.files import FileError, holder, is_held, read_json
-from rsjax.models import create_model
+from rsjax.models.base import create_model
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.ablation.grid import Value, values_of
 from rsjax.training.log import read_log

@@ -8,7 +8,7 @@ from typing import Any
 
 from rsjax.config import require
 from rsjax.config.config_fields import config_fields
-from rsjax.config.model import FAMILIES
+from rsjax.config.model import families
 from rsjax.errors import UserError, did_you_mean
 from rsjax.evaluation.protocols import OWN
 from rsjax.evaluation.results import NAME, Result, read_result
@@ -159,7 +159,7 @@ def check_seeds(group: Group) -> None:
 
 def _deciding(model: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the :data:`SEEDED` fields of a result's model that affect scores, by dotted name."""
-    kind = FAMILIES.get(model["family"])
+    kind = families().get(model["family"])
     runtime = {f"settings.{name}" for name, field in config_fields(kind()).items() if field.runtime} if kind else set()
     named = _flat({name: model[name] for name in SEEDED if name in model})
     return {name: value for name, value in named.items() if name not in runtime}

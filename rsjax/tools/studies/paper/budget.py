@@ -23,6 +23,12 @@ STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations
 # Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
 TOKENIZER_RATE = 4.6e10
 START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
+# Seconds of a step of autoencoder and model in a family's small preset, on the idle machine; of other families' steps,
+# the operations tell the seconds.
+FAMILY_STEPS = {"irasim": (0.13, 0.34), "cogvideox": (0.85, 0.50), "ivideogpt": (0.88, 1.02)}
+# Seconds by which an imagined episode of Lift takes longer than a simulated one, on 2 cores of an Intel Ice Lake: each
+# of its 30 frames takes these families a whole video.
+FAMILY_EPISODES = {"irasim": 29.0, "ivideogpt": 3.4}
 EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds per evaluation, step of the localiser, and rollout
 
 COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # shares of a budget
@@ -136,16 +142,16 @@ def parameters(config: Config) -> tuple[int, int]:
 
 def step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the world model; 0 for a family that does not count its operations."""
-    if config.model.step_seconds:
-        return config.model.step_seconds[1]
+    if config.model.family in FAMILY_STEPS:
+        return FAMILY_STEPS[config.model.family][1]
     flops = train_flops(config)
     return STEP + flops / max(1, config.train.steps) / RATE if flops is not None else 0.0
 
 
 def tokenizer_step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the tokenizer."""
-    if config.model.step_seconds:
-        return config.model.step_seconds[0]
+    if config.model.family in FAMILY_STEPS:
+        return FAMILY_STEPS[config.model.family][0]
     loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
     return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
 

@@ -25,6 +25,7 @@ from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos
 from rsjax.tools.policies.synthesize import CLIPS, Synthesis, synthesize
 from rsjax.tools.policies.training import train_policy
 from rsjax.tools.policies.trials import Trials, lift_simulators
+from rsjax.tools.studies.paper.budget import FAMILY_EPISODES
 from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, register
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
@@ -79,7 +80,7 @@ def _seconds(
         if not _in_lift(config):
             return 0.0
         size = Size.of(config)
-        beyond = imagined * config.model.episode_seconds
+        beyond = imagined * FAMILY_EPISODES.get(config.model.family, 0.0)
         acting = size.trials.episodes * (trials * EPISODE + beyond + decisions * DECISION)
         return JUDGE_STEP * size.judge + policies * POLICY_STEP * size.policy.train.steps + acting
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.diffusion import DenoiseConfig, NoiseConfig, check_grid
 from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
+from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
 
 ENCODED, DECODED = 8, 2  # frames that the autoencoder encodes and latent frames that it decodes in one piece
 COMPRESSION = 4  # frames per latent frame, after the first
@@ -101,7 +101,6 @@ class CogVideoXConfig(ModelConfig):
     """CogVideoX: full attention over text and a clip's latents, v-prediction; the defaults are 5B-I2V. No actions."""
 
     uses_tokenizer: ClassVar[bool] = True
-    step_seconds: ClassVar[tuple[float, float] | None] = (0.85, 0.50)  # 0.74 × 0.67, the gain since, on a Zen 5
     autoencoder: CausalVAEConfig = CausalVAEConfig()
     text: TextConfig = TextConfig()
     width: int = 3072

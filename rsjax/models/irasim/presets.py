@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from rsjax.config.diffusion import DenoiseConfig
-from rsjax.config.irasim import IRASimConfig, KLConfig
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.models.diffusion.config import DenoiseConfig
+from rsjax.models.irasim.config import IRASimConfig, KLConfig
 
 
 def irasim_s() -> Config:

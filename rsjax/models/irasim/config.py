@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
-from rsjax.config.diffusion import DenoiseConfig, NoiseConfig, check_grid
 from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.config.tokenizer import TokenizerConfig
+from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,6 @@ class IRASimConfig(DiTConfig, ModelConfig):
     """IRASim (reference: its authors' public code): predicts the noise in a clip's latents; first frames are clean."""
 
     uses_tokenizer: ClassVar[bool] = True
-    step_seconds: ClassVar[tuple[float, float] | None] = (0.13, 0.34)  # 0.55 × 0.62, the gain since, on a Zen 5
-    episode_seconds: ClassVar[float] = 29.0  # each of 30 frames takes a whole video: 9.7 s for 10 episodes
     autoencoder: KLConfig = KLConfig()
     action_dropout: float = 0.1  # share of the training clips whose actions are replaced by a learned embedding
     error_weight: float = 1.0

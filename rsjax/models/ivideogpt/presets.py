@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from rsjax.config.ivideogpt import ConditionalVQConfig, IVideoGPTConfig
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 
 
 def ivideogpt_64() -> Config:

@@ -87,8 +87,6 @@ class IVideoGPTConfig(ModelConfig):
     """A LLaMA on the tokens of :class:`ConditionalVQConfig`; the defaults are the public network."""
 
     uses_tokenizer: ClassVar[bool] = True
-    step_seconds: ClassVar[tuple[float, float] | None] = (0.88, 1.02)  # 1.33 × 0.77, the gain of a faster attention
-    episode_seconds: ClassVar[float] = 3.4  # each of 30 frames takes a whole video: 1.15 s for 10 episodes
     autoencoder: ConditionalVQConfig = ConditionalVQConfig()
     width: int = 768
     blocks: int = 12

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-from rsjax.config.cogvideox import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
 from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 
 
 def cogvideox_2b() -> Config:
