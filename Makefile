@@ -32,4 +32,4 @@ lint: setup  ## ruff and mypy
 
 clean:  ## removes the environment and the caches; data and runs stay
 	@rm -rf "$(VENV)" build rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	@find rsjax experiments tests -name __pycache__ -prune -exec rm -rf {} +
+	@find rsjax experiments benchmarks scripts tests -name __pycache__ -prune -exec rm -rf {} +

@@ -1,11 +1,15 @@
 """Measures a preset's speed. ``python -m experiments.bench roboscape_s --batch 1 --json bench.json``"""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from experiments.cli import main_errors, parse
+from rsjax.config import Config
+from rsjax.errors import UserError
 from rsjax.files import write_json
 from rsjax.runtime import tune_process
 
@@ -23,7 +27,7 @@ class Options:
     horizons: tuple[int, ...] = ()
     """Lengths of rollouts in frames, including one prompt frame; default: the clips' length and three times that."""
     torch: bool = False
-    """Also measure the model in plain PyTorch (needs make extras; for RoboScape only the RGB branch)."""
+    """Also measure the model in plain PyTorch (needs a checkout and make extras; for RoboScape only the RGB branch)."""
     json: Path | None = None
     """Write the numbers to this file; it is updated after each part."""
 
@@ -39,11 +43,26 @@ def main() -> None:
     from rsjax.tools.bench.run import PARTS, bench, table
 
     jax.config.update("jax_enable_compilation_cache", False)  # so that compilation itself is measured
+    rival = pytorch_rival(config) if options.torch else None
     console = Console()
     only = tuple(options.only.split(",")) if options.only else PARTS
     keep = partial(write_json, options.json) if options.json else lambda numbers: None
-    numbers = bench(config, options.batch, only, options.horizons, options.torch, say=console.print, keep=keep)
+    numbers = bench(config, options.batch, only, options.horizons, rival, say=console.print, keep=keep)
     console.print(table(numbers))
+
+
+def pytorch_rival(config: Config) -> Callable[..., dict[str, Any]]:
+    """Returns the function that measures a family's network in PyTorch.
+
+    Raises:
+        UserError: the folder ``benchmarks`` or a package is missing, or PyTorch has no network like this one.
+    """
+    if not (Path(__file__).parents[1] / "benchmarks" / "pytorch").is_dir():
+        raise UserError("--torch needs the folder benchmarks/ of a checkout of rsjax; run there, or leave --torch out")
+    from benchmarks.pytorch.baselines import check_torch, torch_baseline
+
+    check_torch(config)
+    return torch_baseline
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.soak.rounds import Stage, Target, run_without_faults
 from tests.reliability.program import make_store
-from tests.soak.rounds import Stage, Target, run_without_faults
 from tests.tools.pipeline.conftest import command, debug, shared
 
 __all__ = ["command", "debug", "shared"]

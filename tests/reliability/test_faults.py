@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.soak.attempt import Attempt, checkpoints, last_logged
+from benchmarks.soak.compare import compare_stages
+from benchmarks.soak.disk import can_mount, small_disk
+from benchmarks.soak.faults import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, SHARES, TERMINATE, damage_file
+from benchmarks.soak.rounds import Event, Target, run_round, run_without_faults
 from rsjax.training.skipped import read_skipped
 from tests.reliability.conftest import EVERY, STEPS, Targets
-from tests.soak.attempt import Attempt, checkpoints, last_logged
-from tests.soak.compare import compare_stages
-from tests.soak.disk import can_mount, small_disk
-from tests.soak.faults import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, SHARES, TERMINATE, damage_file
-from tests.soak.rounds import Event, Target, run_round, run_without_faults
 
 SEED = 0
 

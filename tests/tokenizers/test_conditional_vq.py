@@ -155,7 +155,7 @@ def test_images_that_do_not_divide_into_tokens_are_refused() -> None:
 @pytest.mark.parametrize("changes", [{}, {"context_frames": 2, "patch_size": 2}], ids=["plain", "patches-2-context"])
 def test_tokens_and_images_are_those_of_plain_pytorch(changes: dict[str, Any]) -> None:
     torch = pytest.importorskip("torch")
-    from rsjax.tools.bench.ivideogpt_vq_torch import ConditionalVQTorch, public_tensors
+    from benchmarks.pytorch.conditional_vq import ConditionalVQTorch, public_tensors
 
     config = replace(VQ, **changes)
     size = SIZE * config.patch_size

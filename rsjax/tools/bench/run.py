@@ -15,10 +15,10 @@ from rsjax.errors import did_you_mean
 from rsjax.tools.bench import inputs, parts
 from rsjax.tools.bench.roofline import roofline
 from rsjax.tools.bench.timing import peak_memory_bytes
-from rsjax.tools.bench.torch_part import check_torch, torch_baseline
 
 PARTS = ("matmul", "train", "roofline", "sample", "tokenizer", "environment", "loader", "feed")
 MODEL_FACTS = ("blocks", "width", "use_depth", "compute_dtype", "remat")  # reported if the family has them
+Rival = Callable[[Config, int, float, int], dict[str, Any]]  # of configuration, batch, seconds, frames of a rollout
 BUDGET_SECONDS = 20.0  # per quantity, unless three runs take longer
 
 
@@ -27,7 +27,7 @@ def bench(
     batch: int = 1,
     only: Sequence[str] = PARTS,
     horizons: tuple[int, ...] = (),
-    torch: bool = False,
+    rival: Rival | None = None,
     budget: float = BUDGET_SECONDS,
     say: Callable[[str], None] = lambda line: None,
     keep: Callable[[dict[str, Any]], None] = lambda numbers: None,
@@ -38,8 +38,8 @@ def bench(
         batch: clips per training step, rollout and loader batch; the tokenizer processes their frames. The part
             ``feed`` uses the preset's batch size.
         horizons: lengths of rollouts in frames, including one prompt frame; if empty, once and three times the clips'
-            length. PyTorch decodes in a window of the first length.
-        torch: whether to measure the PyTorch baseline too.
+            length. The rival decodes in a window of the first length.
+        rival: measures the same model in PyTorch; None: only ours.
         budget: seconds after which repetitions of a quantity end, but at least three are run.
         say: takes a message before each part.
         keep: takes all numbers so far after each part, since the next part may run out of memory.
@@ -48,40 +48,57 @@ def bench(
         Numbers and facts about model and machine, flat and JSON-ready. Peak memory is the maximum up to a part's end.
 
     Raises:
-        UserError: a part is unknown, the batch is not positive, a rollout has nothing to generate, torch is not
-            installed, or the PyTorch baseline cannot be compared with the model.
+        UserError: a part is unknown, the batch is not positive, or a rollout has nothing to generate.
     """
-    check_request(config, batch, only, horizons, torch)
+    check_request(config, batch, only, horizons)
     with inputs.random_files(config) as config:
         horizons = horizons or (config.clips.frames, 3 * config.clips.frames)
-        dtype = getattr(config.model, "compute_dtype", "float32")
-        works: dict[str, Callable[[], dict[str, Any]]] = {
-            "matmul": lambda: parts.matmul(dtype, budget),
-            "train": lambda: parts.train(config, batch, budget),
-            "roofline": lambda: roofline(config, batch, numbers["matmul_ceiling_flops"], budget),
-            "sample": lambda: parts.sample(config, batch, budget, horizons),
-            "tokenizer": lambda: parts.tokenizer(config, batch, budget),
-            "environment": lambda: parts.environment(config, budget),
-            "loader": lambda: parts.load(config, batch, budget),
-            "feed": lambda: parts.feed(config, budget),
-            "torch": lambda: ours_with_adamw() | torch_baseline(config, batch, budget, horizons[0]),
-        }
-
-        def ours_with_adamw() -> dict[str, Any]:
-            return parts.train_adamw(config, batch, budget) if "train" in only else {}
-
         numbers = facts(config, batch)
-        for name in [part for part in PARTS if part in only] + ["torch"] * torch:
-            say(f"measuring {name}")
-            numbers |= works[name]() | {"peak_memory_bytes": peak_memory_bytes()}
+
+        def add(name: str, measured: dict[str, Any]) -> None:
+            peak = {"peak_memory_bytes": peak_memory_bytes()}
             if name != "torch":  # jax does not see torch's memory on an accelerator
-                numbers[f"{name}_peak_memory_bytes"] = numbers["peak_memory_bytes"]
-            numbers |= ratios(numbers, config.model.uses_depth)
+                peak[f"{name}_peak_memory_bytes"] = peak["peak_memory_bytes"]
+            numbers.update(measured | peak)
+            numbers.update(ratios(numbers, config.model.uses_depth))
             keep(dict(numbers))
+
+        for name in PARTS:
+            if name in only:
+                say(f"measuring {name}")
+                add(name, measure_part(name, config, batch, budget, horizons, numbers))
+        if rival is not None:
+            say("measuring torch")
+            ours = parts.train_adamw(config, batch, budget) if "train" in only else {}
+            add("torch", ours | rival(config, batch, budget, horizons[0]))
     return numbers
 
 
-def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int], torch: bool) -> None:
+def measure_part(
+    name: str, config: Config, batch: int, budget: float, horizons: tuple[int, ...], before: dict[str, Any]
+) -> dict[str, Any]:
+    """Measures one of :data:`PARTS`; ``before`` holds the numbers of the parts before it."""
+    match name:
+        case "matmul":
+            return parts.matmul(getattr(config.model, "compute_dtype", "float32"), budget)
+        case "train":
+            return parts.train(config, batch, budget)
+        case "roofline":
+            return roofline(config, batch, before["matmul_ceiling_flops"], budget)
+        case "sample":
+            return parts.sample(config, batch, budget, horizons)
+        case "tokenizer":
+            return parts.tokenizer(config, batch, budget)
+        case "environment":
+            return parts.environment(config, budget)
+        case "loader":
+            return parts.load(config, batch, budget)
+        case "feed":
+            return parts.feed(config, budget)
+    raise ValueError(f"no part {name!r}")
+
+
+def check_request(config: Config, batch: int, only: Sequence[str], horizons: Sequence[int]) -> None:
     """Raises :class:`UserError` if any part cannot be measured; called before the first measurement."""
     for name in only:
         known = f"{did_you_mean(name, PARTS)} (parts: {', '.join(PARTS)})"
@@ -92,8 +109,6 @@ def check_request(config: Config, batch: int, only: Sequence[str], horizons: Seq
     for frames in horizons:
         problem = f"--horizons has {frames}; a rollout has {parts.PROMPT_FRAMES} prompt frame, so it needs at least 2"
         require(frames > parts.PROMPT_FRAMES, problem)
-    if torch:
-        check_torch(config)
 
 
 def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:

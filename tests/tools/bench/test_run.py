@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from rsjax.config import Config, ConfigError, presets
+from rsjax.config import Config, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.models.cogvideox.config import TextConfig
@@ -224,30 +224,6 @@ def test_what_cannot_be_measured_is_refused_before_anything_is(request_: dict[st
         bench(toy(), **request_)
 
 
-@pytest.mark.parametrize(
-    ("config", "line"),
-    [
-        (presets.get("tiny"), "model.temporal_norm is on"),
-        (toy(final_norm=True), "model.final_norm is on"),
-        (toy(qk_norm=True), "model.qk_norm is on"),
-        (toy(mup=True), "model.mup is on"),
-        (toy(positions="rotary"), "model.positions is 'rotary'"),
-    ],
-    ids=["tiny", "final_norm", "qk_norm", "mup", "rotary"],
-)
-def test_torch_for_a_model_that_it_cannot_be_is_refused_before_anything_is_measured(config: Config, line: str) -> None:
-    said: list[str] = []
-    with pytest.raises(ConfigError, match=line):
-        bench(config, torch=True, say=said.append)
-    assert not said
-
-
-def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsjax.tools.bench.torch_part.find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"pip install -e '\.\[torch\]'"):
-        bench(toy(), torch=True)
-
-
 def test_torchs_faster_variant_is_compared_and_named() -> None:
     plain = {"torch_device": "cpu", "platform": "cpu", "train_step_s": 2.0, "torch_train_step_s_bfloat16": 6.0}
     rate = "tokenizer_encode_frames_per_s"
@@ -268,24 +244,14 @@ def test_torchs_faster_variant_is_compared_and_named() -> None:
     }
 
 
-@pytest.mark.parametrize(("horizon", "compiler"), [(3, "eager"), (48, "none")])
-def test_torch_is_timed_in_both_types_on_jaxs_device(
-    horizon: int, compiler: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("torch")
-    monkeypatch.setattr("rsjax.tools.bench.torch_part.COMPILER", compiler)
-    measured = bench(toy(), only=[], horizons=(horizon,), budget=0.0, torch=True)
-    assert (measured["torch_device"] == "cpu") == (measured["platform"] == "cpu")
-    assert all(
-        measured[f"torch_{name}_{dtype}"] > 0
-        for name in ("train_step_s", "sample_s_per_frame")
-        for dtype in ("float32", "bfloat16")
-    )
-    assert all(
-        measured[f"torch_tokenizer_{way}_frames_per_s_bfloat16_channels_last"] > 0 for way in ("encode", "decode")
-    )
-    if compiler == "eager":
-        assert measured["torch_train_step_s_bfloat16_compiled"] > 0 and measured["torch_compile_s"] > 0
-    else:
-        assert measured["torch_compile"].startswith("unavailable: ")
-        assert "torch_train_step_s_bfloat16_compiled" not in measured
+def test_a_rival_is_measured_last_beside_our_step_with_adamw(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[int, float, int]] = []
+
+    def rival(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
+        calls.append((batch, budget, horizon))
+        return {"torch_device": "cpu", "torch_train_step_s_float32": 6.0}
+
+    monkeypatch.setattr(parts, "train", lambda *_: {"train_step_s": 2.0, "train_flops": 1.0})
+    numbers = bench(toy(), batch=3, only=["train"], horizons=(4, 6), rival=rival, budget=0.5)
+    assert calls == [(3, 0.5, 4)]
+    assert numbers["train_speedup_over_torch_float32"] == 3.0

@@ -11,11 +11,11 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from torch import Tensor, nn
 
+from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import Config
 from rsjax.models.cogvideox.config import COMPRESSION, CausalVAEConfig, CogVideoXConfig, padded_frames
 from rsjax.models.cogvideox.transformer import Architecture
 from rsjax.models.diffusion.schedule import alphas
-from rsjax.tools.bench.torch_work import TorchWork
 
 
 def autoencoder(config: CausalVAEConfig) -> tuple[nn.Module, Any, Any]:

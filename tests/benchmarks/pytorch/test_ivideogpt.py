@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.pytorch.baselines import check_torch
 from rsjax.clip import Video
 from rsjax.config import Config, ConfigError, presets
 from rsjax.data.normalization import Normalization
@@ -14,6 +15,7 @@ from rsjax.models.ivideogpt.model import IVideoGPT
 from rsjax.tools.bench.run import bench
 from rsjax.tools.convert.ivideogpt import llama_table, tokenizer_table
 from rsjax.tools.convert.table import to_tensors
+from tests.benchmarks.pytorch.eager import EAGER
 from tests.models.ivideogpt.toy import CLIPS, MODEL, frames, llama_params, vq_params
 from tests.models.toy_family import ToyConfig
 
@@ -23,7 +25,7 @@ MOST_PROBABLE = replace(MODEL, sample=TopKConfig(top_k=1))
 def test_videos_are_those_of_the_public_way_to_sample() -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("transformers")
-    from rsjax.tools.bench.ivideogpt_torch import Sampler
+    from benchmarks.pytorch.ivideogpt import Sampler
 
     llama, vq, reference = llama_params(), vq_params(), Sampler(MOST_PROBABLE, CLIPS)
     tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(llama, llama_table(MODEL)).items()}
@@ -50,7 +52,7 @@ def toy() -> Config:
 def test_all_parts_are_timed_in_both_types() -> None:
     pytest.importorskip("torch")
     pytest.importorskip("transformers")
-    numbers = bench(toy(), only=["tokenizer", "sample"], horizons=(3,), budget=0.0, torch=True)
+    numbers = bench(toy(), only=["tokenizer", "sample"], horizons=(3,), budget=0.0, rival=EAGER)
     for dtype in ("float32", "bfloat16"):
         assert numbers[f"torch_train_step_s_{dtype}"] > 0
         for name in ("sample", "tokenizer_encode", "tokenizer_decode"):
@@ -59,4 +61,4 @@ def test_all_parts_are_timed_in_both_types() -> None:
 
 def test_a_family_without_a_torch_baseline_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="no network of family 'toy', only of roboscape, genie, ivideogpt"):
-        bench(replace(toy(), model=ToyConfig()), only=[], torch=True)
+        check_torch(replace(toy(), model=ToyConfig()))

@@ -14,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from benchmarks.pytorch.magvit2 import Decoder, Encoder
+from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import Config, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.tools.bench.magvit2_torch import Decoder, Encoder
-from rsjax.tools.bench.torch_work import TorchWork
 
 
 class Attention(nn.Module):
@@ -60,7 +60,7 @@ class GenieTorch(nn.Module):
     """Maps tokens (B, T, S) and actions (B, T, A) to logits (B, T, S, n, V); the public Genie reads no actions.
 
     Args:
-        config: passes :func:`rsjax.tools.bench.torch_part.check_plain`.
+        config: passes :func:`benchmarks.pytorch.baselines.check_plain`.
     """
 
     def __init__(self, config: Architecture) -> None:

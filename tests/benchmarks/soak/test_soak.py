@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
+from benchmarks.soak import soak as module
+from benchmarks.soak.__main__ import training_arguments
+from benchmarks.soak.faults import FULL_DISK, SHARES
+from benchmarks.soak.rounds import SoakError
+from benchmarks.soak.runs import Options, Soak, without
+from benchmarks.soak.soak import run_soak
+from benchmarks.soak.table import HEADER, conclusion, markdown, passed, rows
 from rsjax.config import presets
-from tests.soak import soak as module
-from tests.soak.__main__ import training_arguments
-from tests.soak.conftest import Dummies
-from tests.soak.faults import FULL_DISK, SHARES
-from tests.soak.rounds import SoakError
-from tests.soak.runs import Options, Soak, without
-from tests.soak.soak import run_soak
-from tests.soak.table import HEADER, conclusion, markdown, passed, rows
+from tests.benchmarks.soak.conftest import Dummies
 
 TRIAL = {"record": 3, "quarantined": [3], "differences": [], "problem": "", "passed": True}
 
@@ -39,7 +39,7 @@ def test_rounds_go_on_until_the_time_is_up_and_a_second_start_adds_nothing(soak:
     assert passed(result)
     assert sum(one["seconds"] for one in result["rounds"]) >= 60 * soak.options.minutes
     assert [one["number"] for one in result["rounds"]] == list(range(1, len(result["rounds"]) + 1))
-    assert any("left]" in line for line in shown)
+    assert any("left]" in line or "[time is up]" in line for line in shown)  # on a busy machine, at once
     assert json.loads((soak.out / "soak.json").read_text()) == result
     assert "the command" in (soak.out / "soak.md").read_text()
     assert not (soak.out / "round").exists()

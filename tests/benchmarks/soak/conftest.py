@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.soak import dummy
-from tests.soak.rounds import Stage, Target
+from benchmarks.soak.rounds import Stage, Target
+from tests.benchmarks.soak import dummy
 
 Dummies = Callable[..., Target]
 

@@ -1,4 +1,4 @@
-"""Measures the server of a run without a browser: ``python -m tests.tools.play.speed runs/tiny --data-dir data``.
+"""Measures the server of a run without a browser: ``python -m benchmarks.play.speed runs/tiny --data-dir data``.
 
 Arguments after the run go to ``experiments.play``. A client on the same machine sends a step when it has the frame of
 the one before, and times each from its message to its frame.
@@ -10,8 +10,8 @@ import time
 import numpy as np
 from websockets.sync.client import connect
 
+from benchmarks.play.latency import server
 from tests.tools.play.client import Client, Picture
-from tests.tools.play.latency import server
 
 STEPS = 300
 

@@ -1,4 +1,4 @@
-"""Measures the page of a run in a browser: ``python -m tests.tools.play.latency runs/tiny --data-dir data``.
+"""Measures the page of a run in a browser: ``python -m benchmarks.play.latency runs/tiny --data-dir data``.
 
 Arguments after the run go to ``experiments.play``. A headless Chromium on the same machine holds a key that moves the
 arm and takes another every 0.4 s, for half a minute; the figures are those that the page itself shows.

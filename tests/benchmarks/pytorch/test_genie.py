@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, OptimizerConfig, TokenizerConfig
+from rsjax.config import OptimizerConfig, TokenizerConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import magvit2
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.tools.bench.torch_part import check_plain
 from rsjax.tools.convert.table import to_tensors
 from rsjax.tools.convert.tokenizer import table
 
@@ -24,7 +23,7 @@ TOY = Architecture(
 
 def copied(params: Any, arch: Architecture = TOY) -> Any:
     """The baseline with the weights of the RGB branch."""
-    from rsjax.tools.bench.genie_torch import GenieTorch
+    from benchmarks.pytorch.genie import GenieTorch
 
     model = GenieTorch(arch)
     tensor = lambda x: torch.tensor(np.asarray(x))  # noqa: E731
@@ -83,8 +82,8 @@ def test_logits_are_those_of_the_rgb_branch(action_inputs: int) -> None:
 
 @pytest.mark.parametrize("changes", [{"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
 def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
-    from rsjax.tools.bench.magvit2_torch import Decoder, Encoder
-    from rsjax.tools.bench.torch_work import to_channels_last
+    from benchmarks.pytorch.magvit2 import Decoder, Encoder
+    from benchmarks.pytorch.measure import to_channels_last
 
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6, **changes
@@ -113,8 +112,8 @@ def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("bf16", [False, True])
 def test_steps_lower_the_loss_of_the_same_clip(params: Any, bf16: bool) -> None:
-    from rsjax.tools.bench.genie_torch import masked_loss
-    from rsjax.tools.bench.torch_work import make_adamw, train_step
+    from benchmarks.pytorch.genie import masked_loss
+    from benchmarks.pytorch.measure import make_adamw, train_step
 
     torch.manual_seed(0)
     model = copied(params)
@@ -130,8 +129,8 @@ def test_steps_lower_the_loss_of_the_same_clip(params: Any, bf16: bool) -> None:
 
 
 def test_a_clip_of_zero_clips_nothing(params: Any) -> None:
-    from rsjax.tools.bench.genie_torch import masked_loss
-    from rsjax.tools.bench.torch_work import make_adamw, train_step
+    from benchmarks.pytorch.genie import masked_loss
+    from benchmarks.pytorch.measure import make_adamw, train_step
 
     torch.manual_seed(0)
     tokens, mask = torch.randint(0, 256, (1, 3, 16)), torch.rand(1, 3, 16) < 0.5
@@ -146,7 +145,7 @@ def test_a_clip_of_zero_clips_nothing(params: Any) -> None:
 
 
 def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(params: Any) -> None:
-    from rsjax.tools.bench.genie_torch import decode_frame
+    from benchmarks.pytorch.genie import decode_frame
 
     model, tokens = copied(params), torch.randint(0, 256, (2, 3, 16))
     decoded = decode_frame(model, tokens, t=1, steps=1)
@@ -156,8 +155,3 @@ def test_decoding_fills_one_frame_and_one_step_takes_the_most_probable_codes(par
         codes = model(tokens, mask)[:, 1].argmax(-1)
     assert torch.equal(decoded[:, 1], codes[..., 0] + 16 * codes[..., 1])
     assert torch.equal(decoded[:, ::2], tokens[:, ::2])
-
-
-def test_what_the_public_code_has_not_is_refused() -> None:
-    with pytest.raises(ConfigError, match="model.final_norm is on"):
-        check_plain(dataclasses.replace(TOY, final_norm=True))

@@ -12,10 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.soak.attempt import Attempt, finished
-from tests.soak.conftest import Dummies
-from tests.soak.dummy import STEPS
-from tests.soak.faults import (
+from benchmarks.soak.attempt import Attempt, finished
+from benchmarks.soak.faults import (
     KILL_COMPILING,
     KILL_STARTING,
     KILL_TRAINING,
@@ -26,7 +24,9 @@ from tests.soak.faults import (
     damage_file,
     schedule,
 )
-from tests.soak.rounds import Event, run_round, settle
+from benchmarks.soak.rounds import Event, run_round, settle
+from tests.benchmarks.soak.conftest import Dummies
+from tests.benchmarks.soak.dummy import STEPS
 from tests.waiting import wait_until
 
 
@@ -127,7 +127,7 @@ def test_what_a_killed_soak_had_started_dies_with_it(target: Dummies, tmp_path: 
         pytest.skip("util-linux's setpriv is not installed")
     dummy = target()
     code = (
-        "import time; from pathlib import Path; from tests.soak.attempt import Attempt; "
+        "import time; from pathlib import Path; from benchmarks.soak.attempt import Attempt; "
         f"attempt = Attempt({dummy.command!r}, [Path({str(dummy.trained[0])!r})], Path({str(dummy.output)!r})); "
         "print(attempt.process.pid, flush=True); time.sleep(600)"
     )

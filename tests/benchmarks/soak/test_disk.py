@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.soak.disk import can_mount, small_disk, unmount_below
+from benchmarks.soak.disk import can_mount, small_disk, unmount_below
 
 
 @pytest.fixture

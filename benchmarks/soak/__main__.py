@@ -1,4 +1,4 @@
-"""Injects faults into the training command and compares the results. ``python -m tests.soak tiny --minutes 30``"""
+"""Injects faults into the training command and compares the results. ``python -m benchmarks.soak tiny --minutes 30``"""
 
 import dataclasses
 import shlex
@@ -6,12 +6,12 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
+from benchmarks.soak.runs import Options, Soak, without
+from benchmarks.soak.soak import run_soak
+from benchmarks.soak.table import markdown, passed
 from experiments.cli import main_errors, parse
-from tests.soak.runs import Options, Soak, without
-from tests.soak.soak import run_soak
-from tests.soak.table import markdown, passed
 
-PROG = "python -m tests.soak"
+PROG = "python -m benchmarks.soak"
 
 
 @main_errors()

@@ -1,4 +1,7 @@
-"""Measures a family's PyTorch baseline on the same machine in the same process."""
+"""Measures a family's network in PyTorch, on the same machine and in the same process as ours.
+
+The families' modules import torch, an optional dependency; this one imports it, and them, only to measure.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,12 +18,17 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.bench.timing import median_seconds
 
 ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # options that the plain Genie lacks
-COMPILER = "inductor"  # backend of torch.compile
 
 
 def check_genie(config: Config) -> None:
     """Raises :class:`ConfigError` if the model has an option that the plain Genie lacks."""
-    check_plain(Architecture.create(config))
+    model = Architecture.create(config)
+    plain = "and the PyTorch baseline is the plain Genie"
+    cure = "or leave the baseline out"
+    for name in ADDED:
+        require(not getattr(model, name), f"model.{name} is on, {plain}, without it; set it to False, {cure}")
+    problem = f"model.positions is {model.positions!r}, {plain}, which learns them; set it to 'learned', {cure}"
+    require(model.positions == "learned", problem)
 
 
 def check_cogvideox(config: Config) -> None:
@@ -33,11 +41,11 @@ def check_cogvideox(config: Config) -> None:
 
 
 @dataclass(frozen=True)
-class Baseline:
-    """A family's baseline.
+class TorchBaseline:
+    """A family's networks in PyTorch.
 
     Attributes:
-        module: has a function ``create``, which returns a :class:`rsjax.tools.bench.torch_work.TorchWork`.
+        module: has a function ``create``, which returns a :class:`benchmarks.pytorch.measure.TorchWork`.
         packages: the packages that it needs besides torch.
         check: raises :class:`ConfigError` for settings that the baseline lacks.
     """
@@ -48,15 +56,15 @@ class Baseline:
 
 
 FAMILIES = {
-    "roboscape": Baseline("rsjax.tools.bench.genie_torch", check=check_genie),
-    "genie": Baseline("rsjax.tools.bench.genie_torch", check=check_genie),
-    "ivideogpt": Baseline("rsjax.tools.bench.ivideogpt_torch", ("transformers",)),
-    "irasim": Baseline("rsjax.tools.bench.irasim_torch", ("diffusers",)),
-    "cogvideox": Baseline("rsjax.tools.bench.cogvideox_torch", ("diffusers",), check_cogvideox),
+    "roboscape": TorchBaseline("benchmarks.pytorch.genie", check=check_genie),
+    "genie": TorchBaseline("benchmarks.pytorch.genie", check=check_genie),
+    "ivideogpt": TorchBaseline("benchmarks.pytorch.ivideogpt", ("transformers",)),
+    "irasim": TorchBaseline("benchmarks.pytorch.irasim", ("diffusers",)),
+    "cogvideox": TorchBaseline("benchmarks.pytorch.cogvideox", ("diffusers",), check_cogvideox),
 }
 
 
-def check_torch(config: Config) -> Baseline:
+def check_torch(config: Config) -> TorchBaseline:
     """Returns the baseline of the model's family.
 
     Raises:
@@ -77,16 +85,9 @@ def check_torch(config: Config) -> Baseline:
     return baseline
 
 
-def check_plain(model: Architecture) -> None:
-    """Raises :class:`ConfigError` if the model has an option that the baseline lacks."""
-    plain, cure = "and the PyTorch baseline is the plain Genie", "or leave the baseline out"
-    for name in ADDED:
-        require(not getattr(model, name), f"model.{name} is on, {plain}, without it; set it to False, {cure}")
-    problem = f"model.positions is {model.positions!r}, {plain}, which learns them; set it to 'learned', {cure}"
-    require(model.positions == "learned", problem)
-
-
-def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> dict[str, Any]:
+def torch_baseline(
+    config: Config, batch: int, budget: float, horizon: int, compiler: str = "inductor"
+) -> dict[str, Any]:
     """Measures the model in PyTorch, in float32 and under bf16 autocast, like the public code of its family.
 
     This covers the training step, sampling and the autoencoder; for RoboScape, only the RGB branch. All run eagerly;
@@ -94,7 +95,9 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     on the CPU (``torch_device``).
 
     Args:
+        budget: seconds per quantity.
         horizon: length of a rollout in frames. For RoboScape and Genie only its last frame is decoded.
+        compiler: backend of ``torch.compile``.
 
     Raises:
         UserError: as :func:`check_torch`.
@@ -102,7 +105,7 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     baseline = check_torch(config)
     import torch
 
-    from rsjax.tools.bench.torch_work import measure
+    from benchmarks.pytorch.measure import measure
 
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     wait = torch.cuda.synchronize if device == "cuda" else lambda: None
@@ -113,4 +116,4 @@ def torch_baseline(config: Config, batch: int, budget: float, horizon: int) -> d
     torch.manual_seed(0)
     work = import_module(baseline.module).create(config, batch, horizon, device)
     numbers = {"torch": torch.__version__, "torch_device": device, "torch_threads": torch.get_num_threads()}
-    return numbers | measure(work, config.train.optimizer, device, timed, COMPILER)
+    return numbers | measure(work, config.train.optimizer, device, timed, compiler)

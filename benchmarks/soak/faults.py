@@ -11,9 +11,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.soak.attempt import Attempt, checkpoints, unfinished
+from benchmarks.soak.disk import small_disk
 from rsjax.data.store import StoreError, open_store
-from tests.soak.attempt import Attempt, checkpoints, unfinished
-from tests.soak.disk import small_disk
 
 REQUEUE = os.EX_TEMPFAIL  # the exit status after SIGTERM: start me again
 FAILED = 2  # the exit status after an error that the user can cure

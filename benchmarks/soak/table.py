@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.soak.faults import KILL_BETWEEN, SHARES
 from rsjax.progress import duration
-from tests.soak.faults import KILL_BETWEEN, SHARES
 
 HEADER = ("fault", "times", "survived", "steps again", "lost, s", "each, s")
 

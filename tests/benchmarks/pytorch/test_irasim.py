@@ -9,6 +9,7 @@ import pytest
 from rsjax.models.irasim.dit import DiT
 from rsjax.tools.bench.run import bench
 from rsjax.tools.convert.irasim import from_public
+from tests.benchmarks.pytorch.eager import EAGER
 from tests.models.irasim import public, toy
 
 torch = pytest.importorskip("torch")
@@ -17,7 +18,7 @@ pytest.importorskip("diffusers")
 
 @pytest.mark.parametrize("video", [False, True], ids=["frame", "video"])
 def test_output_is_that_of_the_network(video: bool) -> None:
-    from rsjax.tools.bench.irasim_torch import IRASimTorch
+    from benchmarks.pytorch.irasim import IRASimTorch
 
     net = public.Network(video=video)
     tensors = public.random_weights(net)
@@ -34,7 +35,7 @@ def test_output_is_that_of_the_network(video: bool) -> None:
 
 
 def test_all_parts_are_timed_in_both_types() -> None:
-    numbers = bench(toy.config(), only=["tokenizer", "sample"], horizons=(8,), budget=0.0, torch=True)
+    numbers = bench(toy.config(), only=["tokenizer", "sample"], horizons=(8,), budget=0.0, rival=EAGER)
     for dtype in ("float32", "bfloat16"):
         assert numbers[f"torch_train_step_s_{dtype}"] > 0
         for name in ("sample", "tokenizer_encode", "tokenizer_decode"):

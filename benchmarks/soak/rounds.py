@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.soak.attempt import Attempt, finished, last_step
+from benchmarks.soak.faults import KILL_BETWEEN, Fault, conditions, inject
 from rsjax.errors import UserError
 from rsjax.progress import duration
-from tests.soak.attempt import Attempt, finished, last_step
-from tests.soak.faults import KILL_BETWEEN, Fault, conditions, inject
 
 MAX_KILLS = 2  # of a stage without checkpoints; after these it is left alone
 

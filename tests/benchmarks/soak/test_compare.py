@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.soak.compare import compare_arrays, compare_logs, compare_stages, json_lines, read_arrays, same_bits
 from rsjax.config import LoopConfig
 from rsjax.training.checkpoint import save_weights
-from tests.soak.compare import compare_arrays, compare_logs, compare_stages, json_lines, read_arrays, same_bits
 from tests.training.toy import train
 
 

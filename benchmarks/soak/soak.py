@@ -15,14 +15,14 @@ from typing import Any
 
 import jax
 
+from benchmarks.soak.bad_record import try_bad_record
+from benchmarks.soak.disk import can_mount, unmount_below
+from benchmarks.soak.faults import FULL_DISK, SHARES, schedule
+from benchmarks.soak.rounds import SoakError, run_round
+from benchmarks.soak.runs import Soak, compare_with_reference, make_reference, prepare
+from benchmarks.soak.table import failed, markdown
 from rsjax.files import disk_guard, write_atomically
 from rsjax.progress import duration
-from tests.soak.bad_record import try_bad_record
-from tests.soak.disk import can_mount, unmount_below
-from tests.soak.faults import FULL_DISK, SHARES, schedule
-from tests.soak.rounds import SoakError, run_round
-from tests.soak.runs import Soak, compare_with_reference, make_reference, prepare
-from tests.soak.table import failed, markdown
 
 
 def run_soak(soak: Soak, command: str, show: Callable[[str], None]) -> dict[str, Any]:

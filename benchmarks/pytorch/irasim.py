@@ -13,13 +13,13 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler
 from torch import Tensor, nn
 
+from benchmarks.pytorch.magvit2 import Decoder, Encoder
+from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import Config
 from rsjax.models.diffusion.layers import TIME_CHANNELS, grid_positions, positions
 from rsjax.models.diffusion.schedule import alphas
 from rsjax.models.irasim.config import IRASimConfig, KLConfig
 from rsjax.models.irasim.dit import Architecture, architecture
-from rsjax.tools.bench.magvit2_torch import Decoder, Encoder
-from rsjax.tools.bench.torch_work import TorchWork
 
 
 class Attention(nn.Module):

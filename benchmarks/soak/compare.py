@@ -8,11 +8,11 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from benchmarks.soak.attempt import checkpoints
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store, encode, open_store
 from rsjax.training.log import read_curve
 from rsjax.training.skipped import NAME as SKIPPED
-from tests.soak.attempt import checkpoints
 
 
 def compare_stages(one: Path, two: Path) -> list[str]:

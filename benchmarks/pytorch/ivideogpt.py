@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaForCausalLM
 
+from benchmarks.pytorch.conditional_vq import ConditionalVQTorch
+from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import ClipShape, Config
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout
-from rsjax.tools.bench.ivideogpt_vq_torch import ConditionalVQTorch
-from rsjax.tools.bench.torch_work import TorchWork
 
 
 class Sampler:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from benchmarks.soak.attempt import last_logged
+from benchmarks.soak.compare import compare_stages, compare_stores
+from benchmarks.soak.faults import copy_tree
+from benchmarks.soak.rounds import SoakError, Stage, Target, run_without_faults
 from rsjax.config import Config
 from rsjax.tools.pipeline.run import TRAINED, Run
 from rsjax.training.log import read_log
-from tests.soak.attempt import last_logged
-from tests.soak.compare import compare_stages, compare_stores
-from tests.soak.faults import copy_tree
-from tests.soak.rounds import SoakError, Stage, Target, run_without_faults
 
 CHECKPOINTS = 40  # of a run with faults, by default
 NEVER_STOPPED = "never-stopped"  # a file in a reference that was made here, once it is complete

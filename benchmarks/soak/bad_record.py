@@ -11,12 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.soak.compare import compare_stages, json_lines
+from benchmarks.soak.faults import KILL_TRAINING, copy_tree, damage_record
+from benchmarks.soak.rounds import Stage, Target, run_round, run_without_faults
+from benchmarks.soak.runs import Soak, step_seconds
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store
-from tests.soak.compare import compare_stages, json_lines
-from tests.soak.faults import KILL_TRAINING, copy_tree, damage_record
-from tests.soak.rounds import Stage, Target, run_round, run_without_faults
-from tests.soak.runs import Soak, step_seconds
 
 
 def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
