@@ -144,7 +144,11 @@ def autoencoder_from_public(
     groups = setting(source, settings, "norm_num_groups", 32)
     first = re.compile(r"encoder\.down_blocks\.(\d+)\.resnets\.(\d+)\.conv1\.conv\.weight")
     places = [(int(match[1]), int(match[2])) for match in map(first.fullmatch, tensors) if match]
-    levels, blocks = (max(column) + 1 for column in zip(*places, strict=True)) if places else (0, 0)
+    if places:
+        levels, blocks = (max(column) + 1 for column in zip(*places, strict=True))
+    else:
+        levels = 0
+        blocks = 0
 
     def width(key: str) -> int:
         return shape_of(source, tensors, f"{key}.conv.weight", 5, names)[0]
@@ -291,7 +295,10 @@ def convert(source: Path, out: Path, part: Part | None = None) -> list[str]:
     tensors, _, names, others, _ = _read(source)
     settings = published_settings(source, *CLASSES.values())
     vae = is_autoencoder(source, tensors)
-    part, other = PARTS if vae else PARTS[::-1]
+    if vae:
+        part, other = PARTS
+    else:
+        part, other = PARTS[::-1]
     if settings.get("_class_name", CLASSES[part]) != CLASSES[part]:
         raise ConvertError(f"{source}: is no {settings['_class_name']}, as {SETTINGS} beside it says")
     saved = saved_part(out, CogVideoXConfig, other)
@@ -332,7 +339,8 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
     parts = [p for p in PARTS if saved_part(source, CogVideoXConfig, p)]
     if part not in parts and len(parts) != 1:
         raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of a CogVideoX'}; name one with --part")
-    part = part if part in parts else parts[0]
+    if part not in parts:
+        part = parts[0]
     model = read_model(source, CogVideoXConfig, part)
     if part == "tokenizer":
         of = jax.eval_shape(lambda key: autoencoder.init(model.autoencoder, key), jax.random.key(0))

@@ -45,7 +45,10 @@ def save(directory: Path, config: TokenizerConfig | Architecture | KLConfig | di
     """
     (section, place) = SECTIONS[type(config)]
     path = directory / "config.json"
-    settings = read_json(path) if path.exists() else {}
+    if path.exists():
+        settings = read_json(path)
+    else:
+        settings = {}
     if settings.keys() - {name for name, _ in SECTIONS.values()}:
         raise ConvertError(f"{directory}: is a run directory; choose another one")
     with disk_guard(directory):
@@ -74,7 +77,10 @@ def save_part(directory: Path, part: Part, model: ModelConfig, inputs: Inputs, p
         FileError: the disk is full.
     """
     path = directory / "config.json"
-    settings = read_json(path) if path.exists() else {}
+    if path.exists():
+        settings = read_json(path)
+    else:
+        settings = {}
     if settings.keys() - {"model", "inputs"}:
         raise ConvertError(f"{directory}: is a run directory or holds other networks; choose another one")
     with disk_guard(directory):

@@ -77,8 +77,12 @@ def read_tensors(path: Path, holders: Sequence[str] = HOLDERS) -> TensorFile:
             numpy lacks a tensor's type; or PyTorch is needed and not installed.
     """
     if not path.is_file():
-        what = "is a directory; name a file in it" if path.is_dir() else "is a pipe or device; name a file"
-        raise ConvertError(f"{path}: {what if path.exists() else 'no such file'}")
+        what = "is a pipe or device; name a file"
+        if path.is_dir():
+            what = "is a directory; name a file in it"
+        elif not path.exists():
+            what = "no such file"
+        raise ConvertError(f"{path}: {what}")
     if instead := placeholder(path):
         raise ConvertError(f"{path}: {instead}")
     metadata: dict[str, str] = {}
@@ -187,13 +191,19 @@ def _read_torch(path: Path, holders: Sequence[str]) -> tuple[Tensors, dict[str, 
     content = _unpickled(path, torch)
     holding = (holder for holder in holders if isinstance(content, dict) and _tensors(content.get(holder), torch))
     key = next(holding, "")
-    state = content[key] if key else content
+    if key:
+        state = content[key]
+    else:
+        state = content
     tensors = _tensors(state, torch)
     if not tensors:
         raise ConvertError(f"{path}: holds no tensors by name, also under none of the keys {', '.join(holders)}")
     others = {}
     for name, value in content.items():
-        read = len(tensors) if value is state else state is content and name in tensors
+        if value is state:
+            read = len(tensors)
+        else:
+            read = state is content and name in tensors
         if more := _count(value, torch) - read:
             others[f"the file's key {name}"] = more
     return {name: _to_numpy(path, name, x, torch) for name, x in tensors.items()}, others, key
@@ -208,22 +218,26 @@ def _unpickled(path: Path, torch: Any) -> Any:
     except Exception as error:  # torch raises many types for damage and for content that it refuses
         # torch's messages advise loading the file without this protection, so they are not shown.
         unknown = re.search(r"GLOBAL (\S+)", str(error))
-        why = (
-            f"it holds {unknown[1]:.80}, which could run code when loaded" if unknown else "it is damaged or no weights"
-        )
+        why = "it is damaged or no weights"
+        if unknown:
+            why = f"it holds {unknown[1]:.80}, which could run code when loaded"
         raise ConvertError(f"{path}: refused: {why}; pass the same weights as a {SAFE} file") from error
 
 
 def _tensors(state: Any, torch: Any) -> dict[str, Any]:
     """Returns the tensors of a state dict; other values, such as counters, are left out."""
-    items = state.items() if isinstance(state, dict) else ()
-    return {name: x for name, x in items if isinstance(name, str) and isinstance(x, torch.Tensor)}
+    if not isinstance(state, dict):
+        return {}
+    return {name: x for name, x in state.items() if isinstance(name, str) and isinstance(x, torch.Tensor)}
 
 
 def _count(value: Any, torch: Any) -> int:
     """Returns the number of tensors in nested dicts and sequences."""
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
-    return sum(_count(x, torch) for x in inner) + isinstance(value, torch.Tensor)
+    if isinstance(value, dict):
+        return sum(_count(x, torch) for x in value.values())
+    if isinstance(value, list | tuple):
+        return sum(_count(x, torch) for x in value)
+    return int(isinstance(value, torch.Tensor))
 
 
 def _to_numpy(path: Path, name: str, tensor: Any, torch: Any) -> np.ndarray:
@@ -245,8 +259,8 @@ S = TypeVar("S", bool, int, float)
 
 def check_type(source: object, name: str, value: object, example: bool | int | float) -> None:
     """Raises :class:`ConvertError` unless a setting is null or of the example's type; integers count as floats, too."""
-    kinds = (int, float) if type(example) is float else (type(example),)
-    if value is not None and type(value) not in kinds:
+    is_integer_for_float = type(example) is float and type(value) is int
+    if value is not None and type(value) is not type(example) and not is_integer_for_float:
         raise ConvertError(f"{source}: {name} is {json.dumps(value):.80}, not {_KINDS[type(example)]}")
 
 

@@ -37,7 +37,12 @@ HEADS = {1152: 16, 1024: 16, 768: 12, 384: 6}  # attention heads of the public s
 def table(config: Architecture) -> Table:
     """Returns an entry for each public tensor of the network except the positions."""
     linear = config.action_activation == "none"
-    first, second = ("embed_arm_state", "embed_state") if linear else ("embed_state.fc1", "embed_state.fc2")
+    if linear:
+        first = "embed_arm_state"
+        second = "embed_state"
+    else:
+        first = "embed_state.fc1"
+        second = "embed_state.fc2"
     entries: list[Entry] = [
         *weight_and_bias("x_embedder.proj", "patches", "conv"),
         *weight_and_bias("t_embedder.mlp.0", "time/fc1", "linear"),
@@ -78,7 +83,7 @@ def infer_config(source: object, tensors: Tensors, heads: int | None = None, nam
     linear = "embed_arm_state.weight" in tensors
     inputs = shape("embed_arm_state.weight" if linear else "embed_state.fc1.weight", 2)[1]
     # Frame-Ada reads one action at a time; Video-Ada reads all (frames - 1) actions of a clip.
-    video = inputs % (frames - 1) == 0 and inputs > frames - 1 if frames > 2 else False
+    video = frames > 2 and inputs % (frames - 1) == 0 and inputs > frames - 1
     heads = heads or HEADS.get(width)
     if heads is None:
         raise ConvertError(f"{source}: of width {width}, which is none of the public sizes; set --heads")
@@ -146,9 +151,13 @@ def convert(source: Path, out: Path, weights: Literal["ema", "raw"], heads: int 
         tensors = to_public(config, params)
         write_safetensors(out, tensors, {METADATA: json.dumps(to_dict(config))})
         return [f"{out}: {len(tensors)} tensors of an IRASim, under their public names{replaces}"]
-    holders = ("ema", *HOLDERS) if weights == "ema" else HOLDERS
+    holders: tuple[str, ...] = HOLDERS
+    if weights == "ema":
+        holders = ("ema", *HOLDERS)
     tensors, metadata, names, others, key = read_tensors(source, holders)
-    lacking = ", as it has no ema" if weights == "ema" and key != "ema" else ""
+    lacking = ""
+    if weights == "ema" and key != "ema":
+        lacking = ", as it has no ema"
     own = exported_config(Architecture, source, metadata, METADATA)
     config, params, aside = from_public(source, tensors, own, heads, names)
     replaces = REPLACES * save(out, config, params)

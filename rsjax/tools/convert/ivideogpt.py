@@ -150,7 +150,9 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
     tensors, metadata, names, others, _ = read_tensors(source)
     own = _exported(source, metadata)
     if "dynamics_quantize.embedding.weight" in tensors:
-        given = None if own is None else (own[0].autoencoder, own[1].image_size)
+        given = None
+        if own is not None:
+            given = (own[0].autoencoder, own[1].image_size)
         vq, size, params = tokenizer_from_public(source, tensors, given, names)
         before = saved_part(out, IVideoGPTConfig, "world_model")
         model = replace(before[0] if before else IVideoGPTConfig(), autoencoder=vq)
@@ -160,11 +162,17 @@ def convert(source: Path, out: Path, heads: int | None = None, part: Part | None
         return [f"{out}: a tokenizer of {len(tensors)} tensors, {vq}{REPLACES * replaces}", *left_aside(others)]
     aside = Counter(ASIDE.search(name)[0] for name in tensors if ASIDE.search(name))  # type: ignore[index]
     used = {name: x for name, x in tensors.items() if not ASIDE.search(name)}
-    model, actions = (own[0], own[1].action_dim) if own else infer_llama(source, used, heads, names)
+    if own:
+        model = own[0]
+        actions = own[1].action_dim
+    else:
+        model, actions = infer_llama(source, used, heads, names)
     shapes = _llama_shapes(model, actions)
     params = to_params(source, used, llama_table(model), shapes, names)
     before = saved_part(out, IVideoGPTConfig, "tokenizer")
-    whole = replace(model, autoencoder=before[0].autoencoder) if before else model
+    whole = model
+    if before:
+        whole = replace(model, autoencoder=before[0].autoencoder)
     _check_codes(out, before and before[0], model)
     sizes = [found.image_size for _, found in filter(None, (before, own))]
     inputs = Inputs(sizes[0] if sizes else 0, actions)
@@ -178,7 +186,8 @@ def _export(source: Path, out: Path, part: Part | None) -> str:
     parts = [p for p in PARTS if saved_part(source, IVideoGPTConfig, p)]
     if part not in parts and len(parts) != 1:
         raise ConvertError(f"{source}: holds {' and '.join(parts) or 'no part of an iVideoGPT'}; name one with --part")
-    part = part if part in parts else parts[0]
+    if part not in parts:
+        part = parts[0]
     model = read_model(source, IVideoGPTConfig, part)
     inputs = saved_inputs(source)
     if part == "tokenizer":
@@ -220,7 +229,9 @@ def _check_codes(directory: Path, there: IVideoGPTConfig | None, model: IVideoGP
 
 def llama_table(config: IVideoGPTConfig) -> Table:
     """Returns an entry for each parameter of the LLaMA; with actions the public names begin with ``llm``."""
-    under = "llm." if config.use_actions else ""
+    under = ""
+    if config.use_actions:
+        under = "llm."
     entries: list[Entry] = [
         Entry(f"{under}model.embed_tokens.weight", "embed_tokens/embedding"),
         Entry(f"{under}model.norm.weight", "norm/scale"),
@@ -253,14 +264,18 @@ def infer_llama(
         ConvertError: the tensors are not such a LLaMA's, or belong to one that this project cannot build.
     """
     use_actions = "action_linear.weight" in tensors
-    under = "llm." if use_actions else ""
+    under = ""
+    if use_actions:
+        under = "llm."
     layer = f"{under}model.layers.{{}}.self_attn.q_proj.weight"
     embedding = f"{under}model.embed_tokens.weight"
     if not {layer.format(0), embedding} <= tensors.keys():
         raise ConvertError(f"{source}: holds no LLaMA of iVideoGPT, such as {layer.format(0)}")
     vocabulary, width = shape_of(source, tensors, embedding, 2, names)
     hidden = shape_of(source, tensors, f"{under}model.layers.0.mlp.gate_proj.weight", 2, names)[0]
-    actions = shape_of(source, tensors, "action_linear.weight", 2, names)[1] if use_actions else 0
+    actions = 0
+    if use_actions:
+        actions = shape_of(source, tensors, "action_linear.weight", 2, names)[1]
     try:
         config = IVideoGPTConfig(
             autoencoder=ConditionalVQConfig(codes=max(1, vocabulary // 2 - 1)),

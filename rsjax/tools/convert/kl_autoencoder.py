@@ -150,7 +150,9 @@ def _renamed(name: str) -> str:
 
 def _flat(name: str, x: np.ndarray) -> np.ndarray:
     """Returns attention weights as matrices; some files store them as 1×1 convolutions."""
-    return x[..., 0, 0] if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1) else x
+    if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1):
+        return x[..., 0, 0]
+    return x
 
 
 def convert(source: Path, out: Path) -> list[str]:

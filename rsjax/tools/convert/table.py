@@ -80,7 +80,10 @@ def public_shapes(table: Table, shapes: Any) -> dict[str, Shape]:
     _check_complete(table, {path: leaf.shape for path, leaf in flat.items()})
     public: dict[str, Shape] = {}
     for entry in table:
-        own = flat[entry.path].shape if entry.layer is None else flat[entry.path].shape[1:]
+        if entry.layer is None:
+            own = flat[entry.path].shape
+        else:
+            own = flat[entry.path].shape[1:]
         public[entry.key] = LAYOUTS[entry.layout][1](np.broadcast_to(np.float32(0), own)).shape
     return public
 
@@ -177,8 +180,9 @@ def _check_complete(table: Table, shapes: dict[str, Shape]) -> None:
 
 def _some(names: Iterable[str]) -> str:
     listed = sorted(names)
-    more = f" and {len(listed) - NAMED} more" if len(listed) > NAMED else ""
-    return ", ".join(listed[:NAMED]) + more
+    if len(listed) > NAMED:
+        return f"{', '.join(listed[:NAMED])} and {len(listed) - NAMED} more"
+    return ", ".join(listed)
 
 
 def vae_table(shapes: Params, more: Sequence[tuple[str, str]] = ()) -> Table:

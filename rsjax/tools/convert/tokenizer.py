@@ -47,7 +47,9 @@ IGNORED: dict[Weights, tuple[str, ...]] = {
 
 def public_name(key: str, weights: Weights) -> str:
     """Returns a public file's name for a key of the table."""
-    return key if weights == "raw" else f"model_ema.{key.replace('.', '')}"
+    if weights == "raw":
+        return key
+    return f"model_ema.{key.replace('.', '')}"
 
 
 def table(config: TokenizerConfig) -> Table:
@@ -115,7 +117,12 @@ def infer_config(source: object, tensors: Tensors, weights: Weights, names: Name
     levels = count("encoder.down.{}.block.0.conv1.weight")
     blocks = count("encoder.down.0.block.{}.conv1.weight")
     if not (has("encoder.conv_in.weight") and has("encoder.conv_out.weight") and levels):
-        kind, cure = ("averaged (ema) ", "; try --weights raw") if weights == "ema" else ("", "")
+        if weights == "ema":
+            kind = "averaged (ema) "
+            cure = "; try --weights raw"
+        else:
+            kind = ""
+            cure = ""
         raise ConvertError(
             f"{source}: holds no {kind}weights of a MAGVIT-2 tokenizer, such as "
             f"{public_name('encoder.conv_in.weight', weights)}{cure}"

@@ -98,13 +98,19 @@ def export_lerobot(
 
 
 def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[int, int], None]) -> dict[str, Any]:
-    names = store.splits if options.split == "all" else (options.split,)
+    if options.split == "all":
+        names = store.splits
+    else:
+        names = (options.split,)
     total = sum(len(store.source(name)) for name in names)
     layout = None
     splits = {}
     cameras: dict[str, None] = {}
     for name in names:
-        begins = layout.episodes if layout else 0
+        if layout:
+            begins = layout.episodes
+        else:
+            begins = 0
         for clip in _clips(store, name):
             if layout is None:
                 layout = _layout(store, clip, root, options)
@@ -169,5 +175,8 @@ def _episode(clip: Record, features: dict[str, Any], state: str) -> LeRobotEpiso
     columns: dict[str, Float32[np.ndarray, "T D"]] = {"action": np.concatenate([actions[1:], actions[-1:]])}
     if "observation.state" in features:
         zeros = np.zeros((len(actions), len(ZEROS)), np.float32)
-        columns["observation.state"] = actions if state == "command" else zeros
+        if state == "command":
+            columns["observation.state"] = actions
+        else:
+            columns["observation.state"] = zeros
     return LeRobotEpisode(clip["rgb"], columns, str(clip["task"]))

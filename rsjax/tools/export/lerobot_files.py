@@ -51,7 +51,9 @@ class VideoSettings:
     @property
     def number(self) -> float:
         """Returns the frame rate as ``info.json`` states it: an int if it is a whole number."""
-        return int(self.fps) if self.fps == int(self.fps) else self.fps
+        if self.fps == int(self.fps):
+            return int(self.fps)
+        return self.fps
 
     def describe(self) -> dict[str, Any]:
         """Returns the ``info`` of a video feature."""
@@ -123,7 +125,10 @@ def rows_table(columns: Mapping[str, Num[np.ndarray, "T ..."]]) -> pa.Table:
     for name, values in columns.items():
         flat = pa.array(np.ascontiguousarray(values).reshape(-1))
         width = values.size // len(values)
-        arrays[name] = pa.FixedSizeListArray.from_arrays(flat, width) if width > 1 else flat
+        if width > 1:
+            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, width)
+        else:
+            arrays[name] = flat
     return pa.table(arrays)
 
 
@@ -148,7 +153,9 @@ def _stats(rows: Num[np.ndarray, "N D"], count: int) -> dict[str, np.ndarray]:
 
 def merged_stats(one: Stats, other: Stats) -> Stats:
     """Returns the statistics of both together; quantiles become weighted means, as in LeRobot's own aggregation."""
-    return {name: _merged(one[name], other[name]) for name in one} if one else other
+    if one:
+        return {name: _merged(one[name], other[name]) for name in one}
+    return other
 
 
 def _merged(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

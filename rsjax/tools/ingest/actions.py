@@ -47,7 +47,9 @@ class Layout:
     def to_json(self) -> dict[str, Any]:
         """Returns the fields, JSON-ready; ``unclear`` only if it is not empty."""
         values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-        return values if self.unclear else {name: value for name, value in values.items() if name != "unclear"}
+        if self.unclear:
+            return values
+        return {name: value for name, value in values.items() if name != "unclear"}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Layout":
@@ -110,7 +112,8 @@ def check_declared(layout: Layout, skipped: int, config: ActionConfig) -> None:
         raise EpisodeError(f"actions: {problem}; {cure}", option="--option held")
     problem = f"{skipped} recorded rows become one, and nobody says whether they are steps, which add up, or targets"
     cure = "say --option kind=delta or --option kind=absolute, and 'held=[…]' for grippers"
-    doubts = f"; these cannot be steps: {doubts}" if doubts else ""
+    if doubts:
+        doubts = f"; these cannot be steps: {doubts}"
     raise EpisodeError(f"actions: {problem}; {cure}{doubts}", option="--option kind")
 
 
@@ -123,7 +126,10 @@ def align_actions(rows: Float[np.ndarray, "N A"], after: bool = False) -> Float3
             row t leads into frame t+1, and the last row is dropped.
     """
     aligned = np.zeros(rows.shape, np.float32)
-    aligned[1:] = rows[1:] if after else rows[:-1]
+    if after:
+        aligned[1:] = rows[1:]
+    else:
+        aligned[1:] = rows[:-1]
     return aligned
 
 
@@ -160,7 +166,10 @@ def sampled_actions(
         _composed(rows[before + 1 : after + 1], config.compose, layout, steps)
         for before, after in itertools.pairwise(frames)
     ]
-    width = composed[0].size if composed else actions.shape[1]
+    if composed:
+        width = composed[0].size
+    else:
+        width = actions.shape[1]
     return np.stack([np.zeros(width), *composed]).astype(np.float32)
 
 
@@ -270,8 +279,13 @@ def layout_of(
     unclear: tuple[str, ...] = ()
     if kind != "absolute" and held is None:
         known = {first + place for first in quaternions for place in range(4)}
-        named = list(names) if len(names) == actions.shape[1] else [""] * actions.shape[1]
-        like = states[1:] if states is not None and states.shape == actions.shape else None
+        if len(names) == actions.shape[1]:
+            named = list(names)
+        else:
+            named = [""] * actions.shape[1]
+        like = None
+        if states is not None and states.shape == actions.shape:
+            like = states[1:]
         unclear = tuple(_no_steps(actions[1:], known, named, like))
     return Layout(kind or "undeclared", tuple(quaternions), tuple(held or ()), unclear)
 
@@ -314,7 +328,10 @@ def flat_names(names: Any, width: int) -> list[str]:
         width: how many dimensions there are.
     """
     if isinstance(names, dict):
-        names = list(names) if all(isinstance(value, int) for value in names.values()) else list(names.values())
+        if all(isinstance(value, int) for value in names.values()):
+            names = list(names)
+        else:
+            names = list(names.values())
     while isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
         names = names[0]
     if not isinstance(names, list) or len(names) != width:
@@ -333,11 +350,21 @@ def describe_dimensions(layout: Layout, names: Sequence[str], config: ActionConf
     """
     turned = {first + place for first in layout.quaternions for place in range(4)}
     recorded = len(names) or width
-    kind = "delta" if config.kind == "delta" else layout.kind
+    if config.kind == "delta":
+        kind = "delta"
+    else:
+        kind = layout.kind
     lines = []
     for place in range(width):
         row, dimension = divmod(place, recorded)
-        what = "held" if dimension in layout.held else f"{kind}, of a quaternion" if dimension in turned else kind
-        stacked = f", row {row}" if width > recorded else ""
+        if dimension in layout.held:
+            what = "held"
+        elif dimension in turned:
+            what = f"{kind}, of a quaternion"
+        else:
+            what = kind
+        stacked = ""
+        if width > recorded:
+            stacked = f", row {row}"
         lines.append(f"{names[dimension] if names else ''} ({what}{stacked})".strip())
     return lines

@@ -126,7 +126,10 @@ def _tracks(track: Tracker, camera: str, episode: Episode, inputs: Inputs) -> Re
         depth = FilledDepths(episode.depth[camera], 1.0, f"episode {episode.id}: depth of {camera}")
     elif "depth" in inputs and len(inputs["depth"]):
         depth = StoredDepths(inputs["depth"], episode)
-    spans = inputs["shots"][0]["spans"].tolist() if "shots" in inputs else [(0, len(frames))]
+    if "shots" in inputs:
+        spans = inputs["shots"][0]["spans"].tolist()
+    else:
+        spans = [(0, len(frames))]
     points = 0
     for first, end in spans:
         shot = _Shot(frames, first, end)
@@ -137,7 +140,10 @@ def _tracks(track: Tracker, camera: str, episode: Episode, inputs: Inputs) -> Re
 
 
 def _semantics(annotate: SemanticsAnnotator, camera: str, episode: Episode, inputs: Inputs) -> Records:
-    motion = inputs["motion"][0]["motion"] if "motion" in inputs else None
+    if "motion" in inputs:
+        motion = inputs["motion"][0]["motion"]
+    else:
+        motion = None
     semantics = annotate(episode, camera_of(episode, camera), motion)
     yield {
         "task": semantics.task,
@@ -250,7 +256,10 @@ class FrameRecords:
                 self._number = number
                 self._current = self._records[number]
             record = self._current
-            length = len(record["depth"]) if "depth" in record else record["points"].shape[1]
+            if "depth" in record:
+                length = len(record["depth"])
+            else:
+                length = record["points"].shape[1]
             if record["first"] <= first and last < record["first"] + length:
                 return record
         return None

@@ -123,12 +123,16 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
     reasons = judge(index, episode.timestamps, motion, annotated.key_frames, windows)
     step = check_rate(episode.fps, windows)
     whole = abs(step - round(step)) < 0.01 * step  # otherwise sampled_actions says what to do
-    stacked = round(step) if config.actions.compose == "stack" and whole else 0  # rows that each action stacks
+    stacked = 0  # rows that each action stacks
+    if config.actions.compose == "stack" and whole:
+        stacked = round(step)
     layout = Layout.from_json(episode.meta.get("actions", {}))
     names = flat_names(episode.meta.get("action_names"), episode.actions.shape[1])
     pictures = _Fitted(episode.cameras[camera].read, config)
     depths, unit = _depths(annotated, camera, config, pictures)
-    stored = None if annotated.tracks is None else FrameRecords(annotated.tracks)
+    stored = None
+    if annotated.tracks is not None:
+        stored = FrameRecords(annotated.tracks)
     statistics: Statistics | None = None
     near = np.inf
     far = 0.0
@@ -143,15 +147,23 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
         if tracks is None:
             reasons[number] = "no track"
             continue
-        depth = depths.read(frames.tolist()) if depths is not None else None
+        depth = None
+        if depths is not None:
+            depth = depths.read(frames.tolist())
         actions = sampled_actions(episode.actions, frames, config.actions, layout)
         rows = Statistics.of(actions[1:])
-        statistics = statistics.merged(rows) if statistics else rows
+        if statistics:
+            statistics = statistics.merged(rows)
+        else:
+            statistics = rows
         if depth is not None:
             near = min(near, float(depth[depth > 0].min()))
             far = max(far, float(depth.max()))
         success = np.asarray(episode.meta.get("success", False), bool)  # one value per frame, or one for the episode
-        success = success[frames] if success.ndim else np.full(len(frames), bool(success))
+        if success.ndim:
+            success = success[frames]
+        else:
+            success = np.full(len(frames), bool(success))
         succeeded += bool(success[-1])
         yield {
             "rgb": rgb,
@@ -179,11 +191,17 @@ def cut(annotated: Annotated, config: ClipConfig) -> Records:
 def _short(
     index: WindowIndex, spans: list[Span], fps: float, windows: WindowConfig, shots: Sequence[Span]
 ) -> dict[str, Any]:
-    faster = "raise --windows.rate or " if 0 < windows.rate < fps else ""
-    at = f" at {windows.rate:g} Hz" if windows.rate else ""
+    faster = ""
+    if 0 < windows.rate < fps:
+        faster = "raise --windows.rate or "
+    at = ""
+    if windows.rate:
+        at = f" at {windows.rate:g} Hz"
     span = round((windows.frames - 1) * check_rate(fps, windows)) + 1
     uncut = len(shots) > 1 and shots[-1][1] >= span
-    whole = "the video was cut between shots, so --shots none if it was not edited, or " if uncut else ""
+    whole = ""
+    if uncut:
+        whole = "the video was cut between shots, so --shots none if it was not edited, or "
     return {
         "spans": index.short,
         "longest": max((end - first for first, end in spans), default=0),
@@ -238,11 +256,13 @@ def _tracks(
     if stored is None:
         return Tracked(np.zeros((count, len(frames), 2), np.float32), np.zeros((count, len(frames)), bool))
     record = stored.with_frames(int(frames[0]), int(frames[-1]))
-    columns = frames - record["first"] if record else frames
     if record is None or placement is None:
         return None
+    columns = frames - record["first"]
     tracked = Tracked(*placement.tracks(record["points"][:, columns], record["visible"][:, columns]))
-    return window_tracks(tracked, np.arange(len(frames)), count) if tracked.visible[:, 0].any() else None
+    if tracked.visible[:, 0].any():
+        return window_tracks(tracked, np.arange(len(frames)), count)
+    return None
 
 
 def _depths(annotated: Annotated, camera: str, config: ClipConfig, pictures: "_Fitted") -> "tuple[_Fitted | None, str]":
@@ -281,7 +301,9 @@ class _Fitted:
     def read(self, frames: list[int]) -> Float[np.ndarray, "T S S *C"]:
         """Returns these frames. The first frame must not decrease from call to call: earlier frames are dropped."""
         missing = [frame for frame in frames if frame not in self._kept]
-        new = self._read(missing) if missing else ()
+        new: Iterable[np.ndarray] = ()
+        if missing:
+            new = self._read(missing)
         kept = {frame: picture for frame, picture in self._kept.items() if frame >= frames[0]}
         sized = (self._fitted(picture) for picture in new)
         self._kept = kept | dict(zip(missing, sized, strict=True))

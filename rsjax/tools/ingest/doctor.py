@@ -122,12 +122,16 @@ def check_episode(episode: Episode, limits: Thresholds) -> tuple[list[Finding], 
     for name, frames in episode.cameras.items():
         more, picture = _pictures(name, frames, limits.frames, moving=bool(episode.actions[1:].any()))
         problems += more
-        first = picture if first is None else first
+        if first is None:
+            first = picture
     for name, maps in episode.depth.items():
         problems += _depth(name, maps, limits.frames)
     if not episode.task.strip():
         problems.append(("no-task", "its task is empty"))
-    states = np.zeros((0, 0), np.float32) if episode.states is None else episode.states
+    if episode.states is None:
+        states = np.zeros((0, 0), np.float32)
+    else:
+        states = episode.states
     digest = None
     if first is not None:
         digest = hashlib.sha256(first.tobytes() + episode.actions.tobytes() + states.tobytes()).digest()
@@ -201,7 +205,9 @@ def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
 
 def _sample(count: int, frames: int) -> list[int]:
     """Spreads ``frames`` indices evenly over ``count``, including the first and the last; 0 means all."""
-    return list(range(count)) if not frames else np.unique(np.linspace(0, count - 1, frames).astype(int)).tolist()
+    if not frames:
+        return list(range(count))
+    return np.unique(np.linspace(0, count - 1, frames).astype(int)).tolist()
 
 
 def _pictures(
@@ -222,7 +228,8 @@ def _pictures(
         for start in range(0, len(chosen), _CHUNK):
             numbers = chosen[start : start + _CHUNK]
             pictures = frames.read(numbers)
-            first = pictures[0] if first is None else first
+            if first is None:
+                first = pictures[0]
             flat = np.ptp(pictures.reshape(len(pictures), -1, 3), axis=1).max(1) == 0
             blank += [number for number, one_colour in zip(numbers, flat, strict=True) if one_colour]
             changes = changes or bool((pictures != first).any())
@@ -242,7 +249,9 @@ def _depth(name: str, maps: Depths, wanted: int) -> Iterator[Problem]:
             (depth,) = maps.read([number])
             bad = not np.isfinite(depth).all() or depth.min() < 0
             if bad or not depth.any():
-                problem = "values that are negative or not finite" if bad else "no value above 0"
+                problem = "no value above 0"
+                if bad:
+                    problem = "values that are negative or not finite"
                 yield "depth", f"{name}: frame {number} has {problem}"
                 return
     except EpisodeError as error:
@@ -275,8 +284,9 @@ class Diagnosis:
 
     def usual(self) -> list[str]:
         """Returns the kinds of finding that every episode has, if all can be read and decoded: they may be intended."""
-        kinds = {} if self.unread else self.counts()
-        return [kind for kind, count in kinds.items() if count == len(self.refs) and kind != "undecodable"]
+        if self.unread:
+            return []
+        return [kind for kind, count in self.counts().items() if count == len(self.refs) and kind != "undecodable"]
 
     def reasons(self) -> dict[str, list[str]]:
         """Returns the findings of each episode that has any, as texts by its id."""
@@ -394,7 +404,10 @@ def _mended(episode: Episode) -> str:
     """Returns the reader's notes on what it repaired."""
     notes = []
     for name, value in episode.meta.get("notes", {}).items():
-        parts = [f"{key} {number}" for key, number in value.items()] if isinstance(value, dict) else value
+        if isinstance(value, dict):
+            parts = [f"{key} {number}" for key, number in value.items()]
+        else:
+            parts = value
         notes.append(f"{name.replace('_', ' ')}: {', '.join(map(str, parts)) if isinstance(parts, list) else parts}")
     return "; ".join(notes)
 

@@ -38,7 +38,10 @@ def run_on_this_machine(plan: IngestPlan, refs: Sequence[EpisodeRef], settle: Se
             result = 1, 0
         settle(ref, *result)
 
-    threads = max(1, count_cores() // workers) if workers else None
+    if workers:
+        threads = max(1, count_cores() // workers)
+    else:
+        threads = None
     run_items(partial(_open_worker, plan, threads), refs, workers, settled)
 
 

@@ -158,7 +158,10 @@ def make_runner(options: IngestOptions) -> "Runner":
     if options.runner == "ray":
         from rsjax.tools.ingest.ray_runner import run_on_ray
 
-        most = None if options.workers < 0 else max(1, options.workers)
+        if options.workers < 0:
+            most = None
+        else:
+            most = max(1, options.workers)
         return partial(run_on_ray, address=options.ray_address, most=most)
     from rsjax.processes import count_workers
     from rsjax.tools.ingest.ingest import run_on_this_machine

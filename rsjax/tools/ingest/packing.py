@@ -75,7 +75,9 @@ def cut_episodes(plan: IngestPlan, refs: Sequence[EpisodeRef]) -> list[CutEpisod
 
 def refuse_odd(cuts: list[CutEpisode]) -> tuple[list[CutEpisode], list[tuple[EpisodeRef, str]]]:
     """Returns the episodes whose actions have the most common number of dimensions, and the others with the reason."""
-    usual = Counter(cut.action_dim for cut in cuts).most_common(1)[0][0] if cuts else None
+    if not cuts:
+        return [], []
+    usual = Counter(cut.action_dim for cut in cuts).most_common(1)[0][0]
     why = f"dimensions, those of most others have {usual}; ingest it alone"
     odd = [(cut.ref, f"actions: {cut.action_dim} {why}") for cut in cuts if cut.action_dim != usual]
     return [cut for cut in cuts if cut.action_dim == usual], odd
@@ -90,9 +92,11 @@ def choose_contents(cuts: Sequence[CutEpisode], test_share: float) -> Contents:
     for cut in splits["train"]:
         if cut.depth_unit is not None:
             units[cut.depth_unit] += cut.records
-    unit = max(units, key=lambda name: (units[name], name == "metres")) if units else None
+    unit = max(units, key=lambda name: (units[name], name == "metres"), default=None)
     ranges = [cut.depth for cut in splits["train"] if cut.depth is not None and cut.depth_unit == unit]
-    spread = [min(near for near, _ in ranges), max(far for _, far in ranges)] if ranges else None
+    spread = None
+    if ranges:
+        spread = [min(near for near, _ in ranges), max(far for _, far in ranges)]
     return Contents(splits, unit, spread)
 
 
@@ -147,7 +151,9 @@ def _finite(value: Any) -> Any:
         return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def _records(
@@ -156,7 +162,9 @@ def _records(
     """Yields the clips of these episodes, without depth that is not in the store's unit, and with its depth range."""
     for cut in cuts:
         source = EpisodeWork(plan, cut.ref).records(CLIPS, cut.records)
-        changes: dict[str, Any] = {} if cut.depth_unit == contents.depth_unit else {"depth": None}
+        changes: dict[str, Any] = {}
+        if cut.depth_unit != contents.depth_unit:
+            changes["depth"] = None
         provenance = {"depth_range": contents.depth_range} | ({"depth_unit": ""} if changes else {})
         for number in range(len(source)):
             record = source[number]
@@ -168,7 +176,9 @@ def _dimensions(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> list[str]:
     """Returns the most common description of the actions' dimensions among the episodes."""
     marks = (EpisodeWork(plan, cut.ref).done(CLIPS) for cut in cuts)
     said = Counter(tuple(mark["summary"]["dimensions"]) for mark in marks if mark is not None)
-    return list(said.most_common(1)[0][0]) if said else []
+    if said:
+        return list(said.most_common(1)[0][0])
+    return []
 
 
 def _statistics(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> dict[str, Any]:
@@ -179,5 +189,10 @@ def _statistics(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> dict[str, Any]:
         if mark is None:
             raise StoreError(f"{work.output(CLIPS)}: was deleted meanwhile; run again")
         rows = Statistics.from_json(mark["summary"]["actions"])
-        total = total.merged(rows) if total else rows
-    return total.to_json() if total else {}
+        if total:
+            total = total.merged(rows)
+        else:
+            total = rows
+    if total:
+        return total.to_json()
+    return {}

@@ -132,8 +132,10 @@ def _decode(payload: bytes, flags: int, where: Path | str) -> np.ndarray:
     problem = f"not a readable picture ({len(payload)} bytes)"
     if payload.startswith(b"\x89PNG\r\n\x1a\n"):
         sides = _png_sides(payload)
+    elif payload.startswith(b"\xff\xd8"):
+        sides = _jpeg_sides(payload)
     else:
-        sides = _jpeg_sides(payload) if payload.startswith(b"\xff\xd8") else None
+        sides = None
     if sides is None:
         instead = placeholder(payload) or "neither a whole PNG nor a JPEG"
         raise EpisodeError.at(where, f"{problem}: {instead}", kind="undecodable")
@@ -173,7 +175,10 @@ def _jpeg_sides(payload: bytes) -> tuple[int, int] | None:
         if marker == 0xDA:
             break
         has_length = marker not in (0x00, 0x01, 0xFF) and not 0xD0 <= marker <= 0xD8
-        step = 2 + int.from_bytes(payload[place + 2 : place + 4], "big") if has_length else 1
+        if has_length:
+            step = 2 + int.from_bytes(payload[place + 2 : place + 4], "big")
+        else:
+            step = 1
         place = payload.find(b"\xff", place + step)
     return largest
 
@@ -204,7 +209,10 @@ class Placement:
     @classmethod
     def create(cls, fit: Fit, height: int, width: int, size: int) -> "Placement":
         """Places a picture of H×W pixels in a square of S×S, at whole pixels of the picture (crop) or square (pad)."""
-        words = "" if height == width else f"{width} × {height} {_DONE[fit]}"
+        if height == width:
+            words = ""
+        else:
+            words = f"{width} × {height} {_DONE[fit]}"
         if fit == "crop":
             side = min(height, width)
             left = (width - side) // 2
@@ -229,7 +237,10 @@ class Placement:
             offset = self.offset[axis]
             source.append(_pixels(-offset / scale, (1 - offset) / scale, side))
             target.append(_pixels(offset, offset + scale, self.size))
-        method = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST_EXACT
+        if picture.ndim == 3:
+            method = cv2.INTER_AREA
+        else:
+            method = cv2.INTER_NEAREST_EXACT
         rows, columns = target
         seen = picture[tuple(source)]
         small = cv2.resize(seen, (columns.stop - columns.start, rows.stop - rows.start), interpolation=method)

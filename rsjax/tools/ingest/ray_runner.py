@@ -166,7 +166,8 @@ class _Actors:
             if mark is None:
                 mark = await self._run_item(work, step)
                 ran += 1
-                clips += mark.get("records", 0) if step is self._plan.steps[-1] else 0
+                if step is self._plan.steps[-1]:
+                    clips += mark.get("records", 0)
             if mark["status"] == "failed":
                 break
         return ran, clips

@@ -57,7 +57,9 @@ class IngestSummary:
     def ruled_out_by(self) -> str:
         """Returns the one option that ruled out every quarantined episode; "" if there is none."""
         options = {row["option"] for row in self.quarantined}
-        return options.pop() if len(options) == 1 else ""
+        if len(options) == 1:
+            return options.pop()
+        return ""
 
     def tables(self) -> str:
         """Names the files that give the reasons for what was left out; "" if nothing was."""
@@ -113,7 +115,10 @@ def summarise(
             else:
                 short[ref.id] = last["summary"]["short"]
     for row in steps.values():
-        row["clips_per_second"] = clips / row["seconds"] if row["seconds"] else None
+        if row["seconds"]:
+            row["clips_per_second"] = clips / row["seconds"]
+        else:
+            row["clips_per_second"] = None
     # All episodes with the same cure get the same reason.
     longest = Counter[tuple[str, str]]()
     for why in short.values():
@@ -152,7 +157,10 @@ def no_clips(plan: IngestPlan, summary: IngestSummary) -> str:
     """Returns one line that says why no episode gave a clip."""
     option = summary.ruled_out_by()
     reasons = [row["error"] for row in summary.quarantined] + list(summary.filtered.values())
-    because = f", all {len(summary.quarantined)} of these because of {option}" if option else ""
+    if option:
+        because = f", all {len(summary.quarantined)} of these because of {option}"
+    else:
+        because = ""
     return (
         f"none of {summary.episodes} episodes gave a clip ({len(summary.filtered)} left out, "
         f"{len(summary.quarantined)} quarantined{because}), the first one for: {reasons[0]}; {plan.folder} has all of "
@@ -171,7 +179,10 @@ def lines(summary: IngestSummary) -> list[str]:
     if summary.cut:
         text.append(f"cuts      in {summary.cut} episodes, which no window crosses; --shots none if they are none")
     if summary.test_clips == 0:
-        cure = "add episodes" if summary.done < 2 else "raise --test-share"  # one episode is always for training
+        # one episode is always for training
+        cure = "raise --test-share"
+        if summary.done < 2:
+            cure = "add episodes"
         text.append(f"testing   no clip is left for it, and training needs two: {cure}")
     text += [f"pictures  of {number} episodes, {how}" for how, number in summary.fits.items()]
     if summary.depth_left_out:
@@ -182,7 +193,9 @@ def lines(summary: IngestSummary) -> list[str]:
             f"{run['clips_per_second']:.3g} clips/s"
         )
     for name, row in summary.steps.items():
-        rate = f", {row['clips_per_second']:.3g} clips/s a worker" if row["clips_per_second"] else ""
+        rate = ""
+        if row["clips_per_second"]:
+            rate = f", {row['clips_per_second']:.3g} clips/s a worker"
         text.append(
             f"{name:<9} {row['done']} done, {row['failed']} failed, {_brief(row['seconds'])} on workers, "
             f"{_brief(row['cpu_seconds'])} on cores{rate}"
@@ -196,4 +209,6 @@ def lines(summary: IngestSummary) -> list[str]:
 
 
 def _brief(seconds: float) -> str:
-    return duration(seconds) if seconds >= 60 else f"{seconds:.2g} s"
+    if seconds >= 60:
+        return duration(seconds)
+    return f"{seconds:.2g} s"

@@ -99,7 +99,10 @@ def _scan(path: Path, size: int, modified: int) -> VideoIndex:
     if len(keys) < len(packets):
         raise EpisodeError.at(path, "two frames have the same time", "rewrite the file with increasing times")
     in_order = list(keys) == stamps  # either frames are stored as shown, or the stamps are wrong
-    labels = _shown_order(path, stamps, avi) if reorders and in_order else stamps
+    if reorders and in_order:
+        labels = _shown_order(path, stamps, avi)
+    else:
+        labels = stamps
     return VideoIndex(np.array(stamps), np.array(labels), np.array([keys[label] for label in labels]), time_base)
 
 
@@ -197,7 +200,10 @@ def _decoded_labels(path: Path, labels: list[int]) -> list[int]:
 
 def _unreadable(path: Path, error: Exception) -> EpisodeError:
     missing = isinstance(error, FileNotFoundError)
-    problem = "missing" if missing else f"not a readable video ({getattr(error, 'strerror', None) or error})"
+    if missing:
+        problem = "missing"
+    else:
+        problem = f"not a readable video ({getattr(error, 'strerror', None) or error})"
     return EpisodeError.at(path, problem, kind="undecodable")
 
 
@@ -214,7 +220,9 @@ class VideoFrames:
         self._numbers = numbers
 
     def __len__(self) -> int:
-        return len(scan(self.path).stamps) if self._numbers is None else len(self._numbers)
+        if self._numbers is None:
+            return len(scan(self.path).stamps)
+        return len(self._numbers)
 
     def read(self, indices: Sequence[int]) -> UInt8[np.ndarray, "n H W 3"]:
         """Returns these pictures, 0–255, RGB, rotated as the file's display matrix says.
@@ -374,7 +382,9 @@ class _Decoder:
     def _start(self, number: int) -> int:
         """Returns the nearest frame at or before this one at which decoding can begin."""
         place = int(np.searchsorted(self._starts, number, side="right")) - 1
-        return int(self._starts[place]) if place >= 0 else 0
+        if place >= 0:
+            return int(self._starts[place])
+        return 0
 
     def _decode_until(self, number: int) -> Any:
         """Continues decoding up to this frame; returns None if the decoder skips it."""
@@ -383,11 +393,15 @@ class _Decoder:
                 continue
             self._next = place + 1
             if place >= number:
-                return frame if place == number and not frame.is_corrupt else None
+                if place == number and not frame.is_corrupt:
+                    return frame
+                return None
         return None
 
 
 def _upright(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
     """Returns a decoded frame as RGB, rotated as the file's display matrix says."""
     picture = frame.to_ndarray(format="rgb24", threads=1)  # threads would hang a forked process that frees them
-    return np.rot90(picture, round(frame.rotation / 90)) if frame.rotation else picture
+    if frame.rotation:
+        return np.rot90(picture, round(frame.rotation / 90))
+    return picture

@@ -72,7 +72,10 @@ def check_rate(fps: float, config: WindowConfig) -> float:
     Raises:
         EpisodeError: the recording has a lower rate than windows need, or a rate that no camera has.
     """
-    step = fps / config.rate if config.rate else 1.0
+    if config.rate:
+        step = fps / config.rate
+    else:
+        step = 1.0
     if not step < MAX_STEP:
         raise EpisodeError(f"fps: recorded at {fps:g} fps, which no camera does; mend the file's rate or times")
     if step < 1 - 1e-6:
@@ -153,7 +156,9 @@ def cut_spans(count: int, shots: Sequence[Span], segments: Sequence[Segment], co
 def segment_at(segments: Sequence[Segment], frames: Int[np.ndarray, " T"]) -> Segment | None:
     """Returns the segment with most of a window's frames, the earlier one of two; None if no segment has any."""
     shares = [int(((frames >= segment.start) & (frames < segment.end)).sum()) for segment in segments]
-    return segments[int(np.argmax(shares))] if any(shares) else None
+    if any(shares):
+        return segments[int(np.argmax(shares))]
+    return None
 
 
 def judge(
@@ -176,13 +181,20 @@ def judge(
         ``gap``, ``still``, ``shaking``, ``no key frame`` or "".
     """
     frames = index.frames
-    recorded = float(np.median(np.diff(timestamps))) if len(timestamps) > 1 else 0.0
+    if len(timestamps) > 1:
+        recorded = float(np.median(np.diff(timestamps)))
+    else:
+        recorded = 0.0
     numbers = np.diff(frames, axis=1)
     seconds = np.diff(timestamps[frames], axis=1)
     # Rounding to recorded frames makes some steps longer than 1 / rate although no frame is missing.
     steps = np.maximum(numbers * recorded, 1 / config.rate if config.rate else 0.0)
     torn = ((seconds > config.most_gap * steps) | (numbers < 1)).any(1)
-    means = np.full(len(index), np.nan) if motion is None else _window_means(motion, index)  # nan passes both bounds
+    # nan passes both bounds
+    if motion is None:
+        means = np.full(len(index), np.nan)
+    else:
+        means = _window_means(motion, index)
     keys = np.sort(np.asarray(key_frames, np.int64))
     has_key = np.searchsorted(keys, frames[:, 0]) < np.searchsorted(keys, frames[:, -1], "right")
     reasons = {

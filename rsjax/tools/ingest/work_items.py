@@ -127,12 +127,16 @@ class EpisodeWork:
         except (OSError, ValueError, KeyError):
             return None
         sound = mark["status"] in ("done", "failed") and all(type(number) in (int, float) for number in numbers)
-        return mark if sound and whole else None
+        if sound and whole:
+            return mark
+        return None
 
     def done(self, step: str) -> Mark | None:
         """Reads the mark of a work item that succeeded; None if it failed or was not run."""
         mark = self.mark(step)
-        return mark if mark is not None and mark["status"] == "done" else None
+        if mark is not None and mark["status"] == "done":
+            return mark
+        return None
 
     def records(self, step: str, count: int) -> Source:
         """Opens the ``count`` records of a work item that succeeded."""
@@ -141,7 +145,10 @@ class EpisodeWork:
 
     def fail(self, step: str, error: BaseException, seconds: float = 0.0, cpu_seconds: float = 0.0) -> Mark:
         """Writes the mark of a failed work item, a row of the quarantine table."""
-        message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, UserError):
+            message = str(error)
+        else:
+            message = f"{type(error).__name__}: {error}"
         row = {
             "error": " ".join(message.split()),
             "option": getattr(error, "option", ""),
@@ -184,7 +191,10 @@ def run_episode(plan: IngestPlan, ref: EpisodeRef, prepared: set[str]) -> tuple[
         if mark is None:
             mark = run_item(work, step, prepared)
             ran += 1
-            clips += mark.get("records", 0) if step is plan.steps[-1] else 0
+            if step is plan.steps[-1]:
+                clips += mark.get("records", 0)
+            else:
+                clips += 0
         if mark["status"] == "failed":
             break
     return ran, clips

@@ -28,7 +28,9 @@ class CategoryConfig:
 
     def scene(self, description: str) -> str:
         """Returns the scene's label; ``unknown`` without a description or a match."""
-        return look_up(self.scenes, description) if self.scenes else description or UNKNOWN
+        if self.scenes:
+            return look_up(self.scenes, description)
+        return description or UNKNOWN
 
 
 def look_up(table: Table, text: str) -> str:

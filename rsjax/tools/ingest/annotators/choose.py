@@ -47,7 +47,9 @@ def choose_annotators(words: dict[str, str]) -> Annotators:
 def choose_recorded(word: str) -> RecordedDepth | None:
     """Returns how recorded depth is read with this depth method; None if ``none`` turns depth off."""
     chosen = choose("depth", word)
-    return chosen if chosen is None or isinstance(chosen, RecordedDepth) else RecordedDepth()
+    if chosen is None or isinstance(chosen, RecordedDepth):
+        return chosen
+    return RecordedDepth()
 
 
 def choose(stage: str, text: str) -> Any:

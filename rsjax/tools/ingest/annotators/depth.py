@@ -113,7 +113,10 @@ def stretch(inverse: Float32[np.ndarray, "n H W"], extent: tuple[float, float]) 
     least, and even in 1/depth beyond them, up to 1000.
     """
     low, high = extent
-    position = (inverse - low) / (high - low) if high > low else np.zeros_like(inverse)
+    if high > low:
+        position = (inverse - low) / (high - low)
+    else:
+        position = np.zeros_like(inverse)
     return (1 / np.maximum(_NEAR_SHARE + (1 - _NEAR_SHARE) * position, 1e-3)).astype(np.float32)
 
 
@@ -180,14 +183,17 @@ class VideoDepthAnything(Network):
                 f"Depth Anything holds in memory at once; raise that, or cut the episode"
             )
         model = self.load()
-        precise = {"fp32": True} if self.device == "cpu" else {}  # older checkouts do not know the option
-        options = {"input_size": self.input_size, "device": self.device} | precise
+        options: dict[str, Any] = {"input_size": self.input_size, "device": self.device}
+        if self.device == "cpu":
+            options["fp32"] = True  # older checkouts do not know the option
         maps, _ = model.infer_video_depth(frames.read(range(len(frames))), episode.fps, **options)
         return _as_maps(np.asarray(maps), self.metric, episode, camera, self.name)
 
     def build(self) -> Any:
         module = checkout_module(self.checkout, "video_depth_anything.video_depth", self.title)
-        options = {"metric": True} if self.metric else {}  # older checkouts do not know the option
+        options = {}
+        if self.metric:
+            options["metric"] = True  # older checkouts do not know the option
         model = module.VideoDepthAnything(**_SIZES[self.encoder], **options)
         return load_weights(model, self.weights, self.device, self.title)
 
@@ -234,7 +240,9 @@ def _as_maps(maps: Float32[np.ndarray, "N H W"], metric: bool, episode: Episode,
     if maps.shape != shape:
         raise AnnotationError(f"{method} gave depth of shape {maps.shape} for frames of {shape}; check its version")
     try:
-        return metric_depth(maps) if metric else relative_depth(maps)
+        if metric:
+            return metric_depth(maps)
+        return relative_depth(maps)
     except ValueError as error:
         raise AnnotationError(f"episode {episode.id}: {method}: {error}; check weights and precision") from error
 

@@ -76,7 +76,10 @@ def _resized(pictures: Pictures) -> UInt8[np.ndarray, "T h w 3"]:
     if scale == 1:
         return pictures
     size = (round(width * scale), round(height * scale))
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    if scale < 1:
+        how = cv2.INTER_AREA
+    else:
+        how = cv2.INTER_LINEAR
     return np.stack([cv2.resize(picture, size, interpolation=how) for picture in pictures])
 
 
@@ -102,7 +105,9 @@ class RaftFlow(Network):
         model = self.load()
         starts = range(0, len(before), self.batch)
         flows = [self._flow(model, before[i : i + self.batch], after[i : i + self.batch]) for i in starts]
-        return np.concatenate(flows) if flows else np.zeros((*before.shape[:3], 2), np.float32)
+        if flows:
+            return np.concatenate(flows)
+        return np.zeros((*before.shape[:3], 2), np.float32)
 
     def build(self) -> Any:
         flows = library("torchvision.models.optical_flow", self.title)

@@ -48,7 +48,12 @@ class OwnSemantics(Annotator):
         parts = []
         for segment in episode.segments or (Segment(0, len(episode.timestamps), ""),):
             frames, by = key_frames(segment, changes, motion, self.smooth)
-            text, text_by = (segment.text, "segment") if segment.text else (episode.task, episode.task and "task")
+            if segment.text:
+                text = segment.text
+                text_by = "segment"
+            else:
+                text = episode.task
+                text_by = episode.task and "task"
             parts.append(Semantic(segment.start, segment.end, text, segment.skill, frames, text_by, by))
         return Semantics(episode.task, str(episode.meta.get("scene", "")), tuple(parts))
 
@@ -137,7 +142,9 @@ class InternVL(Network):
 
     def __call__(self, episode: Episode, camera: str, motion: Float[np.ndarray, " N"] | None = None) -> Semantics:
         known = OwnSemantics()(episode, camera, motion)
-        return known if all(part.text for part in known.parts) else complete(known, episode, camera, self._ask, self)
+        if all(part.text for part in known.parts):
+            return known
+        return complete(known, episode, camera, self._ask, self)
 
     def params(self) -> dict[str, Any]:
         return super().params() | {"own": OwnSemantics().params()}

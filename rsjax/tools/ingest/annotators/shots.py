@@ -72,14 +72,20 @@ def histogram_changes(frames: Frames) -> Float32[np.ndarray, " N"]:
     for start, pictures in in_chunks(frames):
         for t, picture in enumerate(pictures, start):
             histogram = _histogram(picture)
-            changes[t] = 0.0 if last is None else np.abs(histogram - last).sum() / 2
+            if last is None:
+                changes[t] = 0.0
+            else:
+                changes[t] = np.abs(histogram - last).sum() / 2
             last = histogram
     return changes
 
 
 def _histogram(picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " bins"]:
     scale = min(1.0, _SIDE / max(picture.shape[:2]))
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+    if scale < 1:
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    else:
+        small = picture
     hsv = cv2.cvtColor(small, cv2.COLOR_RGB2HSV)
     histogram = cv2.calcHist([hsv], [0, 1, 2], None, list(_BINS), [0, 180, 0, 256, 0, 256])
     return histogram.ravel() / histogram.sum()
@@ -136,6 +142,9 @@ def transition_probabilities(
         window = torch.from_numpy(padded[start : start + WINDOW])[None].to(device)
         with torch.no_grad():
             output = model(window)
-        logits = output[0] if isinstance(output, tuple) else output
+        if isinstance(output, tuple):
+            logits = output[0]
+        else:
+            logits = output
         found.append(torch.sigmoid(logits)[0, _EDGE : _EDGE + STEP, 0].cpu().numpy())
     return np.concatenate(found)[:count].astype(np.float32)

@@ -170,7 +170,10 @@ def track_in_spans(frames: Frames, follow: Follower, grid: int, span: int, depth
         visible = np.concatenate([visible, np.zeros((len(seeds), count), bool)])
         visible[len(visible) - len(seeds) :, start] = True
         going = np.flatnonzero(visible[:, start])
-        maps = depth.read(range(start, end)) if depth else None
+        if depth:
+            maps = depth.read(range(start, end))
+        else:
+            maps = None
         places, seen = follow(frames.read(range(start, end)), points[going, start], maps)
         points[going, start:end] = places
         points[going, end:] = places[:, -1:]

@@ -98,7 +98,8 @@ class AgiBot:
             for name in _FOLDERS:
                 folder = self._root / name / task
                 try:
-                    on_disk |= {entry.name for entry in subfolders(folder)} if exists(folder) else set()
+                    if exists(folder):
+                        on_disk |= {entry.name for entry in subfolders(folder)}
                 except SourceError as error:
                     yield broken(safe_id(f"task_{task}-{name}"), str(error))
             for identity in sorted(on_disk | entries.keys(), key=lambda name: (len(name), name)):
@@ -117,7 +118,9 @@ class AgiBot:
         folder = inside(self._root, f"observations/{place}")
         segments, bad = _segments(location["segments"], len(times))
         depth, why_not = _depth(folder / "depth", len(times))
-        unnamed = "" if location["told"] else "names no such episode, so it has no task"
+        unnamed = "names no such episode, so it has no task"
+        if location["told"]:
+            unnamed = ""
         notes = {"task_info": unnamed, "bad_segments": bad, "depth_left_out": why_not, **proprio.notes}
         episode = Episode(
             id=ref.id,
@@ -147,14 +150,17 @@ class AgiBot:
             raise SourceError(f"{self._root}: has neither task_info nor observations; unpack the data set")
         tasks = {path.stem.removeprefix("task_") for path in info.glob("task_*.json")}
         for folder in (self._root / name for name in _FOLDERS):
-            tasks |= {path.name for path in subfolders(folder)} if exists(folder) else set()
+            if exists(folder):
+                tasks |= {path.name for path in subfolders(folder)}
         if absent := [task for task in self._only if task not in tasks]:
             raise SourceError(f"{self._root}: has no task {absent[0]}; it has {', '.join(sorted(tasks))}")
         return sorted(self._only or tasks, key=lambda name: (len(name), name))
 
     def _ref(self, task: str, identity: str, entry: dict[str, Any]) -> EpisodeRef:
         labels = entry.get("label_info")
-        segments = labels.get("action_config") if isinstance(labels, dict) else None
+        segments = None
+        if isinstance(labels, dict):
+            segments = labels.get("action_config")
         location = {
             "task": task,
             "episode": identity,
@@ -199,7 +205,9 @@ class Proprio:
     def seconds(self) -> Float64[np.ndarray, " N"]:
         """Returns the seconds since the first frame; the file has nanoseconds."""
         whole = self._stamps.dtype.kind in "iu"
-        stamps = self._stamps.astype(np.int64) if whole else self._stamps  # differences of unsigned ones wrap around
+        stamps = self._stamps
+        if whole:
+            stamps = stamps.astype(np.int64)  # differences of unsigned ones wrap around
         return (stamps - stamps[0]).astype(np.float64) / 1e9
 
     def states(self) -> Float32[np.ndarray, "N 34"]:
@@ -212,7 +220,10 @@ class Proprio:
     def quaternions(self, name: str) -> Float64[np.ndarray, "N 8"]:
         """Returns both hands' quaternions at every frame, each with continuous signs. Raises as :meth:`command`."""
         kind, _, field = name.partition("/")
-        pair = self._state(field) if kind == "state" else self.command(field)
+        if kind == "state":
+            pair = self._state(field)
+        else:
+            pair = self.command(field)
         mended = np.concatenate([continuous_signs(pair[:, :4]), continuous_signs(pair[:, 4:])], 1)
         if rows := int((mended != pair).any(1).sum()):
             self.notes["flipped"][name] = rows
@@ -299,10 +310,14 @@ class Proprio:
         if data.size > MAX_CELLS or data.dtype.kind not in "fiu" or not data.ndim:
             raise self._error(f"{name} is {data.dtype} {data.shape}, no table of numbers")
         if data.size != len(data) * width:
-            hint = ", a dexterous hand" if name.endswith("effector/position") and data.size == len(data) * 12 else ""
+            hint = ""
+            if name.endswith("effector/position") and data.size == len(data) * 12:
+                hint = ", a dexterous hand"
             raise self._error(f"{name} has shape {data.shape}, not {width} numbers a row{hint}")
         rows = data[()].reshape(-1, width)
-        return rows if name == "timestamp" else rows.astype(np.float64)
+        if name == "timestamp":
+            return rows
+        return rows.astype(np.float64)
 
 
 def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:

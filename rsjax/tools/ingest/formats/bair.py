@@ -91,7 +91,9 @@ class BairSource:
 def _trajectories(name: str) -> tuple[int, int]:
     """Returns the first and last trajectory that a file's name promises; -1 if it promises none."""
     match = re.match(r"traj_(\d+)_to_(\d+)", name)
-    return (int(match[1]), int(match[2])) if match else (-1, -1)
+    if match:
+        return (int(match[1]), int(match[2]))
+    return (-1, -1)
 
 
 def _rows(example: Example, key: str, count: int) -> Float32[np.ndarray, "N n"]:

@@ -137,7 +137,10 @@ def parquet_columns(path: Path, columns: Sequence[str] | None = None, filters: A
     with reading(path):
         with pq.ParquetFile(data_file(path)) as file:
             names = file.schema_arrow.names
-            chosen = names if columns is None else [name for name in columns if name in names]
+            if columns is None:
+                chosen = names
+            else:
+                chosen = [name for name in columns if name in names]
             # The metadata of column chunks is not read: if it is damaged, pyarrow ends the process.
             count = file.metadata.num_rows
             size = sum(file.metadata.row_group(number).total_byte_size for number in range(file.num_row_groups))
@@ -179,7 +182,9 @@ def _numbers(table: pa.Table, column: str, where: Path | str) -> Float64[np.ndar
         values = np.array(table[column].to_pylist(), np.float64)
     except (ValueError, TypeError) as error:
         raise wrong from error
-    return values.reshape(len(values), -1) if values.size else np.zeros((len(values), 0))
+    if values.size:
+        return values.reshape(len(values), -1)
+    return np.zeros((len(values), 0))
 
 
 def integers(table: pa.Table, column: str, where: Path | str) -> Int64[np.ndarray, " N"]:

@@ -118,7 +118,10 @@ def open_source(
     if not path.is_dir():
         raise SourceError(f"{path}: not a folder; give the one that contains the episodes")
     file = path / "dataset.json"
-    values = read_json(file) if exists(file) else {}
+    if exists(file):
+        values = read_json(file)
+    else:
+        values = {}
     from_json(FolderConfig, values, file)
     options: dict[str, object] = {"task": task, "fps": fps, "after": after, "action": action}
     options |= {"kind": kind, "held": held, "quaternions": quaternions}
@@ -172,7 +175,10 @@ class Folder:
             problem = f"has no video ({', '.join(VIDEOS)}) and no folder of pictures"
             raise EpisodeError.at(place, problem, "add one or leave it out")
         count = len(next(iter(cameras.values())))
-        json_path = place.with_name(f"{name}.json") if flat else place / "episode.json"
+        if flat:
+            json_path = place.with_name(f"{name}.json")
+        else:
+            json_path = place / "episode.json"
         task, own_fps, segments = read_description(json_path, count)
         table = read_table(table_path)
         fps = own_fps or config.fps
@@ -184,7 +190,9 @@ class Folder:
             raise EpisodeError.at(table_path, problem, "one row per frame", "length")
         actions = _actions(actions, count, config.after, table_path)
         measured = [column for column in table.column_names if column.startswith("state")]
-        states = columns(table, measured, table_path)[0] if measured else None
+        states = None
+        if measured:
+            states = columns(table, measured, table_path)[0]
         layout = layout_of(actions, config.kind, config.held, config.quaternions, names, states)
         check_layout(layout, actions.shape[1], table_path)
         episode = Episode(
@@ -218,7 +226,8 @@ class Folder:
     def _ref(self, name: str, flat: bool, files: Sequence[Path] | None = None) -> EpisodeRef:
         sizes = []
         try:
-            files = self._files(name, flat) if files is None else files
+            if files is None:
+                files = self._files(name, flat)
             for folder in filter(Path.is_dir, files):  # pictures are too many to open
                 sizes += sorted((folder.name, path.name, path.stat().st_size) for path in folder.iterdir())
         except (EpisodeError, OSError):
@@ -239,7 +248,10 @@ def _times(
     clocks = {name: scan(f.path).times() for name, f in cameras.items() if isinstance(f, VideoFrames)}
     for name, times in clocks.items():
         first, own = next(iter(clocks.items()))
-        apart = np.abs((times - times[0]) - (own - own[0])) if len(times) == len(own) else np.zeros(1)
+        if len(times) == len(own):
+            apart = np.abs((times - times[0]) - (own - own[0]))
+        else:
+            apart = np.zeros(1)
         if apart.max() > np.diff(own).max(initial=1e-3):
             problem = f"its frame {int(apart.argmax())} is shown {apart.max():.2g} s away from that of {first}"
             raise EpisodeError.at(place / name, problem, "give timestamps in the table, or fps", "time")
@@ -259,8 +271,12 @@ def _actions(rows: Float32[np.ndarray, "N A"], count: int, after: bool, path: Pa
 
 def _rate(times: Float[np.ndarray, " N"]) -> float:
     """Returns frames per second by the median interval; 1 if time stands still or there is one frame."""
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    return 1 / interval if interval > 0 else 1.0
+    if len(times) < 2:
+        return 1.0
+    interval = float(np.median(np.diff(times)))
+    if interval > 0:
+        return 1 / interval
+    return 1.0
 
 
 def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment, ...]]:
@@ -273,7 +289,10 @@ def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment,
         EpisodeError: the file is damaged, a field is wrong, or a segment is not within the frames.
     """
     try:
-        values = read_json(path) if exists(path) else {}
+        if exists(path):
+            values = read_json(path)
+        else:
+            values = {}
         fps = float(values.get("fps") or 0)
         task = values.get("task")
         if not 0 <= fps <= MAX_FPS or not isinstance(task, str | None):
@@ -304,7 +323,10 @@ def find_cameras(files: Sequence[Path], flat: bool) -> tuple[dict[str, Frames], 
     frames: Frames
     for path in files:
         if path.suffix.lower() in VIDEOS:
-            name = "main" if flat else path.stem
+            if flat:
+                name = "main"
+            else:
+                name = path.stem
             frames = VideoFrames(media(path))
         elif path.is_dir() and path.suffix == _DEPTH:
             depth[path.stem] = PictureFiles(_pictures(path, (".png",)), depth=True)
@@ -390,7 +412,10 @@ def columns(table: pa.Table, names: Sequence[str], path: Path) -> tuple[Float32[
     dimensions: list[str] = []
     for name, part in parts.items():
         width = part.shape[1]
-        dimensions += [name] if width == 1 else [f"{name}[{place}]" for place in range(width)]
+        if width == 1:
+            dimensions += [name]
+        else:
+            dimensions += [f"{name}[{place}]" for place in range(width)]
     return np.concatenate([*parts.values()], 1), dimensions
 
 

@@ -51,7 +51,9 @@ def member(group: Any, key: str, path: Path) -> Any:
     elsewhere = entry.file.filename != group.file.filename
     if elsewhere or (isinstance(entry, h5py.Dataset) and (entry.external or entry.is_virtual)):
         raise EpisodeError.at(path, f"{name} lies in another file", f"copy it into this one or {LEAVE_OUT}")
-    chunks = entry.chunks if isinstance(entry, h5py.Dataset) else None
+    chunks = None
+    if isinstance(entry, h5py.Dataset):
+        chunks = entry.chunks
     if chunks and (size := math.prod(chunks) * entry.dtype.itemsize) > _MOST_CHUNK:
         raise EpisodeError.at(path, f"{name} has chunks of {size} bytes")
     return entry
@@ -71,7 +73,9 @@ def rows(group: Any, key: str, path: Path) -> Float32[np.ndarray, "N n"]:
         raise EpisodeError.at(path, f"{name} is {data.dtype} {data.shape}, should be numbers (N, n)")
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, which is refused later
         values = data[()].astype(np.float32)
-    return values[:, None] if values.ndim == 1 else values
+    if values.ndim == 1:
+        return values[:, None]
+    return values
 
 
 class H5Frames:
@@ -127,7 +131,9 @@ class H5Frames:
 def attribute(group: Any, name: str) -> Any:
     """Returns an attribute, with text decoded; None if there is none."""
     value = group.attrs.get(name)
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return value
 
 
 def settings_of(group: Any, path: Path) -> dict[str, Any]:
@@ -144,10 +150,11 @@ def settings_of(group: Any, path: Path) -> dict[str, Any]:
     for name in ("env_info", "env_args", "problem_info"):
         text = attribute(group, name)
         try:
-            values = json.loads(text) if text else {}
+            values = json.loads(text or "{}")
         except (TypeError, ValueError, RecursionError) as error:
             raise EpisodeError.at(path, f"data.{name} is not JSON ({error})", "mend the attribute") from error
-        settings |= values if isinstance(values, dict) else {}
+        if isinstance(values, dict):
+            settings |= values
     return settings
 
 
@@ -158,7 +165,9 @@ def fps_of(settings: dict[str, Any], path: Path) -> float:
         EpisodeError: the rate is impossible.
     """
     arguments = settings.get("env_kwargs")
-    fps = arguments.get("control_freq", 0) if isinstance(arguments, dict) else 0
+    fps = 0
+    if isinstance(arguments, dict):
+        fps = arguments.get("control_freq", 0)
     if not isinstance(fps, int | float) or not 0 <= fps <= MAX_FPS:
         raise EpisodeError.at(path, f"control_freq in data.env_args is {fps!r}, should be steps per second", "mend it")
     return float(fps)
@@ -168,17 +177,22 @@ def kind_of(settings: dict[str, Any]) -> Kind:
     """Returns the kind of the arms' commands: targets if robosuite's controller settings, old or new, say so."""
     arguments = settings.get("env_kwargs")
     text = json.dumps(arguments.get("controller_configs") if isinstance(arguments, dict) else None)
-    return "absolute" if '"control_delta": false' in text or '"input_type": "absolute"' in text else "delta"
+    if '"control_delta": false' in text or '"input_type": "absolute"' in text:
+        return "absolute"
+    return "delta"
 
 
 def instruction_of(group: Any, settings: dict[str, Any]) -> str:
     """Returns the instruction of a demo, or of its file; "" if there is none."""
     text = attribute(group, "ep_meta")
     try:
-        instruction = json.loads(text).get("lang") if text else None
+        instruction = json.loads(text or "{}").get("lang")
     except (AttributeError, TypeError, ValueError, RecursionError):
         instruction = None
     instruction = instruction or settings.get("language_instruction")
     if isinstance(instruction, list):
-        instruction = instruction[0] if instruction else ""
+        if instruction:
+            instruction = instruction[0]
+        else:
+            instruction = ""
     return words_of(instruction).strip('" ')

@@ -82,7 +82,10 @@ def open_source(
         raise SourceError(f"{path}: has no column {action!r}; choose among {', '.join(info.features)}")
     tasks = _tasks(path / "meta", info.shared)
     names = str(info.features[action].get("names")).lower()
-    stay = None if held is None else tuple(held)
+    if held is None:
+        stay = None
+    else:
+        stay = tuple(held)
     declared = Declared(kind or (None if "delta" in names else "absolute"), stay, tuple(quaternions))
     return LeRobot(path, info, tasks, declared, action, state)
 
@@ -196,7 +199,10 @@ class LeRobot:
         notes = self._check_rows(table, times, location, path)
         actions = matrix(table, self._action, path)
         dimensions = flat_names(self._info.features[self._action].get("names"), actions.shape[1])
-        states = matrix(table, self._state, path) if self._state in table.column_names else None
+        if self._state in table.column_names:
+            states = matrix(table, self._state, path)
+        else:
+            states = None
         layout = layout_of(align_actions(actions), *self._declared, dimensions, states)
         check_layout(layout, actions.shape[1], path)
         tasks = self._task_of_rows(table, path)
@@ -390,7 +396,9 @@ def _episodes_in(path: Path, size: int, modified: int) -> frozenset[int]:
 
 def _only(location: dict[str, Any]) -> list[tuple[str, str, int]] | None:
     """Returns the filter that selects one episode from a shared table; None if the table holds only this episode."""
-    return [("episode_index", "==", location["episode"])] if "rows" in location else None
+    if "rows" in location:
+        return [("episode_index", "==", location["episode"])]
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,7 +429,10 @@ class TablePictures:
         payloads: list[tuple[str, bytes]] = []
         for index, cell in zip(indices, cells, strict=True):
             where = f"{self.path}: {self.column} of row {index}"
-            payload = cell.get("bytes") if isinstance(cell, dict) else cell
+            if isinstance(cell, dict):
+                payload = cell.get("bytes")
+            else:
+                payload = cell
             if not isinstance(payload, bytes):
                 raise EpisodeError.at(where, "has no encoded picture", kind="undecodable")
             payloads.append((where, payload))

@@ -86,11 +86,18 @@ def open_source(
     """
     if not 0 <= fps <= MAX_FPS:
         raise SourceError(f"npz: option fps is {fps}; it must be above 0 and at most {MAX_FPS:g}")
-    folder = path.parent if path.is_file() else path
-    files = [path] if path.is_file() else sorted(file for file in path.glob("**/*.npz") if file.is_file())
+    if path.is_file():
+        folder = path.parent
+        files = [path]
+    else:
+        folder = path
+        files = sorted(file for file in path.glob("**/*.npz") if file.is_file())
     if not files:
         raise SourceError(f"{path}: no *.npz files; give the folder with them")
-    stay = None if held is None else tuple(held)
+    if held is None:
+        stay = None
+    else:
+        stay = tuple(held)
     settings = Settings(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions))
     return NpzFolder(folder, tuple(str(file.relative_to(folder)) for file in files), settings)
 
@@ -129,7 +136,10 @@ class NpzFolder:
         if kind not in ("absolute", "delta", ""):
             raise EpisodeError.at(path, f"kind is {kind!r}, should be 'absolute' or 'delta'", _SAVE)
         actions = align_actions(commands, how.after)
-        states = _numbers(path, "state") if _header(path, "state") else None
+        if _header(path, "state"):
+            states = _numbers(path, "state")
+        else:
+            states = None
         declared: dict[str, Kind] = {"absolute": "absolute", "delta": "delta"}
         layout = layout_of(actions, declared.get(kind), how.held, how.quaternions, (), states)
         check_layout(layout, commands.shape[1], path)
@@ -214,7 +224,10 @@ def _header(path: Path, name: str) -> tuple[tuple[int, ...], np.dtype[Any]] | No
                 return None
             with archive.open(f"{name}.npy") as file:
                 version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                if version == (1, 0):
+                    read = np.lib.format.read_array_header_1_0
+                else:
+                    read = np.lib.format.read_array_header_2_0
                 shape, _, dtype = read(file)
     except Exception as error:  # zipfile and numpy report damage by many types of error
         raise EpisodeError.at(path, reason(error)) from error
@@ -248,7 +261,10 @@ def _numbers(path: Path, name: str) -> np.ndarray:
     """Reads an array (T, n) or (T,) of numbers as float32 (T, n)."""
     array = _array(path, name)
     if array is None or array.dtype.kind not in "fiu" or array.ndim not in (1, 2) or not array.size:
-        actual = "missing" if array is None else f"{array.dtype} {array.shape}"
+        if array is None:
+            actual = "missing"
+        else:
+            actual = f"{array.dtype} {array.shape}"
         raise EpisodeError.at(path, f"{name} is {actual}, should be numbers (T, n)", _SAVE)
     with np.errstate(over="ignore"):
         return array.astype(np.float32).reshape(len(array), -1)
@@ -280,7 +296,9 @@ def _text(path: Path, name: str) -> str:
     if array.size != 1 or array.dtype.kind not in "US":
         raise EpisodeError.at(path, f"{name} is {array.dtype} {array.shape}, should be one text", _SAVE)
     value = array.reshape(())[()]
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return str(value)
 
 
 def _success(array: np.ndarray, count: int, path: Path) -> Any:

@@ -36,7 +36,10 @@ def check_options(values: Mapping[str, Any], known: Mapping[str, Any], where: st
             hint = did_you_mean(name, known)
             raise SourceError(f"{where}: no {word} {name!r}{hint}; it has {', '.join(known) or 'none'}")
         if not _fits(value, known[name]):
-            subject = f"option {name}" if word == "option" else name
+            if word == "option":
+                subject = f"option {name}"
+            else:
+                subject = name
             raise SourceError(f"{where}: {subject} is {value!r}, should be {_describe(known[name])}")
 
 

@@ -118,7 +118,10 @@ class RldsSource:
         expected = _expected(self.folder)
         for shard in self.shards:
             match = _SHARD.fullmatch(shard)
-            stem = f"{match['split']}-{int(match['number']):05d}" if match else safe_id(shard)
+            if match:
+                stem = f"{match['split']}-{int(match['number']):05d}"
+            else:
+                stem = safe_id(shard)
             counts = expected.get(shard, 0), "dataset_info.json names"
             settings = {n: v for n, v in asdict(self.keys).items() if self.keys.depth or not n.startswith("depth")}
             yield from record_refs(self.folder, shard, f"{stem}-{{:05d}}", counts, settings)
@@ -147,7 +150,9 @@ class RldsSource:
         keys = self.keys
         rows, names = _joined(example, keys.action, count)
         actions = align_actions(rows, keys.after)
-        states = _joined(example, keys.state, count)[0] if keys.state else None
+        states = None
+        if keys.state:
+            states = _joined(example, keys.state, count)[0]
         layout = layout_of(actions, keys.kind, keys.held, keys.quaternions, names, states)
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
@@ -255,7 +260,9 @@ def _shards(path: Path) -> list[Path]:
 def _split_name(shard: Path) -> tuple[str, str]:
     """Returns the names of the data set and of the split in a shard's name."""
     match = _SHARD.fullmatch(shard.name)
-    return (match["name"], match["split"]) if match else (shard.name.partition(".")[0], "")
+    if match:
+        return (match["name"], match["split"])
+    return (shard.name.partition(".")[0], "")
 
 
 def _expected(folder: Path) -> dict[str, int]:
@@ -276,7 +283,10 @@ def _expected(folder: Path) -> dict[str, int]:
 
 def _read_object(path: Path) -> dict[str, Any]:
     """Reads a JSON object; an empty one if there is no file."""
-    content = read_json(path) if exists(path) else {}
+    if exists(path):
+        content = read_json(path)
+    else:
+        content = {}
     if not isinstance(content, dict):
         raise SourceError(f"{path}: is a {type(content).__name__}, should be an object; fetch it again")
     return content
@@ -359,10 +369,14 @@ def propose(path: Path, features: Mapping[str, Feature], fps: float) -> KeyMap:
     pictures = [key for key, feature in features.items() if feature.kind == "image" and key not in maps.values()]
     cameras = {_name(key): key for key in sorted(pictures) if not features[key].is_map}
     whole = features.get("action")
-    action = ["action"] if whole and whole.is_row else []
-    action = action or [key for key, one in features.items() if one.is_row and key.startswith(("action/", "action_"))]
+    if whole and whole.is_row:
+        action = ["action"]
+    else:
+        action = [key for key, one in features.items() if one.is_row and key.startswith(("action/", "action_"))]
     if not cameras or not action:
-        lacks = "pictures" if not cameras else "actions"
+        lacks = "actions"
+        if not cameras:
+            lacks = "pictures"
         raise SourceError(f"{path}: no {lacks} among {', '.join(features) or 'no features'}; write a key map as JSON")
     if not fps:
         raise SourceError(f"{path}: no file of RLDS says how fast its pictures are; add --option fps=…")

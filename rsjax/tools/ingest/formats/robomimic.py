@@ -183,7 +183,10 @@ class DemoSource:
         states, flipped = _states(group.get("obs", {}), how, path)
         named = path.stem.removesuffix("_demo").replace("_", " ")  # LIBERO names files after tasks
         width = commands.shape[1]  # a gripper is the last of each arm's seven dimensions, else the last of all
-        grippers = tuple(range(6, width, 7)) if width % 7 == 0 else (width - 1,)
+        if width % 7 == 0:
+            grippers = tuple(range(6, width, 7))
+        else:
+            grippers = (width - 1,)
         return Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,

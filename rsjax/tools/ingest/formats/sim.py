@@ -114,7 +114,10 @@ class StoreSource:
         width = record["actions"].shape[1]
         layout = layout_of(record["actions"], self.kind, self.held, (), (), None)
         if "control_hz" in provenance:  # a simulator's own: the last dimension of each control step is the gripper
-            last = width // steps - 1 if width % steps == 0 else width
+            if width % steps == 0:
+                last = width // steps - 1
+            else:
+                last = width
             layout = Layout("delta", held=tuple(range(last, width, width // steps or 1)))
         measured = provenance.get("depth_unit", "metres") == "metres" and record.get("depth") is not None
         return Episode(
@@ -160,7 +163,10 @@ def _check_arrays(record: Record, where: str) -> None:
     for name, (kind, axes) in wanted.items():
         array = record.get(name)
         if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, kind) or array.ndim != axes:
-            actual = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+            if isinstance(array, np.ndarray):
+                actual = f"{array.dtype} {array.shape}"
+            else:
+                actual = type(array).__name__
             raise EpisodeError.at(where, f"{name} is {actual}, should have {axes} axes of {kind.__name__}", _CURE)
     if record["rgb"].shape[3] != 3 or not record["rgb"].size:
         raise EpisodeError.at(where, f"rgb has the shape {record['rgb'].shape}, should be (T, H, W, 3)", _CURE)
