@@ -25,10 +25,11 @@ extras: setup  ## the optional packages (networks, PyTorch, Rerun, a browser), a
 	@scripts/extras.sh "$(VENV)"
 	@"$(VENV)/extras/bin/python" -m pytest $(in_parallel) $$(grep -rlE --include='test_*.py' 'importorskip\("(torch|trans|rerun|playwright|stable)' tests) $(ARGS)
 
-lint: setup  ## ruff and mypy
+lint: setup  ## ruff, mypy, and the numbers that may only fall
 	@$(python) -m ruff check
 	@$(python) -m ruff format --check
 	@$(python) -m mypy
+	@$(python) -m scripts.ratchets
 
 clean:  ## removes the environment and the caches; data and runs stay
 	@rm -rf "$(VENV)" build rsjax.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
