@@ -1,4 +1,7 @@
-"""Pictures and depth maps that are stored one by one or are in memory, with the same interface as videos."""
+"""Pictures and depth maps that are stored one by one or are in memory, and how they fit into the square of a clip.
+
+A camera's pictures may differ in resolution from its depth maps, so a :class:`Placement` counts in shares of a side.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

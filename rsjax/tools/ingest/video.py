@@ -1,8 +1,11 @@
 """Reads pictures of video files by number or by time with PyAV (H.264, AV1 and any other codec of FFmpeg).
 
-Reading seeks to the key frame before the picture (``video_index.py`` lists the key frames) and decodes
-from there, or continues from the current position if that is nearer. Each process keeps a few files open and closes the
-least recently used one first.
+Reading seeks to the key frame before the picture (:class:`VideoIndex` lists the key frames) and decodes from there, or
+continues from the current position if that is nearer. Each process keeps a few files open and closes the least recently
+used one first.
+
+The index comes from the packets alone, without decoding, unless the file may lack correct presentation times: AVI has
+none, and a file that was copied from an AVI file may have invented ones. Such a file is decoded once, in order.
 """
 
 import contextlib

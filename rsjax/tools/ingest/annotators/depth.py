@@ -1,4 +1,6 @@
-"""Step "depth": fills the holes of recorded depth, and converts the depth that networks estimate.
+"""Step "depth": fills the holes of recorded depth, and estimates depth by networks.
+
+The networks are Video Depth Anything (a checkout) and DepthAnything for each frame (transformers).
 
 Depth that a network estimates from pictures is mostly relative: 1/depth up to an unknown scale and shift. It is
 stretched for each video so that the nearest point is 1 and the farthest is ``RELATIVE_FAR``, without a unit. The

@@ -1,4 +1,4 @@
-"""Step "motion": measures the motion in each frame. Without weights: dense inverse search (DIS) optical flow.
+"""Step "motion": measures the motion in each frame by optical flow: DIS without weights, or RAFT (Teed & Deng 2020).
 
 The camera's own motion counts too. :mod:`rsjax.tools.ingest.windows` filters by these values.
 """

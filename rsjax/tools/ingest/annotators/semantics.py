@@ -1,7 +1,8 @@
-"""Step "semantics": the text and key frames of each part. Without weights: the data set's own text.
+"""Step "semantics": the text and key frames of each part: the data set's own, or InternVL's where it has none.
 
 Key frames are those in which a gripper opens or closes; without such a change or a known gripper, the frame with most
-motion.
+motion. The network has to answer with one JSON object. An answer outside the schema is refused with the reason, a few
+times; after that the episode has no answer, which is an error and not a guess.
 """
 
 import json

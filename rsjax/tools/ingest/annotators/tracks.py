@@ -1,4 +1,4 @@
-"""Step "tracks": follows points through a shot. Without weights: pyramidal Lucas–Kanade.
+"""Step "tracks": follows points through a shot: Lucas–Kanade without weights, or SpatialTracker or BootsTAPIR.
 
 Every tracker follows a set of points through a few pictures, a span; :func:`track_in_spans` does the rest. Points begin
 on a grid. Those that are visible at a span's end are followed further, and grid cells that lost their points get new

@@ -6,6 +6,8 @@ quaternions x y z w) and both grippers (2, 0 open … 1 closed).
 
 An arm's command at frame t leads into frame t+1, unless an episode's commands are a copy of its states: then the pose
 of frame t led into frame t, and rows stay where they are. Gripper commands always lead into the next frame.
+
+Axes: N frames, M ≤ N commands, D dimensions.
 """
 
 import fnmatch

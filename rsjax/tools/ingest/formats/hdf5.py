@@ -1,4 +1,7 @@
-"""Reads arrays of HDF5 files as pictures, depth maps and rows of numbers; errors name file and data set."""
+"""Reads arrays of HDF5 files as pictures, depth maps and rows of numbers; errors name file and data set.
+
+It also reads what a file of robomimic, robosuite or LIBERO says about its simulator, in attributes that are JSON.
+"""
 
 import json
 import math
