@@ -111,7 +111,8 @@ def infer_config(
     def shape(key: str, axes: int) -> tuple[int, ...]:
         return shape_of(source, tensors, key, axes, names)
 
-    _check_types(source.parent / SETTINGS, settings)
+    for name, example in settings_of(Architecture()).items():
+        check_type(source.parent / SETTINGS, name, settings.get(name), example)
     position = "pos_embed_TSC"
     first = "token_embed.factored_embeds.0.weight"
     hidden = "decoder.layers.0.mlp.fc1.weight"
@@ -152,12 +153,6 @@ def infer_config(
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
     _check_settings(source.parent / SETTINGS, settings, settings_of(config) | {"S": cells})
     return config
-
-
-def _check_types(path: Path, settings: dict[str, Any]) -> None:
-    """Raises :class:`ConvertError` unless each known field is null or of its type; integers count as floats, too."""
-    for name, example in settings_of(Architecture()).items():
-        check_type(path, name, settings.get(name), example)
 
 
 def _check_settings(path: Path, settings: dict[str, Any], inferred: dict[str, Any]) -> None:

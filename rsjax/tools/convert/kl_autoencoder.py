@@ -102,9 +102,16 @@ def from_public(
         ConvertError: as :func:`infer_config`; or tensors are missing, unexpected, of the wrong shape or not finite;
             or the settings are not numbers.
     """
-    own = {_renamed(name): name for name in tensors}
-    tensors = {new: _flat(new, tensors[old]) for new, old in own.items()}
-    names = {n: names.get(o, o) for n, o in own.items()}
+    renamed: Tensors = {}
+    in_file: dict[str, str] = {}
+    for name, x in tensors.items():
+        new = _OLDER.sub(lambda match: f"{match[1]}{OLDER[match[2]]}.", name)
+        if ".attentions." in new and x.ndim == 4 and x.shape[2:] == (1, 1):
+            x = x[..., 0, 0]  # some files store attention weights as 1×1 convolutions
+        renamed[new] = x
+        in_file[new] = names.get(name, name)
+    tensors = renamed
+    names = in_file
     config = infer_config(source, tensors, settings, names)
     factor = setting(source, settings, "scaling_factor", SDXL_FACTOR)
     shift = settings.get("shift_factor") or 0.0
@@ -142,17 +149,6 @@ def to_public(config: KLConfig, params: Params) -> tuple[Tensors, dict[str, Any]
         "scaling_factor": round(float(1 / deviation[0]), 7),
         "shift_factor": float(mean[0]) or None,
     }
-
-
-def _renamed(name: str) -> str:
-    return _OLDER.sub(lambda match: f"{match[1]}{OLDER[match[2]]}.", name)
-
-
-def _flat(name: str, x: np.ndarray) -> np.ndarray:
-    """Returns attention weights as matrices; some files store them as 1×1 convolutions."""
-    if ".attentions." in name and x.ndim == 4 and x.shape[2:] == (1, 1):
-        return x[..., 0, 0]
-    return x
 
 
 def convert(source: Path, out: Path) -> list[str]:

@@ -6,7 +6,7 @@ action follows the last frame.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -102,6 +102,8 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
         names = store.splits
     else:
         names = (options.split,)
+    if store.manifest.get("kind") != "clips":
+        raise StoreError(f"{store.path}: holds {store.manifest.get('kind')}, not clips; export the clips themselves")
     total = sum(len(store.source(name)) for name in names)
     layout = None
     splits = {}
@@ -111,7 +113,7 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
             begins = layout.episodes
         else:
             begins = 0
-        for clip in _clips(store, name):
+        for _, clip in readable(store.source(name)):
             if layout is None:
                 layout = _layout(store, clip, root, options)
             episode = _episode(clip, layout.features, options.state)
@@ -133,12 +135,6 @@ def _write(store: Store, root: Path, options: LeRobotOptions, report: Callable[[
     if len(cameras) > 1:
         note(f"{store.path}: has clips of the cameras {', '.join(cameras)}; all are in {layout.camera}")
     return layout.finish({"codebase_version": options.version, "robot_type": options.robot, "splits": splits})
-
-
-def _clips(store: Store, split: str) -> Iterator[Record]:
-    if store.manifest.get("kind") != "clips":
-        raise StoreError(f"{store.path}: holds {store.manifest.get('kind')}, not clips; export the clips themselves")
-    return (clip for _, clip in readable(store.source(split)))
 
 
 def _layout(store: Store, clip: Record, root: Path, options: LeRobotOptions) -> LayoutV30 | LayoutV21:

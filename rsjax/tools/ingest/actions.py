@@ -1,9 +1,9 @@
 """Turns recorded actions into the actions of a clip: the command that led from one *sampled* frame into the next.
 
-An :class:`Episode` has a row of actions for each recorded frame, in its data set's units. A clip keeps about every tenth
-frame; each of its actions combines the rows between two kept frames, in the way that :class:`ActionConfig` chooses and
-:class:`Layout` allows. :func:`layout_of` decides what each dimension is: a step, which adds up over skipped frames, or a
-target.
+An :class:`Episode` has a row of actions for each recorded frame, in its data set's units. A clip keeps about every
+tenth frame; each of its actions combines the rows between two kept frames, in the way that :class:`ActionConfig`
+chooses and :class:`Layout` allows. :func:`layout_of` decides what each dimension is: a step, which adds up over skipped
+frames, or a target.
 
 Axes: N recorded frames, T sampled frames, K rows between two of these, A recorded and A' resulting action dimensions.
 """

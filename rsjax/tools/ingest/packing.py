@@ -112,6 +112,16 @@ def pack(
         keys: further entries of the manifest, in addition to those of the plan.
         packed: called with the number of episodes that are packed.
     """
+    statistics: Statistics | None = None
+    dimensions: Counter[tuple[str, ...]] = Counter()
+    for cut in contents.splits["train"]:
+        work = EpisodeWork(plan, cut.ref)
+        mark = work.done(CLIPS)
+        if mark is None:
+            raise StoreError(f"{work.output(CLIPS)}: was deleted meanwhile; run again")
+        rows = Statistics.from_json(mark["summary"]["actions"])
+        statistics = statistics.merged(rows) if statistics else rows
+        dimensions[tuple(mark["summary"]["dimensions"])] += 1
     episodes = contents.episodes()
     successes = [(cut.success, cut.records) for cut in episodes if cut.success is not None]
     quarantine: dict[str, str] = {}
@@ -120,8 +130,8 @@ def pack(
         quarantine[row["episode"]] = "; ".join(filter(None, (quarantine.get(row["episode"]), reason)))
     manifest = {
         "source": plan.source.name,
-        **_statistics(plan, contents.splits["train"]),
-        "action_dimensions": _dimensions(plan, contents.splits["train"]),
+        **(statistics.to_json() if statistics else {}),
+        "action_dimensions": [line for lines, _ in dimensions.most_common(1) for line in lines],
         "depth_range": contents.depth_range,
         "depth_unit": contents.depth_unit,
         "episodes": {split: [cut.ref.id for cut in cuts] for split, cuts in contents.splits.items()},
@@ -170,29 +180,3 @@ def _records(
             record = source[number]
             yield record | changes | {"provenance": record["provenance"] | provenance}
         packed()
-
-
-def _dimensions(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> list[str]:
-    """Returns the most common description of the actions' dimensions among the episodes."""
-    marks = (EpisodeWork(plan, cut.ref).done(CLIPS) for cut in cuts)
-    said = Counter(tuple(mark["summary"]["dimensions"]) for mark in marks if mark is not None)
-    if said:
-        return list(said.most_common(1)[0][0])
-    return []
-
-
-def _statistics(plan: IngestPlan, cuts: Sequence[CutEpisode]) -> dict[str, Any]:
-    total: Statistics | None = None
-    for cut in cuts:
-        work = EpisodeWork(plan, cut.ref)
-        mark = work.done(CLIPS)
-        if mark is None:
-            raise StoreError(f"{work.output(CLIPS)}: was deleted meanwhile; run again")
-        rows = Statistics.from_json(mark["summary"]["actions"])
-        if total:
-            total = total.merged(rows)
-        else:
-            total = rows
-    if total:
-        return total.to_json()
-    return {}

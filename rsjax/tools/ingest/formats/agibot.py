@@ -87,7 +87,12 @@ class AgiBot:
             path = self._root / "task_info" / f"task_{task}.json"
             entries: dict[str, dict[str, Any]] = {}
             try:
-                for place, entry in enumerate(_entries(path) if exists(path) else ()):
+                listed: Any = []
+                if exists(path):
+                    listed = read_json(path)
+                if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+                    raise SourceError(f"{path}: should be a list of episodes; fetch the file again")
+                for place, entry in enumerate(listed):
                     identity = str(entry.get("episode_id", ""))
                     if not identity.isdecimal() or identity in entries:
                         message = f"{path}: episode_id of entry {place} is missing or there already; mend the file"
@@ -116,7 +121,11 @@ class AgiBot:
             proprio = Proprio(file, path)
             times = proprio.seconds()
             states = proprio.states()
-            actions = _actions(proprio)
+            hands = np.concatenate([proprio.command("end/position"), proprio.quaternions("action/end/orientation")], 1)
+            with np.errstate(over="ignore"):
+                hands = hands.astype(np.float32)
+            hands = align_actions(hands, after=proprio.copied())
+            actions = np.concatenate([hands, align_actions(proprio.grippers())], 1)
         folder = inside(self._root, f"observations/{place}")
         segments, bad = _segments(location["segments"], len(times))
         depth, why_not = _depth(folder / "depth", len(times))
@@ -175,13 +184,6 @@ class AgiBot:
         files = [self._root / "proprio_stats" / task / identity / "proprio_stats.h5"]
         files += [videos / f"{name}_color.mp4" for name in self._cameras]
         return EpisodeRef(safe_id(f"{task}-{identity}"), fingerprint(files, location), location)
-
-
-def _entries(path: Path) -> list[dict[str, Any]]:
-    entries = read_json(path)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise SourceError(f"{path}: should be a list of episodes; fetch the file again")
-    return entries
 
 
 class Proprio:
@@ -320,13 +322,6 @@ class Proprio:
         if name == "timestamp":
             return rows
         return rows.astype(np.float64)
-
-
-def _actions(proprio: Proprio) -> Float32[np.ndarray, "N 16"]:
-    hands = np.concatenate([proprio.command("end/position"), proprio.quaternions("action/end/orientation")], 1)
-    with np.errstate(over="ignore"):
-        hands = hands.astype(np.float32)
-    return np.concatenate([align_actions(hands, after=proprio.copied()), align_actions(proprio.grippers())], 1)
 
 
 def _segments(entries: list[Any], count: int) -> tuple[tuple[Segment, ...], list[Any]]:

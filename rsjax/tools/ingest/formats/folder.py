@@ -17,6 +17,7 @@ action leads into the next frame, and the last row may be missing. ``fps`` is ne
 videos have their own rate.
 """
 
+import contextlib
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -188,7 +189,15 @@ class Folder:
         if len(times) != count:
             problem = f"{len(times)} timestamps for {count} pictures"
             raise EpisodeError.at(table_path, problem, "one row per frame", "length")
-        actions = _actions(actions, count, config.after, table_path)
+        if not config.after and len(actions) == count - 1:  # the last row leads into no frame
+            actions = np.concatenate([actions, actions[-1:]])
+        if len(actions) != count:
+            problem = f"{len(actions)} rows of actions for {count} pictures"
+            raise EpisodeError.at(table_path, problem, "one row per frame", "length")
+        actions = align_actions(actions, config.after)
+        if not fps:
+            interval = float(np.median(np.diff(times))) if count > 1 else 1.0
+            fps = 1 / interval if interval > 0 else 1.0  # time may stand still
         measured = [column for column in table.column_names if column.startswith("state")]
         states = None
         if measured:
@@ -199,7 +208,7 @@ class Folder:
             id=ref.id,
             fingerprint=ref.fingerprint,
             task=task or words_of(config.task),
-            fps=fps or _rate(times),
+            fps=fps,
             timestamps=times - times[0],
             actions=actions,
             states=states,
@@ -258,25 +267,6 @@ def _times(
     if clocks:
         return next(iter(clocks.values()))
     raise EpisodeError(f"{place}: how fast are its pictures? Give fps in dataset.json or timestamps")
-
-
-def _actions(rows: Float32[np.ndarray, "N A"], count: int, after: bool, path: Path) -> Float32[np.ndarray, "N A"]:
-    """Aligns the rows of the table; the last row may be missing if it leads into no frame."""
-    if not after and len(rows) == count - 1:
-        rows = np.concatenate([rows, rows[-1:]])
-    if len(rows) != count:
-        raise EpisodeError.at(path, f"{len(rows)} rows of actions for {count} pictures", "one row per frame", "length")
-    return align_actions(rows, after)
-
-
-def _rate(times: Float[np.ndarray, " N"]) -> float:
-    """Returns frames per second by the median interval; 1 if time stands still or there is one frame."""
-    if len(times) < 2:
-        return 1.0
-    interval = float(np.median(np.diff(times)))
-    if interval > 0:
-        return 1 / interval
-    return 1.0
 
 
 def read_description(path: Path, count: int) -> tuple[str, float, tuple[Segment, ...]]:
@@ -376,7 +366,12 @@ def read_table(path: Path) -> pa.Table:
         names = table.column_names  # names are decoded only here
     except (pa.ArrowException, OSError, ValueError) as error:
         raise EpisodeError.at(path, reason(error), "save it again") from error
-    if len(set(names)) < len(names) or all(map(_is_number, names)):
+    numbers = 0  # among the names, if the file has no line of names
+    for name in names:
+        with contextlib.suppress(ValueError):
+            float(name)
+            numbers += 1
+    if len(set(names)) < len(names) or numbers == len(names):
         raise EpisodeError(f"{path}: its first line must name the columns, each once; it has {names}")
     return table
 
@@ -425,11 +420,3 @@ def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
     except OSError as error:
         raise EpisodeError.at(folder, f"cannot be listed ({error.strerror})", LEAVE_OUT) from error
     return sorted(paths, key=lambda path: (len(path.name), path.name))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

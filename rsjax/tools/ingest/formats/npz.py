@@ -144,7 +144,13 @@ class NpzFolder:
         layout = layout_of(actions, declared.get(kind), how.held, how.quaternions, (), states)
         check_layout(layout, commands.shape[1], path)
         times = _times(path, count, how.fps)
+        meta = {"source": "npz", "file": ref.location["file"], "actions": layout.to_json()}
         success = _array(path, "success")
+        if success is not None:
+            if success.shape not in ((), (count,)) or success.dtype.kind not in "biuf":
+                problem = f"success is {success.dtype} {success.shape}, should be one value or ({count},)"
+                raise EpisodeError.at(path, problem, _SAVE)
+            meta["success"] = success.astype(bool).tolist()
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -155,8 +161,7 @@ class NpzFolder:
             states=states,
             cameras={"main": frames},
             depth={"main": NpzFrames(path, "depth", depth=True)} if _header(path, "depth") else {},
-            meta={"source": "npz", "file": ref.location["file"], "actions": layout.to_json()}
-            | ({} if success is None else {"success": _success(success, count, path)}),
+            meta=meta,
         )
         return checked(episode, path)
 
@@ -299,9 +304,3 @@ def _text(path: Path, name: str) -> str:
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace")
     return str(value)
-
-
-def _success(array: np.ndarray, count: int, path: Path) -> Any:
-    if array.shape not in ((), (count,)) or array.dtype.kind not in "biuf":
-        raise EpisodeError.at(path, f"success is {array.dtype} {array.shape}, should be one value or ({count},)", _SAVE)
-    return array.astype(bool).tolist()

@@ -80,13 +80,10 @@ class RenderedStates:
     def read(self, indices: Sequence[int]) -> np.ndarray:
         """Returns these pictures or maps; :class:`EpisodeError` if the model or a state cannot be rendered."""
         try:
-            views = [self._view(int(index)) for index in indices]
+            views = [_scene(self).view(self.states[int(index)]) for index in indices]
         except PlaybackError as error:
             raise EpisodeError.at(self.where, str(error), CURE) from error
         return np.stack([view[self.depth] for view in views])
-
-    def _view(self, index: int) -> View:
-        return _scene(self).view(self.states[index])
 
 
 class _Scene:

@@ -157,6 +157,10 @@ class RldsSource:
         check_layout(layout, actions.shape[1], f"{example.where}: key map")
         texts = _texts(example, self.keys.task, count)
         segments = [segment for segment in runs(texts) if segment.text]
+        metadata = {}
+        for name in example.names():
+            if name.startswith("episode_metadata/") and len(value := example.plain(name)) == 1:
+                metadata[name.removeprefix("episode_metadata/")] = value[0]
         episode = Episode(
             id=ref.id,
             fingerprint=ref.fingerprint,
@@ -174,7 +178,7 @@ class RldsSource:
                 "actions": layout.to_json(),
                 "action_names": names,
                 "blank": blank,
-                "episode": _metadata(example),
+                "episode": metadata,
             },
         )
         return checked(episode, example.where)
@@ -232,16 +236,6 @@ def _texts(example: Example, keys: Sequence[str], count: int) -> list[str]:
         if any(texts):
             return texts
     return []
-
-
-def _metadata(example: Example) -> dict[str, Any]:
-    """Returns those features of the episode itself that are a single text or number."""
-    prefix = "episode_metadata/"
-    values = {}
-    for name in example.names():
-        if name.startswith(prefix) and len(value := example.plain(name)) == 1:
-            values[name.removeprefix(prefix)] = value[0]
-    return values
 
 
 def _shards(path: Path) -> list[Path]:

@@ -107,21 +107,16 @@ def open_demos(path: Path, convention: Convention, filter: str, depth: bool, siz
         try:
             demos = source.demos(file)
             with open_file(file) as content:
-                if demos:
-                    _check_pictures(source, content[f"data/{demos[0]}"], file)
+                first = content[f"data/{demos[0]}"] if demos else None
+                if first is not None and not _picture_keys(first.get("obs", {}), convention):
+                    try:
+                        source.pictures(first, file)  # they may be rendered
+                    except EpisodeError as error:
+                        raise SourceError(str(error)) from error
             break
         except (EpisodeError, KeyError):
             continue  # its episodes are still listed, and refused one by one
     return source
-
-
-def _check_pictures(source: "DemoSource", group: Any, path: Path) -> None:
-    """Raises :class:`SourceError` if a demo has no pictures and cannot be rendered."""
-    if not _picture_keys(group.get("obs", {}), source.convention):
-        try:
-            source.pictures(group, path)
-        except EpisodeError as error:
-            raise SourceError(str(error)) from error
 
 
 @dataclass
