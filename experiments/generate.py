@@ -53,8 +53,8 @@ class Options:
     read_means: bool | None = None
     """Let later frames read the mean codes too; no effect without --mean-codes."""
     guidance: float | None = None
-    """Guidance strength; 1: none. Guidance by actions needs model.action_dropout; by text, model.text.dropout or a
-    file."""
+    """Guidance strength; 1: none. Guidance by actions needs model.departures.action_dropout; by text,
+    model.text.dropout or a file."""
     window_stride: int | None = None
     """Frames by which a full window moves on (with learned positions); 0: half of the window."""
     cache_dtype: Literal["float32", "bfloat16"] | None = None

@@ -122,7 +122,7 @@ def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
         Codec(trained.config.tokenizer, trained.assets.tokenizer, trained.assets.normalization),
     )
     prompt = codec.encode(clips.video.frames(0, 1))
-    actions = codec.normalization.action_inputs(clips.actions, model.config.integrate_actions)
+    actions = codec.normalization.action_inputs(clips.actions, model.config.departures.integrate_actions)
     sample = model.config.sample
     return rollout(model.architecture, sample, trained.params, prompt, actions, jax.random.key(sample.seed))
 

@@ -17,7 +17,9 @@ from rsjax.models.cogvideox.config import CogVideoXConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.tools.bench.timing import median_seconds
 
-ADDED = ("temporal_norm", "final_norm", "qk_norm", "mup", "read_previous")  # options that the plain Genie lacks
+# Options that the plain Genie lacks, of the model and of its departures.
+OPTIONS = ("qk_norm", "mup")
+DEPARTURES = ("temporal_norm", "final_norm", "read_previous", "rotary")
 
 
 def check_genie(config: Config) -> None:
@@ -25,10 +27,10 @@ def check_genie(config: Config) -> None:
     model = Architecture.create(config)
     plain = "and the PyTorch baseline is the plain Genie"
     cure = "or leave the baseline out"
-    for name in ADDED:
-        require(not getattr(model, name), f"model.{name} is on, {plain}, without it; set it to False, {cure}")
-    problem = f"model.positions is {model.positions!r}, {plain}, which learns them; set it to 'learned', {cure}"
-    require(model.positions == "learned", problem)
+    options = {f"model.{name}": getattr(model, name) for name in OPTIONS}
+    options |= {f"model.departures.{name}": getattr(model.departures, name) for name in DEPARTURES}
+    for name, is_on in options.items():
+        require(not is_on, f"{name} is on, {plain}, without it; set it to False, {cure}")
 
 
 def check_cogvideox(config: Config) -> None:

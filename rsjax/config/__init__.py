@@ -23,6 +23,7 @@ from rsjax.config.model import ModelConfig, families, register_family
 from rsjax.config.run import Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import (
+    Departures,
     GenieConfig,
     LossConfig,
     MaskConfig,
@@ -41,6 +42,7 @@ __all__ = [
     "ConfigError",
     "CurriculumStageConfig",
     "DataConfig",
+    "Departures",
     "EvalConfig",
     "GenieConfig",
     "LoopConfig",

@@ -20,12 +20,82 @@ class MaskConfig:
     corruption_probability: float = 0.5  # step 2 applies to this share of the batches
     corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
     corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
-    visible_prefix: float = 0.0  # step 3: share of the clips in which all frames before a random one stay visible
-    # With model.whole_frames: after own_frames_after steps, in this share of the steps, every frame is predicted from
+
+
+@dataclass(frozen=True)
+class Departures:
+    """What the paper does not have. All are off by default; :mod:`rsjax.models.roboscape.departures` implements them.
+
+    Three departures concern sampling alone and so are in :class:`SampleConfig`, off by default too: ``mean_codes``,
+    ``read_means`` and ``guidance``.
+    """
+
+    # Input of the network.
+    # The action encoder also reads the sum of all actions so far, which doubles its input. For small models whose
+    # actions are pose deltas: the sum is the pose, which a large model finds by temporal attention.
+    integrate_actions: bool = False
+    # Every frame's input also contains the tokens of the frame before it, cell by cell, embedded by a separate table.
+    # In training these are visible even where that frame is masked, as past frames are in sampling.
+    read_previous: bool = False
+    # With read_previous: all cells of every frame but a clip's first stay masked, so that each frame is predicted as a
+    # whole and decoded in one pass instead of two; further decoding steps gain nothing.
+    whole_frames: bool = False
+    # The share of training clips whose actions are replaced by a learned null action, for guidance in sampling.
+    action_dropout: float = 0.0
+
+    # The network.
+    # Temporal queries and keys are rotated, and a rollout can go on beyond the trained frames with a rolling cache;
+    # positions within a frame stay learned.
+    rotary: bool = False
+    # Norms before temporal attention and before the heads: small models trained for few steps learn faster with both.
+    temporal_norm: bool = False
+    final_norm: bool = False
+
+    # Training.
+    # Copies of each training clip, moved by up to shift_pixels. A step draws one of them or the clip. Few clips last
+    # longer with copies: a scene that is moved by less than a token has new tokens everywhere.
+    shifts: int = 0
+    shift_pixels: int = 4
+    # The share of the clips in which all frames before a random one stay visible, as past frames are in sampling.
+    visible_prefix: float = 0.0
+    # With whole_frames: after self_conditioning_after steps, in this share of the steps, every frame is predicted from
     # the model's own prediction of the frame before (its mean codes), as in a rollout. Such a step takes a third more
-    # work. Not in the reference.
-    own_frames: float = 0.0
-    own_frames_after: int = 0
+    # work.
+    self_conditioning: float = 0.0
+    self_conditioning_after: int = 0
+
+    # The keypoint terms.
+    # The anchor of Eq. 5 is the code of the true first frame, not ŝ₁, the output at frame 1: this is the prompt, which
+    # is never masked, so no cross-entropy trains ŝ₁.
+    observed_anchor: bool = False
+    # Eq. 5 compares masked cells only: a third to half of ŝ_t lie on visible cells, which are never sampled.
+    masked_keypoints: bool = False
+    # M_i, Eq. 5 and Eq. 6 leave out the frames in which a point is hidden or outside the picture.
+    visible_keypoints: bool = False
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.departures", 0, 1, "visible_prefix", "self_conditioning")
+        require_range(self, "model.departures", 0, math.inf, "shifts", "shift_pixels", "self_conditioning_after")
+        require(
+            0 <= self.action_dropout < 1,
+            f"model.departures.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and "
+            f"below 1",
+        )
+        require(
+            self.read_previous or not self.whole_frames,
+            "model.departures.whole_frames masks all frames but the first, and read_previous is off, so the model "
+            "would see no other frame; switch it on",
+        )
+        require(
+            self.whole_frames or not self.self_conditioning,
+            f"model.departures.self_conditioning is {self.self_conditioning}, but without whole_frames no single pass "
+            f"predicts all frames; switch that on, or set self_conditioning to 0",
+        )
+        require(
+            not (self.whole_frames and self.visible_prefix),
+            f"model.departures.visible_prefix is {self.visible_prefix}, but whole_frames leaves no frame visible after "
+            f"the first; set one of them to 0 or False",
+        )
 
 
 @dataclass(frozen=True)
@@ -45,8 +115,8 @@ class SampleConfig:
     # With mean_codes: later frames read the mean codes too, not the most probable ones, so that they know where the
     # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (notebooks/miniature.md).
     read_means: bool = False
-    # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need model.action_dropout and
-    # double the work.
+    # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need
+    # model.departures.action_dropout and double the work.
     guidance: float = 1.0
     # Learned positions only: when the window is full, its first window_stride frames are dropped and the others encoded
     # again from position 0. A smaller stride gives a longer memory and more work. 0: half of the positions.
@@ -76,7 +146,7 @@ def check_sampling(sample: SampleConfig, positions: int, action_dropout: float) 
     require(
         sample.guidance == 1 or action_dropout > 0,
         f"model.sample.guidance is {sample.guidance} but the model never saw clips without actions; "
-        f"set it to 1, or train with model.action_dropout above 0",
+        f"set it to 1, or train with model.departures.action_dropout above 0",
     )
     require(
         sample.window_stride < positions,
@@ -99,13 +169,6 @@ class LossConfig:
     gamma: float = 5.0  # γ of Eq. 6
     use_keypoints: bool = True  # False: without the keypoint and attention terms
     num_keypoints: int = 32  # K of the top-K, at most all tracks; the paper does not give its K
-    # The anchor of Eq. 5. predicted: ŝ₁, the network's output at frame 1, as the paper writes it; frame 1 is the prompt
-    # and never masked, so no cross-entropy trains this output. observed: the code of the true first frame, which gives
-    # 0.05 ± 0.05 dB more ΔPSNR under uniform actions and changes nothing else (notebooks/keypoints.md).
-    keypoint_target: Literal["observed", "predicted"] = "observed"
-    # Whether Eq. 5 compares masked cells only: a third to half of ŝ_t lie on visible cells, which are never sampled.
-    # It had no effect in the measurements of notebooks/keypoints.md.
-    keypoint_masked_only: bool = True
 
     def __post_init__(self) -> None:
         require(self.num_keypoints >= 1, f"model.loss.num_keypoints is {self.num_keypoints}; it must be at least 1")
@@ -118,33 +181,10 @@ class TransformerConfig:
     # linear: one linear layer (RoboScape). mlp: an MLP (the paper's Genie with actions), whose last layer starts at
     # zero, so that public weights keep their logits. none: no actions (the public Genie).
     action_encoder: Literal["linear", "mlp", "none"] = "linear"
-    # The encoder also reads the sum of all actions so far, which doubles its input. If actions are pose deltas, the sum
-    # is the pose: a large model finds it by temporal attention, a small one may not in few steps. Not in the paper.
-    integrate_actions: bool = False
-    # Every frame's input also contains the tokens of the frame before it, cell by cell, embedded by a separate table.
-    # In training these are visible even where that frame is masked, as past frames are in sampling, and the first
-    # spatial attention finds more than masks in the frame to predict. No output sees its own frame this way. Not in the
-    # paper.
-    read_previous: bool = False
-    # All cells of every frame but a clip's first stay masked, so each frame is predicted as a whole, from the actions
-    # and the frames before, which the network sees only through read_previous. Training then sets every cell the same
-    # task as decoding in one step, and decoding makes one pass over a frame instead of two; further decoding steps gain
-    # nothing. The paper and the public code mask a share of the cells.
-    whole_frames: bool = False
     width: int = 256
     blocks: int = 32
     heads: int = 8
     mlp_ratio: int = 4
-    # The share of training clips whose actions are replaced by a learned null action, for classifier-free guidance in
-    # sampling. Not in the paper.
-    action_dropout: float = 0.0
-    # learned: as in the public code. rotary: temporal queries and keys are rotated, and a rollout can go on beyond the
-    # trained frames with a rolling cache; positions within a frame are learned in both cases.
-    positions: Literal["learned", "rotary"] = "learned"
-    # Norms before temporal attention and before the heads. The public Genie has neither; small models trained for few
-    # steps learn faster with both.
-    temporal_norm: bool = False
-    final_norm: bool = False
     # Options of the public code that published weights may use. qk_norm: one LayerNorm normalises each head's queries
     # and keys; the norms before spatial attention and the MLP are then absent.
     qk_norm: bool = False
@@ -159,6 +199,7 @@ class TransformerConfig:
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
     # but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
+    departures: Departures = Departures()
 
     def __post_init__(self) -> None:
         for name in ("width", "blocks", "heads", "mlp_ratio", "unroll"):
@@ -167,24 +208,16 @@ class TransformerConfig:
             self.width % self.heads == 0,
             f"model.width {self.width} is not divisible by model.heads {self.heads}; change one of them",
         )
+        departures = self.departures
         require(
-            self.positions == "learned" or self.head_width % 2 == 0,
-            f"model.positions is 'rotary', which turns pairs of channels, but a head has {self.head_width} "
+            not departures.rotary or self.head_width % 2 == 0,
+            f"model.departures.rotary turns pairs of channels, but a head has {self.head_width} "
             f"(model.width / model.heads); change one of them",
         )
         require(
-            self.action_encoder != "none" or not (self.integrate_actions or self.action_dropout),
-            "model.action_encoder is none, so there are no actions for model.integrate_actions or "
-            "model.action_dropout; set them to False and 0",
-        )
-        require(
-            self.read_previous or not self.whole_frames,
-            "model.whole_frames masks all frames but the first, and model.read_previous is off, so the model would see "
-            "no other frame; switch it on",
-        )
-        require(
-            0 <= self.action_dropout < 1,
-            f"model.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and below 1",
+            self.action_encoder != "none" or not (departures.integrate_actions or departures.action_dropout),
+            "model.action_encoder is none, so there are no actions for model.departures.integrate_actions or "
+            "model.departures.action_dropout; set them to False and 0",
         )
 
     @property
@@ -199,14 +232,10 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     Attributes:
         max_frames: positions in time, and how many frames temporal attention covers; 0: the clips' frames.
-        shifts: copies of each training clip, moved by up to ``shift_pixels``. A step draws one of them or the clip.
-            Few clips last longer with copies: a scene that is moved by less than a token has new tokens everywhere.
     """
 
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
-    shifts: int = 0
-    shift_pixels: int = 4
     mask: MaskConfig = MaskConfig()
     sample: SampleConfig = sampling(SampleConfig())
 
@@ -224,30 +253,18 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     @property
     def token_shifts(self) -> tuple[int, ...]:
-        return (self.shifts, self.shift_pixels) if self.shifts else ()
+        if not self.departures.shifts:
+            return ()
+        return self.departures.shifts, self.departures.shift_pixels
 
     def check(self, clips: ClipShape) -> None:
-        require_range(self, "model", 0, math.inf, "shifts", "shift_pixels")
-        require_range(
-            self.mask, "model.mask", 0, 1, *(f.name for f in fields(MaskConfig) if f.name != "own_frames_after")
-        )
-        require_range(self.mask, "model.mask", 0, math.inf, "own_frames_after")
+        require_range(self.mask, "model.mask", 0, 1, *(f.name for f in fields(MaskConfig)))
         require(
             clips.frames <= self.frames(clips),
             f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "
             f"it to 0 (as many as the clips have)",
         )
-        require(
-            self.whole_frames or not self.mask.own_frames,
-            f"model.mask.own_frames is {self.mask.own_frames}, but without model.whole_frames no single pass predicts "
-            f"all frames; switch that on, or set own_frames to 0",
-        )
-        require(
-            not (self.whole_frames and self.mask.visible_prefix),
-            f"model.mask.visible_prefix is {self.mask.visible_prefix}, but model.whole_frames leaves no frame visible "
-            f"after the first; set one of them to 0 or False",
-        )
-        check_sampling(self.sample, self.frames(clips), self.action_dropout)
+        check_sampling(self.sample, self.frames(clips), self.departures.action_dropout)
 
 
 @register_family("roboscape")

@@ -201,7 +201,7 @@ class Attention(nn.Module):
         cfg = self.config
         q, k, v = self._project(x)
         positions = start + jnp.arange(x.shape[1])
-        if cfg.positions == "rotary":
+        if cfg.departures.rotary:
             q, k = (rotate(self._heads(y), positions).reshape(y.shape) for y in (q, k))
         if cache is None:
             q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))

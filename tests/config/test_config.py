@@ -166,10 +166,10 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("tokenizer_train", {"adversarial_weight": -0.1}, "tokenizer_train.adversarial_weight is -0.1"),
         ("model", {"max_frames": 5}, "clips have 6 frames but model.max_frames is 5"),
         ("model", {"heads": 3}, "model.width 32 is not divisible by model.heads 3"),
-        ("model", {"heads": 32, "positions": "rotary"}, "a head has 1 (model.width / model.heads)"),
-        ("model", {"action_encoder": "none", "integrate_actions": True}, "model.action_encoder is none"),
-        ("model", {"action_encoder": "none", "action_dropout": 0.1}, "model.action_encoder is none"),
-        ("model", {"action_dropout": 1.0}, "model.action_dropout is 1.0"),
+        ("model", {"heads": 32, "departures.rotary": True}, "a head has 1 (model.width / model.heads)"),
+        ("model", {"action_encoder": "none", "departures.integrate_actions": True}, "model.action_encoder is none"),
+        ("model", {"action_encoder": "none", "departures.action_dropout": 0.1}, "model.action_encoder is none"),
+        ("model.departures", {"action_dropout": 1.0}, "model.departures.action_dropout is 1.0"),
         ("model.loss", {"num_keypoints": 0}, "model.loss.num_keypoints is 0"),
         ("model.sample", {"steps": 0}, "model.sample.steps is 0"),
         ("model.sample", {"temperature": -0.5}, "model.sample.temperature is -0.5"),
@@ -189,7 +189,7 @@ def test_what_cannot_run_is_refused_by_name(path: str, changes: dict[str, Any], 
 def test_the_network_fits_clips_and_tokenizer_by_itself() -> None:
     """Positions, grid, codes and the actions' width are derived, so no setting can contradict them."""
     changes = {"sim.frames": 9, "sim.image_size": 128, "sim.control_steps": 2, "tokenizer.code_bits": 10}
-    config = with_values(BASE, changes | {"tokenizer.vocabularies": 5, "model.integrate_actions": True})
+    config = with_values(BASE, changes | {"tokenizer.vocabularies": 5, "model.departures.integrate_actions": True})
     network = Architecture.create(config)
     assert (network.frames, network.grid, network.action_inputs) == (9, config.grid, 2 * 14)
     assert config.grid == config.tokenizer.grid(128) == 16

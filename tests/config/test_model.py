@@ -9,6 +9,7 @@ import pytest
 from rsjax.config import (
     Config,
     ConfigError,
+    Departures,
     GenieConfig,
     LossConfig,
     MaskConfig,
@@ -110,24 +111,23 @@ def test_two_families_of_one_name_are_refused() -> None:
 
 
 def test_frames_that_are_masked_whole_must_be_read_otherwise() -> None:
-    with pytest.raises(ConfigError, match="model.read_previous is off"):
-        RoboScapeConfig(whole_frames=True)
-    model = RoboScapeConfig(read_previous=True, whole_frames=True, mask=MaskConfig(visible_prefix=0.5))
-    with pytest.raises(ConfigError, match="model.mask.visible_prefix is 0.5"):
-        replace(DEBUG, model=model)
+    with pytest.raises(ConfigError, match="read_previous is off"):
+        Departures(whole_frames=True)
+    with pytest.raises(ConfigError, match="model.departures.visible_prefix is 0.5"):
+        Departures(read_previous=True, whole_frames=True, visible_prefix=0.5)
 
 
 def test_own_frames_need_whole_frames_and_are_a_share() -> None:
-    model = RoboScapeConfig(read_previous=True, mask=MaskConfig(own_frames=0.5))
-    with pytest.raises(ConfigError, match="model.mask.own_frames is 0.5, but without model.whole_frames"):
-        replace(DEBUG, model=model)
-    with pytest.raises(ConfigError, match=r"model.mask.own_frames is 1.5; it must be 0 … 1"):
-        replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames=1.5)))
-    with pytest.raises(ConfigError, match="model.mask.own_frames_after is -1; it must be at least 0"):
-        replace(DEBUG, model=replace(model, whole_frames=True, mask=MaskConfig(own_frames_after=-1)))
+    with pytest.raises(ConfigError, match="model.departures.self_conditioning is 0.5, but without whole_frames"):
+        Departures(read_previous=True, self_conditioning=0.5)
+    whole = Departures(read_previous=True, whole_frames=True)
+    with pytest.raises(ConfigError, match=r"model.departures.self_conditioning is 1.5; it must be 0 … 1"):
+        replace(whole, self_conditioning=1.5)
+    with pytest.raises(ConfigError, match="model.departures.self_conditioning_after is -1; it must be at least 0"):
+        replace(whole, self_conditioning_after=-1)
 
 
-@pytest.mark.parametrize("name", ["random_token_rate", "corruption_probability", "corruption_decay", "visible_prefix"])
+@pytest.mark.parametrize("name", ["random_token_rate", "corruption_probability", "corruption_decay"])
 def test_rates_of_masks_are_shares_not_percentages(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"model.mask.{name} is 20; it must be 0 … 1"):
         replace(DEBUG, model=RoboScapeConfig(mask=MaskConfig(**{name: 20})))  # type: ignore[arg-type]

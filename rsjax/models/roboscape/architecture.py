@@ -36,7 +36,7 @@ class Architecture(TransformerConfig):
         """Returns the architecture of a configuration whose model is RoboScape or Genie."""
         model, clips, tokenizer = config.model, config.clips, config.tokenizer
         assert isinstance(model, TokenModelConfig)
-        action_inputs = clips.action_dim * (2 if model.integrate_actions else 1)
+        action_inputs = clips.action_dim * (2 if model.departures.integrate_actions else 1)
         return cls(
             **{field.name: getattr(model, field.name) for field in fields(TransformerConfig)},
             frames=model.frames(clips),
@@ -64,8 +64,8 @@ class Architecture(TransformerConfig):
         The pass that begins the next frame commits the last one, whose cells are all decided by then. With
         ``whole_frames`` the pass over a frame's masked cells is final.
         """
-        return 0 if self.whole_frames else 1
+        return 0 if self.departures.whole_frames else 1
 
     def check_sampling(self, sample: SampleConfig) -> None:
         """Raises :class:`rsjax.config.ConfigError` if the network does not support these settings."""
-        check_sampling(sample, self.frames, self.action_dropout)
+        check_sampling(sample, self.frames, self.departures.action_dropout)

@@ -18,8 +18,8 @@ Features = Float[Array, "B T S C"]
 class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
 
-    ``config.temporal_norm`` adds a norm before temporal attention; ``config.qk_norm`` removes norm1 and norm2. GELU is
-    exact.
+    The departure ``temporal_norm`` adds a norm before temporal attention; ``config.qk_norm`` removes norm1 and norm2.
+    GELU is exact.
     """
 
     config: Architecture
@@ -30,7 +30,7 @@ class STBlock(nn.Module):
         bf16 = cfg.compute_dtype == "bfloat16"
         normed = lambda name, x: x if cfg.qk_norm else layer_norm(name)(x)  # noqa: E731
         x = x + Attention(cfg, name="spatial_attn").spatial(normed("norm1", x))
-        before_time = layer_norm("norm_temporal")(x) if cfg.temporal_norm else x
+        before_time = layer_norm("norm_temporal")(x) if cfg.departures.temporal_norm else x
         out, cache = Attention(cfg, name="temporal_attn").temporal(before_time, start, cache)
         x = x + out
         h = Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed("norm2", x))

@@ -99,7 +99,7 @@ class TokenBranching:
         memories = [cast(_Memory, moments[i].memory) for i in full]
         scaled = self._codec.normalization.scaled(actions[full])
         sums = np.stack([memory.sums for memory in memories]) + scaled
-        rows = with_sums(scaled, sums if self._config.integrate_actions else None)
+        rows = with_sums(scaled, sums if self._config.departures.integrate_actions else None)
         net, chosen = self._network(decodings[0]), [decodings[i] for i in full]
         dials = Dials(
             np.array([each.temperature for each in chosen], np.float32),
@@ -119,7 +119,7 @@ class TokenBranching:
         memory = moment.memory
         if memory is None or memory.cache is None:
             return moment
-        full = self._arch.positions == "learned" and int(memory.state.position[0]) == self._arch.frames
+        full = not self._arch.departures.rotary and int(memory.state.position[0]) == self._arch.frames
         return replace(moment, memory=replace(memory, cache=None) if full else None)
 
     def depth(self, moment: Moment) -> Float32[np.ndarray, "H W"] | None:
@@ -133,7 +133,7 @@ class TokenBranching:
 
         A model that can be guided always is, so that its cache always has the same shape.
         """
-        drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.action_dropout else 1.0
+        drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.departures.action_dropout else 1.0
         sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
         sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k)
         return Network(self._arch, sample, self._has_depth, True)

@@ -71,7 +71,7 @@ class Decoder:
     ) -> tuple[Frame, Cache]:
         """Decodes the second of two frames: a pass over both commits the first, then passes cover the second alone.
 
-        What the first pass writes into the cache for the second frame is overwritten later. With ``arch.whole_frames``
+        What the first pass writes into the cache for the second frame is overwritten later. With ``whole_frames``
         it is final, and the pass leaves out the first frame, which is in the cache already.
 
         Args:
@@ -80,7 +80,7 @@ class Decoder:
                 begins its window.
             actions: those that lead into both frames, as in the window.
             position: that of the second frame in the window.
-            cache: of the frames before the first one; with ``arch.whole_frames``, of those before the second.
+            cache: of the frames before the first one; with ``whole_frames``, of those before the second.
         """
         b, _, cells = pair["rgb"].shape[:3]
         first = 1 - self.arch.uncommitted  # frame of the pass
@@ -117,7 +117,7 @@ class Decoder:
         """Decodes frame t with a full pass over its window at every step."""
         tokens, means = carry
         b, frames, cells = tokens["rgb"].shape
-        length = frames if self.arch.positions == "rotary" else self.arch.frames
+        length = frames if self.arch.departures.rotary else self.arch.frames
         base = window_start(self.arch, self.sample, t)
         keys = self._step_keys(t)
         actions = window_actions(self.arch, self.actions, base, base, length)

@@ -87,4 +87,4 @@ def _prompt(arch: Architecture, codec: Codec, prompt: Video) -> tuple[Tokens, np
 
 
 def _inputs(config: TokenModelConfig, codec: Codec, actions: Float[np.ndarray, "B T A"]) -> Float32[Array, "B T A2"]:
-    return jnp.asarray(codec.normalization.action_inputs(actions, config.integrate_actions))
+    return jnp.asarray(codec.normalization.action_inputs(actions, config.departures.integrate_actions))

@@ -53,7 +53,7 @@ class Imagined:
     def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
         scaled = self._codec.normalization.scaled(actions)
         self._sums += scaled
-        rows = with_sums(scaled, self._sums if self._config.integrate_actions else None)
+        rows = with_sums(scaled, self._sums if self._config.departures.integrate_actions else None)
         norm = self._codec.normalization if self._has_depth else None
         self._state, rgb, depth = _step(
             self._net, self._codec.config, norm, self._params, self._codec.params, self._state, rows

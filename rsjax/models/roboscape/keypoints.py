@@ -8,13 +8,25 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from rsjax.config import Departures
+
 
 @struct.dataclass
 class Keypoints:
     """Selected tracks on the token grid."""
 
     cells: Int[Array, "B K T"]  # row·W + column of the nearest cell
-    visible: Bool[Array, "B K T"]
+    visible: Bool[Array, "B K T"]  # whether the point counts in this frame
+
+
+def counted_frames(departures: Departures, visible: Bool[Array, "B N T"]) -> Bool[Array, "B N T"]:
+    """Returns the frames in which each point counts: all, or those that show it with ``visible_keypoints``.
+
+    A point that is not visible in the first frame was not sampled (a clip without tracks has none) and never counts.
+    """
+    if departures.visible_keypoints:
+        return visible
+    return jnp.broadcast_to(visible[..., :1], visible.shape)
 
 
 def motion_magnitude(tracks: Float[Array, "*B N T 2"], visible: Bool[Array, "*B N T"]) -> Float[Array, "*B N"]:

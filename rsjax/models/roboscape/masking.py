@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Int
 
-from rsjax.config import MaskConfig
+from rsjax.config import Departures, MaskConfig
 from rsjax.tokenizers import lfq
 
 Tokens = dict[str, Int[Array, "B T H W"]]
@@ -34,6 +34,7 @@ class Masked:
 
 def corrupt(
     config: MaskConfig,
+    visible_prefix: float,
     prompt_frames: int,
     code_bits: int,
     vocabularies: int,
@@ -44,6 +45,7 @@ def corrupt(
     """Corrupts and masks a batch.
 
     Args:
+        visible_prefix: as in :class:`rsjax.config.Departures`.
         prompt_frames: P, the first frames, which step 2 leaves alone.
         key: the step's key, the same on all devices.
         tokens: clean tokens by branch.
@@ -59,7 +61,7 @@ def corrupt(
             branch: _replace_sub_tokens(k, grid, replace, code_bits, vocabularies)
             for k, (branch, grid) in zip(branch_keys, clip.items(), strict=True)
         }
-        first = _after_prefix(config.visible_prefix, mask_key, frames, first_masked)
+        first = _after_prefix(visible_prefix, mask_key, frames, first_masked)
         return Masked(noisy, _mask(mask_key, next(iter(clip.values())).shape, first))
 
     return jax.vmap(one_clip)(index, tokens)
@@ -76,14 +78,14 @@ def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Ar
     return jax.vmap(lambda place: jax.random.bernoulli(jax.random.fold_in(key, place), rate))(index)
 
 
-def reads_own_frames(config: MaskConfig, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
-    """Draws whether a step reads the model's own frames; never before step ``own_frames_after``.
+def reads_own_frames(departures: Departures, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
+    """Draws whether a step reads the model's own frames; never before step ``self_conditioning_after``.
 
     Args:
         key: the step's key, as for :func:`corrupt`.
     """
-    drawn = jax.random.bernoulli(jax.random.fold_in(key, 3), config.own_frames)
-    return drawn & (step >= config.own_frames_after)
+    drawn = jax.random.bernoulli(jax.random.fold_in(key, 3), departures.self_conditioning)
+    return drawn & (step >= departures.self_conditioning_after)
 
 
 def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int) -> tuple[Array, Array]:

@@ -29,7 +29,7 @@ from rsjax.models.roboscape.branching import TokenBranching
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.generate import generate, plan, teacher_forced
 from rsjax.models.roboscape.imagine import Imagined
-from rsjax.models.roboscape.keypoints import Keypoints, attention_map, select
+from rsjax.models.roboscape.keypoints import Keypoints, attention_map, counted_frames, select
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.self_conditioning import previous_frames
 from rsjax.models.roboscape.transformer import Transformer, empty_cache, hidden
@@ -68,7 +68,8 @@ class Predictions:
         """The K tracks that move most, on the token grid."""
         loss, tracks = self.model.loss, self.batch.tracks
         count = min(loss.num_keypoints, tracks.shape[1])
-        return select(tracks, self.batch.visible, count, self.model.architecture.grid)
+        counted = counted_frames(self.model.config.departures, self.batch.visible)
+        return select(tracks, counted, count, self.model.architecture.grid)
 
 
 TERMS: dict[str, Callable[[Predictions], Term]] = {}
@@ -113,26 +114,27 @@ def attention_term(of: Predictions) -> Term:
 
 @loss_term("keypoint")
 def keypoint_term(of: Predictions) -> Term:
-    """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over frames t ≥ 2 in which keypoint i is visible.
+    """Returns L_Keypoint of Eq. 5: ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² over keypoints i and frames t ≥ 2.
 
-    ``keypoint_target`` "observed" uses the true code instead of ŝ_1; ``keypoint_masked_only`` leaves out keypoints on
+    The departure ``observed_anchor`` uses the true code instead of ŝ_1; ``masked_keypoints`` leaves out keypoints on
     cells that are not masked.
     """
-    bits, loss = of.model.architecture.code_bits, of.model.loss
+    bits = of.model.architecture.code_bits
+    departures = of.model.config.departures
     cells = of.keypoints.cells.swapaxes(1, 2)  # B T K
 
     def at_points(codes: Float[Array, "B t S D"], cells: Int[Array, "B t K"]) -> Float[Array, "B t K D"]:
         return jnp.take_along_axis(codes, cells[..., None], axis=2)
 
     predicted = lfq.mean_codes(of.logits["rgb"], bits)  # B T S D
-    if loss.keypoint_target == "observed":
+    if departures.observed_anchor:
         first = lfq.tokens_to_codes(of.clean["rgb"][:, :1], bits)
         anchor = at_points(first.reshape(predicted[:, :1].shape), cells[:, :1])
     else:
         anchor = at_points(predicted[:, :1], cells[:, :1])
     distance = jnp.sum(jnp.square(at_points(predicted[:, 1:], cells[:, 1:]) - anchor), axis=-1)
     weight = of.keypoints.visible.swapaxes(1, 2)[:, 1:] * of.batch.weight[:, None, None]
-    if loss.keypoint_masked_only:
+    if departures.masked_keypoints:
         mask = of.mask.reshape(*of.mask.shape[:2], -1)  # B T S
         weight = weight * jnp.take_along_axis(mask[:, 1:], cells[:, 1:], axis=2)
     return jnp.sum(distance * weight), jnp.sum(weight)
@@ -183,15 +185,21 @@ class RoboScape(WorldModel[Batch]):
         arch = self.architecture
         clean = {branch: getattr(batch, branch) for branch in arch.branches}
         shape = (self.prompt_frames, arch.code_bits, arch.vocabularies)
-        masked = masking.corrupt(self.config.mask, *shape, key, clean, batch.index)
-        drop = masking.dropped_actions(arch.action_dropout, key, batch.index) if arch.action_dropout else None
+        masked = masking.corrupt(
+            self.config.mask, self.config.departures.visible_prefix, *shape, key, clean, batch.index
+        )
+        drop = (
+            masking.dropped_actions(arch.departures.action_dropout, key, batch.index)
+            if arch.departures.action_dropout
+            else None
+        )
         no_depth = None if batch.has_depth is None else batch.has_depth == 0
         mask = hidden(arch, masked.mask)
         inputs = (masked.tokens, mask, batch.actions)
         apply = partial(Transformer(arch).apply, drop_actions=drop, no_depth=no_depth)
         previous = None
-        if self.config.mask.own_frames:
-            own = masking.reads_own_frames(self.config.mask, key, context.step)
+        if self.config.departures.self_conditioning:
+            own = masking.reads_own_frames(self.config.departures, key, context.step)
             fixed = {"params": jax.lax.stop_gradient(params)}
             predict = lambda: apply(fixed, *inputs)[0]  # noqa: E731
             previous = previous_frames(predict, masked.tokens, arch.code_bits, own, self.prompt_frames)
@@ -206,7 +214,7 @@ class RoboScape(WorldModel[Batch]):
         return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 
     def transform(self, normalization: Normalization) -> Transform:
-        return partial(records.token_arrays, normalization, self.config.integrate_actions)
+        return partial(records.token_arrays, normalization, self.config.departures.integrate_actions)
 
     def batch(self, arrays: Arrays) -> Batch:
         return records.token_batch(arrays)

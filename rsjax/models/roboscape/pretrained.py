@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from rsjax.config import Config, ConfigError, GenieConfig, RoboScapeConfig, TransformerConfig, from_dict
+from rsjax.config import Config, ConfigError, Departures, GenieConfig, RoboScapeConfig, TransformerConfig, from_dict
 from rsjax.config.fields import differences
 from rsjax.errors import UserError
 from rsjax.files import read_json
@@ -20,8 +20,10 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.models.saved import check_family
 from rsjax.trainable import Params
 
-# Fields that may differ between the saved network and the one to train.
-FREE = {"use_depth", "action_encoder", "action_inputs", "integrate_actions", "action_dropout"} | {
+# Departures in which the saved network and the one to train must agree; other departures may differ.
+ALIKE = {"read_previous", "whole_frames", "rotary", "temporal_norm", "final_norm"}
+# Fields that may differ.
+FREE = {"use_depth", "action_encoder", "action_inputs", "departures"} | {
     "compute_dtype",
     "embed_std",
     "position_std",
@@ -59,8 +61,15 @@ def shapes(own: Architecture, directory: Path) -> Params:
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
     saved = read_architecture(directory)
     # A trained action encoder needs the same inputs.
-    free = FREE - {"integrate_actions", "action_encoder"} if saved.action_inputs else FREE
-    if differing := differences(saved, own, free):
+    free, alike = FREE, ALIKE
+    if saved.action_inputs:
+        free = FREE - {"action_encoder"}
+        alike = ALIKE | {"integrate_actions"}
+    other = {field.name for field in fields(Departures)} - alike
+    differing = "; ".join(
+        filter(None, [differences(saved, own, free), differences(saved.departures, own.departures, other)])
+    )
+    if differing:
         raise UserError(f"{directory}: holds another network ({differing}); set these alike")
     return jax.eval_shape(Transformer(saved).init_params, jax.random.key(0))
 

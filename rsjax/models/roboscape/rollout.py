@@ -260,7 +260,7 @@ def _decode_cached(decoder: Decoder, tokens: Cells, cache: StackedCache, past: i
     """Decodes frames ``past`` to ``frames`` - 1, window by window, with the cache of the first of these windows."""
     arch, sample, length = decoder.arch, decoder.sample, decoder.actions.shape[1]
     made = (tokens, _means(decoder, tokens), apart(cache, arch.blocks, arch.unroll))
-    if arch.positions == "rotary" or length <= arch.frames:
+    if arch.departures.rotary or length <= arch.frames:
         return _decoded(decoder, *jax.lax.fori_loop(past, frames, partial(decoder.cached, 0), made)[:2])
     by, first = stride(arch, sample), window_start(arch, sample, past)
 

@@ -80,12 +80,12 @@ AXES = State(tokens=0, actions=0, base=0, cache=1, position=0, frame=0, key=0, e
 
 def remembered_frames(net: Network) -> int:
     """Returns K: how many frames stay in a window when it moves, but at least 2 if the model reads previous frames."""
-    return max(kept_frames(net), 2 if net.arch.read_previous else 1)
+    return max(kept_frames(net), 2 if net.arch.departures.read_previous else 1)
 
 
 def kept_frames(net: Network) -> int:
     """Returns how many frames stay in a window when it moves: 1, the last frame, for a rolling window."""
-    return 1 if net.arch.positions == "rotary" else net.arch.frames - stride(net.arch, net.sample)
+    return 1 if net.arch.departures.rotary else net.arch.frames - stride(net.arch, net.sample)
 
 
 def begin(net: Network, clips: int) -> State:
@@ -148,7 +148,7 @@ def advance(
         actions: the row that leads into that frame, as in a whole clip's inputs.
         dials: each clip's settings; None: those of the network.
     """
-    if net.arch.positions == "learned":
+    if not net.arch.departures.rotary:
         state = _begin_windows(net, params, kept_frames(net), state, state.position == net.arch.frames)
     if not net.arch.uncommitted:
         state = _begin_windows(net, params, 1, state, state.position == 1)
@@ -225,7 +225,7 @@ def _window_rows(
     arch: Architecture, rows: Float[Array, "T A"], base: Float[Array, " A"], start: Int[Array, ""] | int
 ) -> Float[Array, "T A"]:
     """Returns the actions of frames from position ``start`` on, as in a clip that begins with the window."""
-    if arch.integrate_actions:
+    if arch.departures.integrate_actions:
         rows = rows - jnp.where(jnp.arange(rows.shape[-1]) >= rows.shape[-1] // 2, base, 0.0)
     first = (start + jnp.arange(len(rows)) == 0)[:, None]
-    return jnp.where(first, 0.0, rows) if arch.positions == "learned" else rows
+    return jnp.where(first, 0.0, rows) if not arch.departures.rotary else rows

@@ -48,7 +48,7 @@ def score_tokens(
         past: prompt frames, which are not scored.
     """
     frames = actions.shape[1]
-    size = frames if arch.positions == "rotary" else arch.frames
+    size = frames if arch.departures.rotary else arch.frames
     starts = [int(window_start(arch, sample, t)) for t in range(frames)]
     parts = []
     for base in dict.fromkeys(starts[past:]):
@@ -77,7 +77,7 @@ def _score_window(
     """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
     clips, frames = actions.shape[:2]
     transformer = partial(Transformer(arch).apply, {"params": params}, no_depth=no_depth if arch.use_depth else None)
-    slots = frames if arch.positions == "learned" else max(arch.frames + 1, frames)
+    slots = max(arch.frames + 1, frames) if arch.departures.rotary else frames
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
     before = {name: shifted(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}

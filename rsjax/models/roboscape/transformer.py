@@ -75,15 +75,15 @@ class Transformer(nn.Module):
 
         Args:
             tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
-            mask: True for masked cells, in both branches; ``config.whole_frames`` masks more, see :func:`hidden`.
+            mask: True for masked cells, in both branches; ``whole_frames`` masks more, see :func:`hidden`.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
                 not exceed ``config.frames``, which is not checked.
             cache: from :func:`empty_cache` or an earlier call; frames before ``start`` are read from it.
-            drop_actions: True for clips that see the null action instead of their own; needs ``config.action_dropout``.
+            drop_actions: True for clips that see the null action instead of their own; needs ``action_dropout``.
             no_depth: True for clips without depth: all their cells are masked in the depth branch. Ignored by a model
                 without that branch.
-            previous: for ``config.read_previous``, tokens of the frame before each of these, by branch; those for frame
+            previous: for ``read_previous``, tokens of the frame before each of these, by branch; those for frame
                 0 are not read. If ``start`` is 0, the default is ``tokens`` moved by one frame.
 
         Returns:
@@ -94,14 +94,14 @@ class Transformer(nn.Module):
                 no positions for so many frames; or ``previous`` is missing.
         """
         cfg = self.config
-        if drop_actions is not None and not cfg.action_dropout:
-            raise ValueError("drop_actions needs a model with a null action: model.action_dropout above 0")
-        if cfg.read_previous and previous is None and not (isinstance(start, int) and start == 0):
+        if drop_actions is not None and not cfg.departures.action_dropout:
+            raise ValueError("drop_actions needs a model with a null action: model.departures.action_dropout above 0")
+        if cfg.departures.read_previous and previous is None and not (isinstance(start, int) and start == 0):
             raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
         cells = lambda x: x.reshape(b, t, cfg.grid**2, *x.shape[4:])  # noqa: E731
         init = nn.initializers.normal(cfg.position_std)
-        rotary = cfg.positions == "rotary"  # then the blocks encode time
+        rotary = cfg.departures.rotary  # then the blocks encode time
         if not rotary and t + (start if isinstance(start, int) else 0) > cfg.frames:
             raise ValueError(f"{t} frames from {start} on; the model has learned positions for {cfg.frames}")
         position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
@@ -114,7 +114,7 @@ class Transformer(nn.Module):
             branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), masked) + shared
             for branch, masked in masks.items()
         }
-        if cfg.read_previous:
+        if cfg.departures.read_previous:
             first = (start + jnp.arange(t) == 0)[:, None]
             for branch, before in (previous or {name: shifted(cells(tokens[name])) for name in x}).items():
                 absent = jnp.broadcast_to(first, before.shape[:3])
@@ -144,14 +144,14 @@ class Transformer(nn.Module):
             encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name="action_encoder_fc2")(hidden)
         else:
             encoded = Dense(cfg.width, name="action_encoder")(actions)
-        if cfg.action_dropout:
+        if cfg.departures.action_dropout:
             null = self.param("null_action", nn.initializers.zeros, (cfg.width,))
             encoded = encoded if drop is None else jnp.where(drop[:, None, None], null, encoded)
         return encoded[:, :, None]
 
     def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
-        if cfg.final_norm:
+        if cfg.departures.final_norm:
             x = layer_norm(f"{branch}_norm_out")(x)
         if cfg.mup:
             x = x / (cfg.width / MUP_WIDTH)
@@ -173,7 +173,7 @@ def hidden(config: Architecture, mask: Bool[Array, "B T H W"], start: Any = 0) -
     Args:
         start: position of the first of these frames.
     """
-    if not config.whole_frames:
+    if not config.departures.whole_frames:
         return mask
     return mask | (start + jnp.arange(mask.shape[1]) > 0)[:, None, None]
 

@@ -23,7 +23,7 @@ def stride(arch: Architecture, sample: SampleConfig) -> int:
 
 def window_start(arch: Architecture, sample: SampleConfig, frame: Int[Array, ""] | int) -> Int[Array, ""] | int:
     """Returns the first frame of the window that ``frame`` is decoded in: 0 for the first ``arch.frames`` frames."""
-    if arch.positions == "rotary":
+    if arch.departures.rotary:
         return 0
     by, excess = stride(arch, sample), frame + 1 - arch.frames
     return (excess + by - 1) // by * by * (excess > 0)
@@ -35,7 +35,7 @@ def room(arch: Architecture, sample: SampleConfig, frames: int) -> int:
     The length is rounded up to a multiple of ``arch.frames`` (plus a stride), so that few programs are compiled.
     """
     whole = -(-frames // arch.frames) * arch.frames
-    return whole + stride(arch, sample) if arch.positions == "learned" and whole > arch.frames else whole
+    return whole + stride(arch, sample) if not arch.departures.rotary and whole > arch.frames else whole
 
 
 def cache_slots(arch: Architecture, past: int) -> int:
@@ -44,7 +44,7 @@ def cache_slots(arch: Architecture, past: int) -> int:
     In the pass over frames (t-1, t), frame t-1 still attends to t - ``arch.frames``, so a rolling cache has one slot
     more than the window. A longer prompt is encoded in one pass and must fit.
     """
-    return arch.frames if arch.positions == "learned" else max(arch.frames + 1, past - arch.uncommitted)
+    return arch.frames if not arch.departures.rotary else max(arch.frames + 1, past - arch.uncommitted)
 
 
 def window_actions(
@@ -56,11 +56,11 @@ def window_actions(
 ) -> Float[Array, "B length A"]:
     """Returns the actions into frames start … start + length - 1, as in a clip that begins with frame ``base``.
 
-    The first frame of a clip has no action, and the sums of ``model.integrate_actions`` start there.
+    The first frame of a clip has no action, and the sums of ``model.departures.integrate_actions`` start there.
     """
     rows = jax.lax.dynamic_slice_in_dim(actions, start, length, axis=1)
     moved = rows
-    if arch.integrate_actions:
+    if arch.departures.integrate_actions:
         before = jax.lax.dynamic_slice_in_dim(actions, base, 1, axis=1)
         is_sum = jnp.arange(actions.shape[-1]) >= actions.shape[-1] // 2
         moved = rows - jnp.where(is_sum, before, 0.0)

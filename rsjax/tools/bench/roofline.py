@@ -110,7 +110,9 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
     width, hidden, heads, frames = arch.width, arch.mlp_ratio * arch.width, arch.heads, config.clips.frames
     cells, blocks = arch.grid**2, arch.blocks * len(arch.branches)
     rows, bf16 = batch * frames * cells, arch.compute_dtype == "bfloat16"
-    norms = blocks * ((4 if arch.qk_norm else 2) + arch.temporal_norm) + arch.final_norm * len(arch.branches)
+    norms = blocks * ((4 if arch.qk_norm else 2) + arch.departures.temporal_norm) + arch.departures.final_norm * len(
+        arch.branches
+    )
     joint = arch.blocks if arch.use_depth else 0  # depth → RGB
 
     def product(name: str, times: int, inputs: int, outputs: int) -> Operation:

@@ -49,10 +49,10 @@ def table(config: Architecture) -> Table:
     Raises:
         ConvertError: the network has rotary positions, which the public format cannot express.
     """
-    if config.positions != "learned":
+    if config.departures.rotary:
         raise ConvertError(
-            f"the public format cannot express model.positions {config.positions!r}; only a model with learned "
-            f"positions can be exported"
+            "the public format cannot express model.departures.rotary; only a model with learned "
+            "positions can be exported"
         )
     entries: list[Entry] = [
         Entry("pos_embed_TSC", "pos_embed", "lead"),

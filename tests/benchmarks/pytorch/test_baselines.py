@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from benchmarks.pytorch.baselines import check_torch, torch_baseline
-from rsjax.config import Config, ConfigError, presets
+from rsjax.config import Config, ConfigError, Departures, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.tools.bench.run import bench
@@ -21,11 +21,11 @@ def toy(**model: Any) -> Config:
 @pytest.mark.parametrize(
     ("config", "line"),
     [
-        (presets.get("tiny"), "model.temporal_norm is on"),
-        (toy(final_norm=True), "model.final_norm is on"),
+        (presets.get("tiny"), "model.departures.temporal_norm is on"),
+        (toy(departures=Departures(final_norm=True)), "model.departures.final_norm is on"),
         (toy(qk_norm=True), "model.qk_norm is on"),
         (toy(mup=True), "model.mup is on"),
-        (toy(positions="rotary"), "model.positions is 'rotary'"),
+        (toy(departures=Departures(rotary=True)), "model.departures.rotary is on"),
     ],
     ids=["tiny", "final_norm", "qk_norm", "mup", "rotary"],
 )

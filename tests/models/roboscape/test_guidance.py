@@ -1,4 +1,3 @@
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,9 +11,10 @@ from rsjax.config.config_fields import with_values
 from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.rollout import encode_prompt, rollout
 from rsjax.models.roboscape.transformer import Transformer
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
 
-GUIDED = replace(DUAL, action_dropout=0.2)
+GUIDED = depart(DUAL, action_dropout=0.2)
 
 
 def flat(tokens: dict[str, Any]) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def test_guided_rollouts_are_the_same_without_the_cache() -> None:
 
 def test_guidance_of_a_model_that_never_dropped_actions_is_refused() -> None:
     tokens, actions = given(DUAL, 1)
-    with pytest.raises(ConfigError, match=r"model.sample.guidance is 2.0 .* model.action_dropout above 0"):
+    with pytest.raises(ConfigError, match=r"model.sample.guidance is 2.0 .* model.departures.action_dropout above 0"):
         rollout(DUAL, SampleConfig(guidance=2.0), random_params(DUAL), tokens, actions, KEY)
     debug = presets.debug()
     with pytest.raises(ConfigError, match=r"model.sample.guidance is 2.0"):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import LossConfig, MaskConfig, RoboScapeConfig
+from rsjax.config import Departures, LossConfig, MaskConfig, RoboScapeConfig
 from rsjax.models.roboscape import keypoints as kp
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.architecture import Architecture
@@ -15,7 +15,7 @@ from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.trainable import StepContext, Term, combine
-from tests.models.roboscape.toy import roboscape
+from tests.models.roboscape.toy import depart, roboscape
 
 MODEL = Architecture(frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=1, heads=2)
 MASK, LOSS = MaskConfig(), LossConfig(num_keypoints=3)
@@ -23,7 +23,8 @@ KEY, CONTEXT = jax.random.key(3), StepContext(jnp.int32(0), None, None)
 
 
 def model_of(architecture: Architecture, loss: LossConfig) -> RoboScape:
-    config = RoboScapeConfig(use_depth=architecture.use_depth, loss=loss, mask=MASK)
+    departures = architecture.departures
+    config = RoboScapeConfig(use_depth=architecture.use_depth, departures=departures, loss=loss, mask=MASK)
     return roboscape(architecture, config)
 
 
@@ -70,11 +71,12 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
     has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
     batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
     clean = {name: jnp.asarray(getattr(batch, name)) for name in MODEL.branches}
-    corrupt = jax.jit(partial(masking.corrupt, MASK, 1, MODEL.code_bits, MODEL.vocabularies))
+    corrupt = jax.jit(partial(masking.corrupt, MASK, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
-    points = kp.select(batch.tracks, batch.visible, LOSS.num_keypoints, MODEL.grid)
+    counted = kp.counted_frames(Departures(), batch.visible)
+    points = kp.select(batch.tracks, counted, LOSS.num_keypoints, MODEL.grid)
     emphasis = np.asarray(kp.attention_map(points, MODEL.grid, LOSS.gamma))
 
     expected = dict.fromkeys(("rgb", "depth", "attention"), 0.0)
@@ -101,7 +103,7 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
 
 
 def test_whole_frames_are_scored_in_every_cell_after_the_first_frame() -> None:
-    model = replace(MODEL, read_previous=True, whole_frames=True)
+    model = depart(MODEL, read_previous=True, whole_frames=True)
     batch = random_batch()
     scored = {name: float(weight) for name, (_, weight) in terms_of(model, LOSS, random_params(model), batch).items()}
     frames, cells = MODEL.frames - 1, MODEL.grid**2
@@ -176,7 +178,7 @@ def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
 
 
 def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:
-    model, loss = replace(MODEL, action_dropout=0.5), LossConfig(use_keypoints=False)
+    model, loss = depart(MODEL, action_dropout=0.5), LossConfig(use_keypoints=False)
     params, batch = random_params(model), random_batch(8)
     drop = masking.dropped_actions(0.5, KEY, batch.index)
     assert {False, True} == set(np.asarray(drop).tolist())

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import LossConfig, RoboScapeConfig
+from rsjax.config import Departures, LossConfig, RoboScapeConfig
 from rsjax.models.roboscape import model as losses
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map
@@ -50,9 +50,11 @@ def cross_entropy() -> jax.Array:
     return lfq.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
 
 
-def predictions(keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, **loss: Any) -> Predictions:
+def predictions(
+    keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, gamma: float = 5.0, **departures: bool
+) -> Predictions:
     """Both branches with the same logits and tokens, and these keypoints instead of selected ones."""
-    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(**loss)))
+    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(gamma=gamma), departures=Departures(**departures)))
     batch: Any = SimpleNamespace(weight=jnp.asarray(weight), has_depth=None)
     logits, tokens = (dict.fromkeys(("rgb", "depth"), jnp.array(x)) for x in (LOGITS, TOKENS))
     of = Predictions(model, logits, tokens, jnp.array(MASK), batch)
@@ -106,27 +108,27 @@ def test_mean_codes_are_the_mean_over_all_tokens() -> None:
 
 
 @pytest.mark.parametrize("masked_only", [False, True])
-@pytest.mark.parametrize("target", ["predicted", "observed"])
-def test_keypoints_are_equation_5(target: str, masked_only: bool) -> None:
+@pytest.mark.parametrize("observed", [False, True])
+def test_keypoints_are_equation_5(observed: bool, masked_only: bool) -> None:
     s_hat = plain_mean_codes()
     total = weight = 0.0
     for clip in np.flatnonzero(CLIP_WEIGHT):
         for i in range(5):
             row, column = divmod(int(KEYPOINTS.cells[clip, i, 0]), GRID)
             code = np.array([2 * (int(TOKENS[clip, 0, row, column]) >> c & 1) - 1 for c in range(BITS)])
-            first = code if target == "observed" else s_hat[clip, 0, row * GRID + column]
+            first = code if observed else s_hat[clip, 0, row * GRID + column]
             for t in range(1, T):
                 cell = int(KEYPOINTS.cells[clip, i, t])
                 if KEYPOINTS.visible[clip, i, t] and (not masked_only or MASK[clip, t].ravel()[cell]):
                     total += np.sum((s_hat[clip, t, cell] - first) ** 2)
                     weight += 1
-    of = predictions(keypoint_target=target, keypoint_masked_only=masked_only)
+    of = predictions(observed_anchor=observed, masked_keypoints=masked_only)
     assert_term(losses.keypoint_term(of), (total, weight))
 
 
-def test_all_visible_points_weigh_what_equation_5_divides_by() -> None:
+def test_points_that_count_weigh_what_equation_5_divides_by() -> None:
     seen = Keypoints(KEYPOINTS.cells, jnp.ones((B, 5, T), bool))
-    _, weight = losses.keypoint_term(predictions(seen, np.ones(B), keypoint_masked_only=False))
+    _, weight = losses.keypoint_term(predictions(seen, np.ones(B)))
     assert float(weight) == B * (T - 1) * 5
 
 

@@ -11,14 +11,14 @@ from rsjax.config import SampleConfig
 from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
-from tests.models.roboscape.toy import blind
+from tests.models.roboscape.toy import blind, depart
 from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, given, random_params
 
 CLIPS = 3
 SOME = np.array([False, True, False])
 ALL = np.ones(CLIPS, bool)
 WARM = SampleConfig(steps=2, temperature=1.0, window_stride=2)
-GUIDED = replace(DUAL, action_dropout=0.2, positions="rotary", read_previous=True)
+GUIDED = depart(DUAL, action_dropout=0.2, rotary=True, read_previous=True)
 # Few, and shared by all tests here: compiling is most of the work.
 GREEDY = (DUAL, replace(WARM, steps=4, unmask="greedy"), 3, 6)
 WINDOW = (DUAL, WARM, 2, 12)

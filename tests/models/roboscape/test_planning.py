@@ -9,6 +9,7 @@ import pytest
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
 CANDIDATES, PROMPT, FRAMES = 3, 3, 8
@@ -18,7 +19,7 @@ CANDIDATES, PROMPT, FRAMES = 3, 3, 8
     ("model", "sample"),
     [
         (DUAL, SampleConfig(temperature=1.0)),
-        (replace(RGB, positions="rotary", action_dropout=0.1), SampleConfig(temperature=1.0, guidance=2.0)),
+        (depart(RGB, rotary=True, action_dropout=0.1), SampleConfig(temperature=1.0, guidance=2.0)),
     ],
     ids=["dual", "rotary-guided"],
 )
@@ -65,7 +66,7 @@ def test_a_shared_prompt_is_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_prompt_encoded_for_other_sampling_is_refused(field: str, plain: SampleConfig, other: SampleConfig) -> None:
-    model = replace(RGB, action_dropout=0.1)
+    model = depart(RGB, action_dropout=0.1)
     params, (tokens, actions) = random_params(model), given(model, 2, 4, 1)
     for before, after in ((plain, other), (other, plain)):
         prompt = jax.eval_shape(lambda s=before: encode_prompt(model, s, params, tokens, actions[:, :2]))
@@ -74,7 +75,7 @@ def test_a_prompt_encoded_for_other_sampling_is_refused(field: str, plain: Sampl
 
 
 def test_what_does_not_touch_the_prompts_cache_may_change_after_it() -> None:
-    model = replace(RGB, action_dropout=0.1)
+    model = depart(RGB, action_dropout=0.1)
     params, (tokens, actions) = random_params(model), given(model, 2, FRAMES, 1)
     sample, alike = SampleConfig(guidance=2.0, temperature=1.0), SampleConfig(guidance=0.5, steps=4, window_stride=3)
     made = []

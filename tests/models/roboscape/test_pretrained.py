@@ -16,10 +16,11 @@ from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tools.convert.directory import save
 from rsjax.tools.convert.genie import from_public
 from rsjax.training.checkpoint import load_weights, save_weights
+from tests.models.roboscape.toy import depart
 from tests.tools.convert.public import genie_shapes, random_tensors
 
 ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
-DUAL = replace(ALONE, use_depth=True, action_inputs=5, action_dropout=0.1)
+DUAL = depart(replace(ALONE, use_depth=True, action_inputs=5), action_dropout=0.1)
 
 
 def random_params(network: Architecture, seed: int = 0) -> Any:
@@ -86,7 +87,7 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
     wider = replace(DUAL, action_inputs=6)
     with pytest.raises(UserError, match=r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"):
         begin(wider, tmp_path)
-    integrated = replace(DUAL, integrate_actions=True)
+    integrated = depart(DUAL, integrate_actions=True)
     with pytest.raises(UserError, match="integrate_actions is False there, True here"):
         begin(integrated, tmp_path)
     with pytest.raises(UserError, match="action_encoder is linear there, mlp here"):
@@ -94,7 +95,7 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
 
 
 def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Path) -> None:
-    integrated = replace(DUAL, integrate_actions=True)
+    integrated = depart(DUAL, integrate_actions=True)
     assert not np.any(begin(integrated, public)["action_encoder"]["kernel"])
 
 

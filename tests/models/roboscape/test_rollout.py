@@ -13,9 +13,10 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
-WHOLE = replace(DUAL, read_previous=True, whole_frames=True)
+WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
 
 
 @pytest.mark.parametrize(
@@ -26,8 +27,8 @@ WHOLE = replace(DUAL, read_previous=True, whole_frames=True)
         (DUAL, 3, SampleConfig(steps=1)),
         (RGB, 1, SampleConfig(steps=3, unmask="greedy")),
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
-        (replace(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
-        (replace(DUAL, read_previous=True), 3, SampleConfig(steps=1)),
+        (depart(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
+        (depart(DUAL, read_previous=True), 3, SampleConfig(steps=1)),
         (WHOLE, 1, SampleConfig(steps=1)),
         (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
     ],
@@ -71,7 +72,7 @@ def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
 @pytest.mark.parametrize(("steps", "read"), [(1, False), (1, True), (3, False), (3, True)])
 def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int, read: bool) -> None:
     """With one step each frame's mean codes follow from what it reads: tokens as without them, or mean codes."""
-    model = replace(DUAL, read_previous=True)
+    model = depart(DUAL, read_previous=True)
     params, (tokens, actions) = random_params(model), given(model, 2)
     sample = SampleConfig(steps=steps, mean_codes=True, read_means=read)
     drawn = rollout(model, replace(sample, mean_codes=False), params, tokens, actions, KEY)
@@ -161,7 +162,10 @@ def test_a_rollout_costs_the_frame_passes_that_it_should(
 
 
 def test_a_whole_frame_costs_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, seen = replace(RGB, frames=16, grid=1, read_previous=True, whole_frames=True), count_model(monkeypatch)
+    model, seen = (
+        depart(replace(RGB, frames=16, grid=1), read_previous=True, whole_frames=True),
+        count_model(monkeypatch),
+    )
     tokens = {"rgb": np.zeros((1, 3, 1, 1), np.int32)}
     with jax.disable_jit():
         rollout(model, SampleConfig(steps=1), NO_PARAMS, tokens, np.zeros((1, 16, 3)), KEY)
@@ -170,7 +174,7 @@ def test_a_whole_frame_costs_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("read_previous", [False, True])
 def test_codes_of_tokens_are_read_as_the_tokens_and_mean_codes_as_the_mean(read_previous: bool) -> None:
-    model = replace(DUAL, read_previous=read_previous)
+    model = depart(DUAL, read_previous=read_previous)
     params, (tokens, actions) = random_params(model), given(model, 6)
     mask = np.random.default_rng(3).random((BATCH, 6, 3, 3)) < 0.5
     apply = jax.jit(Transformer(model).apply)

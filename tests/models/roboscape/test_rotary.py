@@ -8,13 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, Departures
 from rsjax.layers.attention import frames_held, rotate
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
 
 ROTARY = Architecture(
-    frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2, positions="rotary", qk_norm=True
+    frames=4,
+    grid=2,
+    code_bits=4,
+    action_inputs=3,
+    width=8,
+    blocks=2,
+    heads=2,
+    departures=Departures(rotary=True),
+    qk_norm=True,
 )
 LENGTH = 11  # frames, more than twice the window
 
@@ -91,7 +99,7 @@ def test_what_cannot_be_is_refused() -> None:
     params, inputs = random_params(ROTARY), random_inputs(ROTARY)
     with pytest.raises(ValueError, match="11 frames do not fit a cache of 5"):
         rotary(params, *inputs, 0, empty_cache(ROTARY, 2, 5))
-    with pytest.raises(ConfigError, match=r"model.positions is 'rotary'.* a head has 3"):
+    with pytest.raises(ConfigError, match=r"model.departures.rotary .* a head has 3"):
         replace(ROTARY, width=6)
 
 

@@ -18,16 +18,15 @@ from rsjax.tokenizers import lfq
 from rsjax.trainable import StepContext, combine
 from tests.models.roboscape.test_loss_terms import KEY, LOSS, random_batch, random_params
 from tests.models.roboscape.test_loss_terms import MODEL as VISIBLE
-from tests.models.roboscape.toy import roboscape
+from tests.models.roboscape.toy import depart, roboscape
 
-MODEL = replace(VISIBLE, read_previous=True, whole_frames=True)
+MODEL = depart(VISIBLE, read_previous=True, whole_frames=True)
 QUIET = MaskConfig(random_token_rate=0.0, corruption_probability=0.0)
 
 
 def model_of(own: float, after: int = 0) -> RoboScape:
-    mask = replace(QUIET, own_frames=own, own_frames_after=after)
-    config = RoboScapeConfig(read_previous=True, whole_frames=True, loss=LOSS, mask=mask)
-    return roboscape(MODEL, config)
+    departures = replace(MODEL.departures, self_conditioning=own, self_conditioning_after=after)
+    return roboscape(MODEL, RoboScapeConfig(departures=departures, loss=LOSS, mask=QUIET))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -89,8 +88,8 @@ def test_before_its_first_own_frames_a_step_is_the_one_on_true_frames() -> None:
 
 
 def test_a_share_of_the_steps_reads_own_frames() -> None:
-    mask = replace(QUIET, own_frames=0.3, own_frames_after=100)
+    departures = replace(MODEL.departures, self_conditioning=0.3, self_conditioning_after=100)
     keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(1100))
-    drawn = np.asarray(jax.vmap(partial(masking.reads_own_frames, mask))(keys, jnp.arange(1100)))
+    drawn = np.asarray(jax.vmap(partial(masking.reads_own_frames, departures))(keys, jnp.arange(1100)))
     assert not drawn[:100].any()
     assert 0.25 < drawn[100:].mean() < 0.35

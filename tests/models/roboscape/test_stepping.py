@@ -12,10 +12,11 @@ from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.stepping import Network, advance, begin, last_frame, restart
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
 
-SUMS = replace(DUAL, action_inputs=4, integrate_actions=True, read_previous=True)
-GUIDED = replace(RGB, action_dropout=0.1, positions="rotary", read_previous=True)
+SUMS = depart(replace(DUAL, action_inputs=4), integrate_actions=True, read_previous=True)
+GUIDED = depart(RGB, action_dropout=0.1, rotary=True, read_previous=True)
 FRAMES = 15
 
 
@@ -26,9 +27,9 @@ FRAMES = 15
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
         (SUMS, SampleConfig(steps=2, mean_codes=True)),
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
-        (replace(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
-        (replace(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5)),
-        (replace(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
+        (depart(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
+        (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5)),
+        (depart(GUIDED, whole_frames=True), SampleConfig(steps=1, guidance=2.0)),
     ],
     ids=[
         "dual-sums",

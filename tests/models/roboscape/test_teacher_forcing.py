@@ -13,12 +13,13 @@ from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.models.roboscape.window import window_actions, window_start
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
 
 SAMPLE = SampleConfig(steps=1, window_stride=2)
-SUMS = replace(RGB, action_inputs=4, integrate_actions=True, read_previous=True)
-WHOLE = replace(SUMS, whole_frames=True)
-ROTARY = replace(RGB, positions="rotary", read_previous=True)
+SUMS = depart(replace(RGB, action_inputs=4), integrate_actions=True, read_previous=True)
+WHOLE = depart(SUMS, whole_frames=True)
+ROTARY = depart(RGB, rotary=True, read_previous=True)
 NONE, FIRST = np.zeros(BATCH, bool), np.arange(BATCH) == 0
 
 
@@ -26,7 +27,7 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
     """Frame by frame: the network sees the true frames of the window, of which the last is masked."""
     params, (tokens, actions) = random_params(model), given(model, frames, frames)
     apply = jax.jit(Transformer(model).apply)
-    length = frames if model.positions == "rotary" else model.frames
+    length = frames if model.departures.rotary else model.frames
     nats, right = ({name: np.full((BATCH, frames), np.nan) for name in tokens} for _ in range(2))
     for t in range(past, frames):
         base = int(window_start(model, SAMPLE, t))

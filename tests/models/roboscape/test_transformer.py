@@ -107,7 +107,7 @@ def test_hiding_depth_leaves_the_callers_mask_and_a_model_without_depth_as_they_
 
 
 def test_actions_cannot_be_dropped_without_a_null_action() -> None:
-    with pytest.raises(ValueError, match="model.action_dropout"):
+    with pytest.raises(ValueError, match="model.departures.action_dropout"):
         apply_plain(DUAL, random_params(DUAL), *random_inputs(DUAL), drop_actions=np.array([True, False]))
 
 

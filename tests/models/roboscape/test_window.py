@@ -1,7 +1,7 @@
 """Rollouts longer than the window."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,13 +15,13 @@ from rsjax.models.roboscape import rollout as module
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.roboscape.window import room, window_actions, window_start
+from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
-Positions = Literal["learned", "rotary"]
-ROTARY = replace(RGB, positions="rotary")
-PREVIOUS = replace(RGB, read_previous=True)
-WHOLE = replace(PREVIOUS, whole_frames=True)
-SUMS = replace(RGB, action_inputs=4, integrate_actions=True)
+ROTARY = depart(RGB, rotary=True)
+PREVIOUS = depart(RGB, read_previous=True)
+WHOLE = depart(PREVIOUS, whole_frames=True)
+SUMS = depart(replace(RGB, action_inputs=4), integrate_actions=True)
 
 
 @drawn(window=st.integers(2, 20), by=st.integers(0, 19), frames=st.integers(2, 90))
@@ -87,9 +87,9 @@ def test_a_rolling_window_forgets_what_has_left_it() -> None:
     assert not np.array_equal(make({"rgb": seen}), before)
 
 
-@pytest.mark.parametrize("positions", ["learned", "rotary"])
-def test_forty_eight_frames(positions: Positions) -> None:
-    model = replace(DUAL, frames=16, grid=2, blocks=1, positions=positions)
+@pytest.mark.parametrize("rotary", [False, True])
+def test_forty_eight_frames(rotary: bool) -> None:
+    model = depart(replace(DUAL, frames=16, grid=2, blocks=1), rotary=rotary)
     params, (tokens, actions) = random_params(model), given(model, 1, 48)
     out, plain = (rollout(model, SampleConfig(), params, tokens, actions, KEY, cached=c) for c in (True, False))
     for name, grid in out.items():
@@ -97,12 +97,10 @@ def test_forty_eight_frames(positions: Positions) -> None:
         assert np.ptp(np.asarray(grid).reshape(BATCH, 48, -1), axis=1).all()
 
 
-@pytest.mark.parametrize(("positions", "beyond"), [("learned", 3), ("rotary", 2)])
-def test_a_longer_rollout_is_no_larger_a_program(
-    positions: Positions, beyond: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("rotary", "beyond"), [(False, 3), (True, 2)])
+def test_a_longer_rollout_is_no_larger_a_program(rotary: bool, beyond: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The model stands in it twice, for two frames and for one, and where a window jumps once more."""
-    model, seen = replace(DUAL, frames=16, positions=positions), count_model(monkeypatch)
+    model, seen = depart(replace(DUAL, frames=16), rotary=rotary), count_model(monkeypatch)
     calls, sizes = {}, {}
     for frames in (16, 48, 96):
         seen.clear()
@@ -124,11 +122,11 @@ def test_lengths_up_to_one_multiple_of_the_window_are_one_program_and_the_next_i
     assert programs == dict.fromkeys(range(33, 49), 1) | {49: 2}
 
 
-@pytest.mark.parametrize(("positions", "passes"), [("learned", 141 + 4 * 7), ("rotary", 141)])
+@pytest.mark.parametrize(("rotary", "passes"), [(False, 141 + 4 * 7), (True, 141)])
 def test_a_jump_costs_the_frames_that_are_encoded_anew(
-    positions: Positions, passes: int, monkeypatch: pytest.MonkeyPatch
+    rotary: bool, passes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, seen = replace(RGB, frames=16, grid=1, positions=positions), count_model(monkeypatch)
+    model, seen = depart(replace(RGB, frames=16, grid=1), rotary=rotary), count_model(monkeypatch)
     with jax.disable_jit():
         tokens = {"rgb": np.zeros((1, 1, 1, 1), np.int32)}
         rollout(model, SampleConfig(), NO_PARAMS, tokens, np.zeros((1, 48, 3), np.float32), KEY)

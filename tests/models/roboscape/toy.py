@@ -12,20 +12,26 @@ from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
 
+
+def depart(architecture: Architecture, **departures: Any) -> Architecture:
+    """The architecture with these departures from the paper besides its own."""
+    return replace(architecture, departures=replace(architecture.departures, **departures))
+
+
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, use_depth=False)
-NORMED = replace(DUAL, temporal_norm=True, final_norm=True)
+NORMED = depart(DUAL, temporal_norm=True, final_norm=True)
 QK_NORM = replace(DUAL, qk_norm=True, mup=True)
-READS_PREVIOUS = replace(DUAL, read_previous=True)
-WHOLE = replace(READS_PREVIOUS, whole_frames=True)
+READS_PREVIOUS = depart(DUAL, read_previous=True)
+WHOLE = depart(READS_PREVIOUS, whole_frames=True)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
-GUIDED = replace(DUAL, action_dropout=0.5)
+GUIDED = depart(DUAL, action_dropout=0.5)
 BATCH = 2
 
 
 def roboscape(architecture: Architecture, config: TokenModelConfig | None = None, prompt_frames: int = 1) -> RoboScape:
     """A model of this architecture, whatever clips and tokenizer that would follow from."""
-    config = config or RoboScapeConfig(use_depth=architecture.use_depth, action_dropout=architecture.action_dropout)
+    config = config or RoboScapeConfig(use_depth=architecture.use_depth, departures=architecture.departures)
     clips = ClipShape(architecture.frames, 64, 7, architecture.action_inputs, 2)
     return RoboScape(config, architecture, prompt_frames, TokenizerConfig(), clips)
 
@@ -118,7 +124,7 @@ def st_block(x: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
     b, t, s, _ = x.shape
     normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
     x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
-    before = layer_norm(x, p["norm_temporal"]) if config.temporal_norm else x.copy()
+    before = layer_norm(x, p["norm_temporal"]) if config.departures.temporal_norm else x.copy()
     for i in range(b):
         for cell in range(s):
             x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
@@ -140,14 +146,14 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
     tokens, mask, actions = inputs
     p = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
     b, t = mask.shape[:2]
-    if config.whole_frames:
+    if config.departures.whole_frames:
         mask = mask.copy()
         mask[:, 1:] = True
     h = {}
     for name, grid in tokens.items():
         flat = grid.reshape(b, t, -1)
         x = embed(flat, mask.reshape(b, t, -1), p[f"{name}_embed"], config)
-        if config.read_previous:
+        if config.departures.read_previous:
             absent = np.broadcast_to((np.arange(t) == 0)[None, :, None], flat.shape)
             x += embed(np.roll(flat, 1, axis=1), absent, p[f"{name}_previous_embed"], config)
         h[name] = x + p["pos_embed"][:t]
@@ -158,7 +164,7 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
         if config.use_depth:
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
-    if config.final_norm:
+    if config.departures.final_norm:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
     if config.mup:
         h = {name: x * 256 / config.width for name, x in h.items()}

@@ -50,7 +50,7 @@ def test_the_tokenizers_products_are_all_that_it_counts(
             assert ("scan" in str(program)) == (wide and config.compute_dtype == "bfloat16")
 
 
-@pytest.mark.parametrize("changes", [{}, {"use_depth": False, "positions": "rotary"}])
+@pytest.mark.parametrize("changes", [{}, {"use_depth": False, "departures.rotary": True}])
 def test_a_cached_passs_products_are_all_that_the_model_counts(changes: dict[str, Any]) -> None:
     config = with_values(presets.debug(), {f"model.{name}": value for name, value in changes.items()})
     model = create_model(config)

@@ -8,6 +8,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 
+from rsjax.config import Departures
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -188,10 +189,17 @@ def test_tensors_of_something_else_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"use_depth": True}, {"final_norm": True}, {"action_inputs": 7}, {"positions": "rotary"}], ids=str
+    "fields",
+    [
+        {"use_depth": True},
+        {"departures": Departures(final_norm=True)},
+        {"action_inputs": 7},
+        {"departures": Departures(rotary=True)},
+    ],
+    ids=str,
 )
 def test_a_model_without_public_names_is_not_exported(fields: dict[str, Any]) -> None:
     config = Architecture(**{"width": 16, "blocks": 2, "heads": 2, "use_depth": False, "action_inputs": 0} | fields)
     params = jax.eval_shape(Transformer(config).init_params, jax.random.key(0))
-    with pytest.raises(ConvertError, match="no name for these parts|cannot express model.positions"):
+    with pytest.raises(ConvertError, match="no name for these parts|cannot express model.departures.rotary"):
         to_tensors(params, table(config))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, Departures
 from rsjax.errors import UserError
 from rsjax.tools.play.guard import Guard
 from rsjax.tools.play.serve import ServeSettings, _address, listen
@@ -36,7 +36,7 @@ def test_settings_are_the_runs_and_limits_follow_from_it() -> None:
     config = toy.config()
     assert first_settings(config).describe() == {"temperature": 0.0, "steps": 2, "guidance": 1.0, "top_k": 0}
     assert settings_limits(config)["guidance"] == [1.0, 1.0]
-    assert settings_limits(toy.with_model(config, action_dropout=0.1))["guidance"] == [0.0, 8.0]
+    assert settings_limits(toy.with_model(config, departures=Departures(action_dropout=0.1)))["guidance"] == [0.0, 8.0]
 
 
 def test_a_run_that_is_none_is_named_in_one_line(tmp_path: Path) -> None:

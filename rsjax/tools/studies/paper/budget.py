@@ -103,7 +103,9 @@ def with_steps(config: Config, steps: int) -> Config:
     """Returns the configuration with a number of world-model steps; own frames begin at the same share of the steps."""
     values = {"train.steps": steps}
     if isinstance(config.model, TokenModelConfig):
-        values["model.mask.own_frames_after"] = config.model.mask.own_frames_after * steps // config.train.steps
+        values["model.departures.self_conditioning_after"] = (
+            config.model.departures.self_conditioning_after * steps // config.train.steps
+        )
     return with_values(config, values)
 
 
@@ -128,7 +130,7 @@ def train_flops(config: Config) -> int | None:
     if per_clip is None:
         return None
     # A step on own frames needs one more forward pass, a third of a step. It is counted from the first step on.
-    own = config.model.mask.own_frames / 3 if isinstance(config.model, TokenModelConfig) else 0.0
+    own = config.model.departures.self_conditioning / 3 if isinstance(config.model, TokenModelConfig) else 0.0
     return round(config.train.steps * config.train.batch_size * per_clip * (1 + own))
 
 

@@ -73,7 +73,7 @@ def test_own_frames_begin_at_the_same_share_of_fewer_and_more_steps(three_hours:
     small = scale(TINY, 3 * HOUR).base
     genie = three_hours.of("table1", "Genie")[0].config
     assert genie.train.steps > small.train.steps < TINY.train.steps
-    whole, *others = [each.model.mask.own_frames_after / each.train.steps for each in (TINY, small, genie)]  # type: ignore[attr-defined]
+    whole, *others = [each.model.departures.self_conditioning_after / each.train.steps for each in (TINY, small, genie)]  # type: ignore[attr-defined]
     assert whole > 0 and others == pytest.approx([whole] * 2, abs=0.01)
 
 

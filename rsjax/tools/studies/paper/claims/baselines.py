@@ -61,7 +61,7 @@ _FAIR = (
     "operations and measured minutes).",
     "Each family has the best of four learning rates (claim learning-rates).",
     "Genie reads actions through an MLP, as the authors answered a reviewer (W4).",
-    "RoboScape and Genie also learn from moved copies of the clips (model.shifts), the other families do not.",
+    "RoboScape and Genie also learn from moved copies of the clips (model.departures.shifts), the others do not.",
 )
 
 TABLE_1 = register(

@@ -26,7 +26,7 @@ _departure(
     "actions",
     "The network reads the sum of all actions so far",
     "The sum of pose deltas is the pose; a small model in few steps does not find it by temporal attention alone.",
-    {"model.integrate_actions": False},
+    {"model.departures.integrate_actions": False},
     _METRICS,
 )
 _departure(
@@ -61,14 +61,19 @@ _departure(
     "norms",
     "Norms before temporal attention and the heads, smaller embeddings",
     "Small models trained for few steps learn faster with norms that the public Genie lacks.",
-    {"model.temporal_norm": False, "model.final_norm": False, "model.embed_std": 1.0, "model.position_std": 0.0},
+    {
+        "model.departures.temporal_norm": False,
+        "model.departures.final_norm": False,
+        "model.embed_std": 1.0,
+        "model.position_std": 0.0,
+    },
     _METRICS,
 )
 _departure(
     "keypoint-anchor",
     "Eq. 5 pulls towards the code of the true first frame, at masked cells",
     "The paper's anchor ŝ₁ is the output at the prompt, which no cross-entropy trains.",
-    {"model.loss.keypoint_target": "predicted", "model.loss.keypoint_masked_only": False},
+    {"model.departures.observed_anchor": False, "model.departures.masked_keypoints": False},
     ("delta_psnr_uniform", *_METRICS),
 )
 
@@ -76,28 +81,32 @@ _departure(
     "moved-copies",
     "Moved copies of the training clips",
     "A scene that is moved by less than a token has other tokens everywhere, so few clips are not learned by heart.",
-    {"model.shifts": 0},
+    {"model.departures.shifts": 0},
     _METRICS,
 )
 _departure(
     "read-previous",
     "Every frame's input has the tokens of the frame before it",
     "What stays need not be found by temporal attention first.",
-    {"model.read_previous": False, "model.whole_frames": False, "model.mask.own_frames": 0.0},
+    {
+        "model.departures.read_previous": False,
+        "model.departures.whole_frames": False,
+        "model.departures.self_conditioning": 0.0,
+    },
     _METRICS,
 )
 _departure(
     "whole-frames",
     "All cells of every frame masked, instead of a share of them",
     "Decoding in one step begins with no cell of the frame, so training on shares of it asks something else.",
-    {"model.whole_frames": False, "model.mask.own_frames": 0.0},
+    {"model.departures.whole_frames": False, "model.departures.self_conditioning": 0.0},
     _METRICS,
 )
 _departure(
     "own-frames",
     "Frames predicted from the model's own predictions in half of the steps",
     "A rollout reads what the model made, which training on true frames alone never shows it.",
-    {"model.mask.own_frames": 0.0},
+    {"model.departures.self_conditioning": 0.0},
     _METRICS,
 )
 _departure(

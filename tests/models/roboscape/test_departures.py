@@ -1,0 +1,52 @@
+"""Which departures from the paper each preset makes."""
+
+from dataclasses import asdict
+from typing import Any
+
+import pytest
+
+from rsjax.config import Departures, MaskConfig, SampleConfig, TokenModelConfig, presets
+
+FULL_SIZE = ("roboscape_s", "roboscape_m", "roboscape_l", "genie_35m", "genie_138m", "genie_35m_actions")
+KEYPOINTS = {"observed_anchor": True, "masked_keypoints": True, "visible_keypoints": True}
+TINY = KEYPOINTS | {
+    "integrate_actions": True,
+    "read_previous": True,
+    "whole_frames": True,
+    "temporal_norm": True,
+    "final_norm": True,
+    "shifts": 3,
+    "self_conditioning": 0.5,
+    "self_conditioning_after": 500,
+    "mean_codes": True,
+    "read_means": True,
+}
+
+
+def active(model: Any) -> dict[str, Any]:
+    """The departures of a model that are on, those of sampling included."""
+    assert isinstance(model, TokenModelConfig)
+    off = asdict(Departures()) | {"mean_codes": False, "read_means": False, "guidance": 1.0}
+    sampling = {name: getattr(model.sample, name) for name in ("mean_codes", "read_means", "guidance")}
+    values = asdict(model.departures) | sampling
+    return {name: value for name, value in values.items() if value != off[name]}
+
+
+@pytest.mark.parametrize("name", FULL_SIZE)
+def test_a_full_size_preset_has_no_departure(name: str) -> None:
+    model = presets.get(name).model
+    assert isinstance(model, TokenModelConfig)
+    assert model.departures == Departures()
+    assert model.mask == MaskConfig()
+    assert model.sample == SampleConfig()
+    assert active(model) == {}
+
+
+@pytest.mark.parametrize(("name", "departures"), [("debug", KEYPOINTS), ("tiny", TINY), ("multitask", TINY)])
+def test_a_small_preset_has_exactly_these_departures(name: str, departures: dict[str, Any]) -> None:
+    assert active(presets.get(name).model) == departures
+
+
+def test_every_departure_is_off_by_default() -> None:
+    on = {name: value for name, value in asdict(Departures()).items() if value}
+    assert on == {"shift_pixels": 4}  # without effect as long as there are no shifts
