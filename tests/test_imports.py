@@ -39,6 +39,6 @@ def test_the_core_imports_no_tool() -> None:
         f"{name} imports {target}"
         for name, path in core.items()
         for target in sorted(imported(path))
-        if target.startswith(TOOLS) and not name.startswith("rsjax.evaluation")  # its estimators are to move
+        if target.startswith(TOOLS)
     ]
     assert not wrong

@@ -9,11 +9,12 @@ depth), and 8-bit colours keep 766 levels.
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from rsjax.clip import Array
 
 Scale = Literal["linear", "inverse"]
+RELATIVE_FAR = 10.0  # depth of the farthest point of a video whose depth has no unit; the nearest is 1
 
 
 def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale: Scale) -> Float[Array, "*batch 3"]:
@@ -37,6 +38,18 @@ def color_to_depth(color: Float[Array, "*batch 3"], near: float, far: float, sca
     position = color.astype(np.float32).mean(-1) / 255.0
     near_value, far_value = _scaled(near, scale), _scaled(far, scale)
     return _scaled(far_value + position * (near_value - far_value), scale)
+
+
+def stretch(inverse: Float32[np.ndarray, "n H W"], extent: tuple[float, float]) -> Float32[np.ndarray, "n H W"]:
+    """Returns relative depth of 1/depth that is known up to a scale and a shift.
+
+    It is 1 at the greatest value of ``extent``, ``RELATIVE_FAR`` at its least, and even in 1/depth beyond them, up to
+    1000.
+    """
+    low, high = extent
+    position = (inverse - low) / (high - low) if high > low else np.zeros_like(inverse)
+    least = 1 / RELATIVE_FAR
+    return (1 / np.maximum(least + (1 - least) * position, 1e-3)).astype(np.float32)
 
 
 def _scaled(depth: Any, scale: Scale) -> Any:

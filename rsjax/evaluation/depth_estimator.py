@@ -1,63 +1,34 @@
 """Estimates depth from recorded and generated frames by one network, so that models without depth have depth scores."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.config import ConfigError, EvalConfig, require
+from rsjax.data.depth_color import stretch
 from rsjax.evaluation.registry import EstimatedDepth
-from rsjax.files import content_hash
 from rsjax.progress import Progress
-from rsjax.tools.ingest.annotators.choose import choose
-from rsjax.tools.ingest.annotators.depth import inverse_of, stretch
-from rsjax.tools.ingest.annotators.protocols import DepthEstimator, DepthMaps
-from rsjax.tools.ingest.episode import Episode
-from rsjax.tools.ingest.pictures import ArrayFrames
-
-_CAMERA = "rgb"
 
 
-def choose_estimator(settings: EvalConfig, load: bool = False) -> DepthEstimator | None:
-    """Returns the network that ``eval.depth_estimator`` names; None if the setting is empty.
+@dataclass(frozen=True)
+class DepthMaps:
+    """The depth of one video's frames, as a network estimates it.
 
-    Args:
-        load: load the network now, not at its first call.
-
-    Raises:
-        ConfigError: there is no such network or field, or a file that the setting names is missing.
-        AnnotationError: the network cannot be loaded: a package or a device is missing, or a file is damaged.
+    Attributes:
+        maps: z-depth in metres, or 1/depth up to an unknown scale and shift; see ``unit``.
+        unit: of ``maps``.
+        extent: the video's least and greatest value, in the same unit.
     """
-    if not settings.depth_estimator:
-        return None
-    try:
-        estimator = choose("depth", settings.depth_estimator)
-        require(callable(estimator), f"{settings.depth_estimator!r} is no network; choose one of docs/annotate.md")
-        for name, value in vars(estimator).items():
-            require(not isinstance(value, Path) or value.exists(), f"{name} {value} does not exist; mend the path")
-    except ConfigError as error:
-        raise ConfigError(f"eval.depth_estimator: {error}") from error
-    if load:
-        estimator.load()
-    found: DepthEstimator = estimator
-    return found
+
+    maps: Float32[np.ndarray, "T H W"]
+    unit: Literal["metres", "relative 1/depth"]
+    extent: tuple[float, float]
 
 
-def by_content(settings: EvalConfig) -> str:
-    """Returns the network's name and all its fields, with a hash of content for each file; "" without a network.
-
-    In a checkout, which may contain other files than code, only Python files count. The errors are those of
-    :func:`choose_estimator` and :func:`rsjax.files.content_hash`.
-    """
-    estimator = choose_estimator(settings)
-    if estimator is None:
-        return ""
-    fields = []
-    for name, value in vars(estimator).items():
-        content = content_hash(value, "*.py" if name == "checkout" else "*") if isinstance(value, Path) else value
-        fields.append(f"{name}={content}")
-    return f"{settings.depth_estimator.partition(':')[0]}:{','.join(fields)}"
+# Estimates the depth of a video's frames, (T, H, W, 3); raises a UserError if the network cannot run.
+DepthEstimator: TypeAlias = Callable[[UInt8[np.ndarray, "T H W 3"]], DepthMaps]
 
 
 def estimate_depth(
@@ -69,40 +40,21 @@ def estimate_depth(
 
     Some networks estimate 1/depth only up to a scale and a shift, which are arbitrary. Their output for both videos of
     a clip is therefore stretched by the same map: to 1 at the recorded video's nearest point and 10 at its farthest.
-
-    Raises:
-        AnnotationError: the network cannot run, or gives values that are not finite.
     """
     recorded = np.empty(truth.shape[:-1], np.float32)
     generated = {name: np.empty_like(recorded) for name in predictions}
     with Progress("depth estimation", len(truth) * (1 + len(predictions)), "videos") as progress:
-        done = 0
         for clip, frames in enumerate(truth):
-            reference = estimator(_episode(frames, clip), _CAMERA)
-            recorded[clip] = _like(reference, reference)
+            reference = estimator(frames)
+            recorded[clip] = _in_unit_of(reference, reference)
             for name, videos in predictions.items():
-                generated[name][clip] = _like(estimator(_episode(videos[clip], clip), _CAMERA), reference)
-            progress.update(done := done + 1 + len(predictions))
+                generated[name][clip] = _in_unit_of(reference, estimator(videos[clip]))
+            progress.update((clip + 1) * (1 + len(predictions)))
     return {name: EstimatedDepth(recorded, depth) for name, depth in generated.items()}
 
 
-def _like(depth: DepthMaps, reference: DepthMaps) -> Float32[np.ndarray, "T H W"]:
+def _in_unit_of(reference: DepthMaps, depth: DepthMaps) -> Float32[np.ndarray, "T H W"]:
     """Returns the maps in metres, or relative depth stretched by the same map as the reference."""
-    frames = range(len(depth.maps))
     if depth.unit == "metres":
-        return depth.maps.read(frames)
-    return stretch(inverse_of(depth, frames), reference.extent)
-
-
-def _episode(frames: UInt8[np.ndarray, "T H W 3"], clip: int) -> Episode:
-    count = len(frames)
-    return Episode(
-        id=f"evaluation-{clip}",
-        fingerprint="",
-        task="",
-        fps=1.0,  # has no effect on depth
-        timestamps=np.arange(count, dtype=np.float64),
-        actions=np.zeros((count, 0), np.float32),
-        states=None,
-        cameras={_CAMERA: ArrayFrames(frames)},
-    )
+        return depth.maps
+    return stretch(depth.maps, reference.extent)

@@ -19,7 +19,7 @@ from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import Store, StoreError
 from rsjax.devices import replicate
-from rsjax.evaluation.depth_estimator import choose_estimator
+from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.frame_curves import Curves, frame_curves
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced
 from rsjax.evaluation.metrics import delta_psnr, fvd
@@ -32,7 +32,6 @@ from rsjax.files import write_atomically
 from rsjax.models.base import Assets
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
-from rsjax.tools.ingest.annotators.protocols import DepthEstimator
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
@@ -76,7 +75,6 @@ def check_files(settings: EvalConfig) -> None:
             load_lpips(path, net)
     if settings.fvd_weights:
         fvd.check_i3d(settings.fvd_weights)
-    choose_estimator(settings)
 
 
 @dataclass(frozen=True)
@@ -143,6 +141,7 @@ def evaluate(
     protocol: Protocol | None = None,
     held_out: HeldOut | None = None,
     folder: Path | None = None,
+    estimator: DepthEstimator | None = None,
 ) -> Evaluation:
     """Scores a model and two baselines on held-out clips: the last prompt frame repeated, and the reconstruction.
 
@@ -151,6 +150,7 @@ def evaluate(
         protocol: the protocol to evaluate by; None: that of the run's own configuration.
         held_out: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
+        estimator: estimates depth from frames; None: no such scores.
 
     Raises:
         StoreError: a test clip is damaged.
@@ -158,7 +158,6 @@ def evaluate(
     """
     settings = trained.config.eval
     check_files(settings)
-    estimator = choose_estimator(settings, load=True)
     if held_out is None:
         wanted = protocol or of_run(trained.config)
         held_out = HeldOut.read(store, "test", wanted, trained.config.clips)

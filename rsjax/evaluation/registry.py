@@ -33,7 +33,7 @@ class EstimatedDepth:
     """Depth of B clips that one estimator computed from frames.
 
     Attributes:
-        truth: of the recorded frames, > 0, in metres or relative (see :mod:`rsjax.tools.ingest.annotators.depth`).
+        truth: of the recorded frames, > 0, in metres or relative (see :func:`rsjax.data.depth_color.stretch`).
         prediction: of the generated frames, in the same unit.
     """
 

@@ -2,20 +2,18 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from rsjax.config import EvalConfig, to_dict
 from rsjax.data.codec import decode, encode
 from rsjax.data.store import StoreError
-from rsjax.evaluation import depth_estimator
 from rsjax.evaluation.evaluate import Evaluation
 from rsjax.evaluation.frame_curves import Curves
-from rsjax.files import FileError, content_hash, read_json, write_file, write_json
+from rsjax.files import FileError, read_json, write_file, write_json
 
 NAME, FRAMES = "result.json", "frames.msgpack"
 
@@ -109,17 +107,6 @@ def read_frames(folder: Path) -> dict[str, np.ndarray]:
         return decode((folder / FRAMES).read_bytes())
     except (OSError, ValueError) as error:
         raise StoreError(f"{folder / FRAMES}: cannot be read ({error}); evaluate again with --overwrite") from error
-
-
-def by_content(settings: EvalConfig) -> EvalConfig:
-    """Returns the settings with a hash of each file's content in place of its path.
-
-    Raises:
-        UserError: a file cannot be read.
-    """
-    files = {name: value for name, value in to_dict(settings).items() if name.endswith("_weights") and value}
-    hashes: dict[str, Any] = {name: content_hash(Path(value)) for name, value in files.items()}
-    return replace(settings, **hashes, depth_estimator=depth_estimator.by_content(settings))
 
 
 def fingerprint(params: Any) -> str:

@@ -11,14 +11,13 @@ from rsjax.data.clips import Clips, readable, spread
 from rsjax.data.codec import Record
 from rsjax.data.store import Store
 from rsjax.errors import UserError
-from rsjax.evaluation.depth_estimator import estimate_depth
+from rsjax.evaluation.depth_estimator import DepthEstimator, estimate_depth
 from rsjax.evaluation.generation import OWN
 from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.protocols import Protocol
 from rsjax.evaluation.registry import Located, Places, Scene
 from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
-from rsjax.tools.ingest.annotators.protocols import DepthEstimator
 
 LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
 

@@ -19,11 +19,12 @@ from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
-from rsjax.evaluation.results import NAME, by_content, fingerprint, read_result, result_of, write_result
+from rsjax.evaluation.results import NAME, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, lock, safe_id
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
+from rsjax.tools.pipeline.metric_files import by_content, check_metric_files, load_estimator
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.tools.pipeline.run import RECIPE, Run
 from rsjax.tools.pipeline.run_clips import relocated
@@ -77,7 +78,7 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     config = load_config(directory)
     config = relocated(config, request.store) if request.store else config
     config = replace(config, eval=replace(config.eval, **request.settings))
-    evaluation.check_files(config.eval)
+    check_metric_files(config.eval)
     standard = find(request.protocol, config)
     protocol = replace(standard, **request.changes, splits=request.splits or standard.splits)
     trained = _sampling(replace(load(directory), config=config), protocol)
@@ -148,7 +149,8 @@ def _evaluate(
         for old in folder.glob("parts-*"):
             if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
-        found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts)
+        estimator = load_estimator(trained.config.eval)
+        found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts, estimator=estimator)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
         about |= _described(trained, run, store, held_out)
         write_result(folder, result_of(found, **about), found.kept)

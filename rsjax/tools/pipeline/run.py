@@ -250,7 +250,7 @@ def _by_content(settings: EvalConfig) -> EvalConfig:
 
 @cache  # hashing large files takes seconds
 def _hashed(settings: EvalConfig) -> EvalConfig:
-    from rsjax.evaluation.results import by_content  # here, because it loads jax
+    from rsjax.tools.pipeline.metric_files import by_content  # here, because it loads jax
 
     return by_content(settings)
 

@@ -14,6 +14,7 @@ from rsjax.models.load_run import load_tokenizer
 from rsjax.progress import Progress, duration, note, stage
 from rsjax.tools.pipeline.evaluations import evaluate_own
 from rsjax.tools.pipeline.limits import check_batch, check_episodes
+from rsjax.tools.pipeline.metric_files import check_metric_files
 from rsjax.tools.pipeline.provenance import record_data, record_start
 from rsjax.tools.pipeline.run import TRAINED, Run, link
 from rsjax.tools.pipeline.setup import note_curriculum, starting, tokenizer_setup, world_model_setup
@@ -91,7 +92,7 @@ def _check_starts(run: Run) -> None:
     if "world_model" in run.stages and not run.finished("world_model"):
         create_model(cfg).check_files()
     if not run.finished("evaluation"):
-        evaluation.check_files(cfg.eval)
+        check_metric_files(cfg.eval)
 
 
 def _collecting(run: Run) -> str:

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from rsjax.data.depth_color import RELATIVE_FAR, stretch
 from rsjax.tools.ingest.annotators.network import Network, checkout_module, library, load_weights, pretrained
 from rsjax.tools.ingest.annotators.protocols import CHUNK, AnnotationError, DepthMaps, Pictures, in_chunks
 from rsjax.tools.ingest.episode import Depths, Episode, EpisodeError
 
-RELATIVE_FAR = 10.0
 _NEAR_SHARE = 1 / RELATIVE_FAR  # 1/depth of the farthest point, relative to the nearest
 _SIZES: dict[str, dict[str, Any]] = {
     "vits": {"encoder": "vits", "features": 64, "out_channels": [48, 96, 192, 384]},
@@ -108,18 +108,6 @@ def relative_depth(inverse: Float32[np.ndarray, "N H W"]) -> DepthMaps:
     """
     extent = _extent(inverse)
     return DepthMaps(ConvertedDepths(inverse, lambda part: stretch(part, extent)), "relative", extent)
-
-
-def stretch(inverse: Float32[np.ndarray, "n H W"], extent: tuple[float, float]) -> Float32[np.ndarray, "n H W"]:
-    """Returns the relative depth of a network's 1/depth: 1 at the greatest value of ``extent``, ``RELATIVE_FAR`` at its
-    least, and even in 1/depth beyond them, up to 1000.
-    """
-    low, high = extent
-    if high > low:
-        position = (inverse - low) / (high - low)
-    else:
-        position = np.zeros_like(inverse)
-    return (1 / np.maximum(_NEAR_SHARE + (1 - _NEAR_SHARE) * position, 1e-3)).astype(np.float32)
 
 
 def inverse_of(maps: DepthMaps, indices: Sequence[int]) -> Float32[np.ndarray, "n H W"]:

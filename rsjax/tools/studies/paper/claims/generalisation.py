@@ -10,6 +10,7 @@ from rsjax.evaluation.protocols import PROTOCOLS
 from rsjax.evaluation.registry import Unavailable
 from rsjax.models.load_run import load
 from rsjax.progress import Progress
+from rsjax.tools.pipeline.metric_files import load_estimator
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.validation_clips import longer_episodes
 from rsjax.tools.sim.collect import collect, collection_key
@@ -28,9 +29,10 @@ def _by_protocol(run: Run, name: str, store: Store, split: str, draws: int) -> S
     protocol = replace(PROTOCOLS[name], clips=run.config.eval.clips, action_draws=draws, splits=(split,))
     held_out = HeldOut.read(store, split, protocol, run.config.clips)
     parts = run.directory / FOLDER / f"{name}-{split}"
-    scores = evaluate(load(run.directory), run.open_clips(), held_out=held_out, folder=parts).per_clip
+    estimator = load_estimator(run.config.eval)
+    result = evaluate(load(run.directory), run.open_clips(), held_out=held_out, folder=parts, estimator=estimator)
     shutil.rmtree(parts, ignore_errors=True)
-    return scores
+    return result.per_clip
 
 
 def _long_seconds(config: Config) -> float:

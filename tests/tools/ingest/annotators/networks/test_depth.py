@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from rsjax.tools.ingest.annotators.depth import RELATIVE_FAR, DepthAnything, VideoDepthAnything, inverse_of
+from rsjax.data.depth_color import RELATIVE_FAR
+from rsjax.tools.ingest.annotators.depth import DepthAnything, VideoDepthAnything, inverse_of
 from rsjax.tools.ingest.annotators.protocols import AnnotationError
 from tests.tools.ingest.annotators.networks.checkouts import check_out
 from tests.tools.ingest.videos import episode, sliding
