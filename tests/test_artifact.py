@@ -32,6 +32,11 @@ COUNT = """
 """
 
 
+def fail_after(file: Path) -> None:
+    file.touch()
+    raise InterruptedError
+
+
 def start(folder: Path, key: str, killed_at: int, log: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-c", textwrap.dedent(COUNT), str(folder), key, str(killed_at), str(log)]
     return subprocess.Popen(command)
@@ -91,9 +96,9 @@ def test_of_two_processes_one_makes_it_and_the_other_waits(tmp_path: Path) -> No
 
 def test_who_does_not_wait_is_told_who_works_there(tmp_path: Path) -> None:
     folder = tmp_path / "folder"
-    with make_once(folder, "key", refuse=REFUSE), pytest.raises(FileError, match="is making it; wait"):
-        with make_once(folder, "key", refuse=REFUSE):
-            raise AssertionError("two work in one folder")
+    second = make_once(folder, "key", refuse=REFUSE)
+    with make_once(folder, "key", refuse=REFUSE), pytest.raises(FileError, match="is making it; wait"), second:
+        raise AssertionError("two work in one folder")
     assert lock_file(folder).exists()
 
 
@@ -117,9 +122,9 @@ def test_seconds_add_up_and_finished_work_can_be_done_again(tmp_path: Path) -> N
 
 def test_a_temporary_folder_goes_when_its_work_ends_and_stays_when_it_fails(tmp_path: Path) -> None:
     folder = tmp_path / "out.partial"
-    with pytest.raises(InterruptedError), make_once(folder, "key", refuse=None, temporary=True):
-        (folder / "clip").touch()
-        raise InterruptedError
+    first = make_once(folder, "key", refuse=None, temporary=True)
+    with pytest.raises(InterruptedError), first as work:
+        fail_after(work.folder / "clip")
     assert (folder / "clip").exists()
     with make_once(folder, "key", refuse=None, temporary=True):
         assert (folder / "clip").exists()
