@@ -96,7 +96,7 @@ def tokenize(options: Tokenize) -> list[Any]:
 
     config, clips = load_config(options.run), open_store(options.store)
     assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # normalization of these clips
-    prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.train.max_damaged)
+    prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.runtime.max_damaged)
     if prepared is None:
         raise ConfigError(f"{options.run}: a model of family {config.model.family!r} has no tokens")
     return [prepared]

@@ -24,10 +24,6 @@ class Options:
     """Resume an interrupted stage from its checkpoints; --no-resume starts the stage over."""
     overwrite: bool = False
     """Train stages of the run directory again if they were trained with another configuration."""
-    wandb: str = ""
-    """Log to this Weights & Biases project as well; WANDB_MODE=offline keeps it on disk."""
-    profile: int = 0
-    """Number of steps of each training stage to trace; the trace is written into the stage's directory."""
     coordinator: str = ""
     """HOST:PORT of process 0 to train on several hosts; not needed with Slurm, Open MPI or TPU pods."""
     processes: int | None = None
@@ -41,7 +37,6 @@ def main() -> None:
     """Runs all unfinished stages."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Collects episodes, trains, generates, evaluates, reports.", Options())
-    config = config.with_loops(**{n: value for n in ("wandb", "profile") if (value := getattr(options, n))})
     # JAX is imported only after the arguments are checked.
     from rsjax.training import distributed
 

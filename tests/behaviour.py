@@ -80,9 +80,9 @@ def curve(directory: Path) -> dict[str, dict[str, float]]:
 
 def tiny(place: Path) -> dict[str, Any]:
     """Trains ``tiny`` for 100 steps per stage on few episodes, and returns both training curves."""
-    short = [f"--{section}.{field}" for section in SECTIONS for field in ("steps=100", "log-every=1")]
+    short = [*(f"--{section}.steps=100" for section in SECTIONS), "--runtime.log-every=1"]
     few = ["--sim.episodes=40", "--sim.test-episodes=4", "--eval.clips=2", "--eval.action-draws=1"]
-    off = ["--tokenizer-train.eval-every=0", "--train.eval-every=0"]
+    off = ["--runtime.eval-every=0"]
     run("train", "tiny", "--run-dir", f"{place}/tiny", "--data-dir", f"{place}/data", *short, *few, *off)
     return {stage: curve(place / "tiny" / stage) for stage in ("tokenizer", "world_model")}
 

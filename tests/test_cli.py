@@ -97,7 +97,7 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         ([], "name a preset first"),
         (["--train.steps", "3"], "name a preset first"),
         (["tiny", "--train.stps", "3"], "did you mean '--train.steps'?"),
-        (["tiny", "--log-every", "3"], "did you mean '--tokenizer-train.log-every' or '--train.log-every'?"),
+        (["tiny", "--log-every", "3"], "did you mean '--runtime.log-every'?"),
         (["tiny", "--rundir", "x"], "did you mean '--run-dir'?"),
         (["tiny", "extra"], "unknown argument 'extra'"),
         (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),

@@ -135,7 +135,7 @@ def make_adamw(params: Iterable[nn.Parameter], optimizer: OptimizerConfig) -> An
     return torch.optim.AdamW(
         params,
         lr=optimizer.learning_rate,
-        betas=(optimizer.beta1, optimizer.beta2),
+        betas=optimizer.betas,
         weight_decay=optimizer.weight_decay,
     )
 

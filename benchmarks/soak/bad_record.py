@@ -68,6 +68,6 @@ def _target(soak: Soak, run: Path, interval: float) -> Target:
     records = len(open_store(run / "tokens" / "store").source("train"))
     steps = math.ceil(records / soak.config.train.batch_size) + 1
     few = () if soak.config.train.curriculum else ("--train.steps", str(steps))
-    every = ("--train.log-every", "1", "--train.checkpoint-every", str(max(1, steps // 4)))
+    every = ("--runtime.log-every", "1", "--runtime.checkpoint-every", str(max(1, steps // 4)))
     command = soak.command(run, soak.options.data_dir, *few, *every)
     return Target(command, (Stage(run / "world_model"),), run.with_name(f"{run.name}.log"), interval)

@@ -19,7 +19,6 @@ from rsjax.training.log import read_log
 
 CHECKPOINTS = 40  # of a run with faults, by default
 NEVER_STOPPED = "never-stopped"  # a file in a reference that was made here, once it is complete
-SECTIONS = {"tokenizer": "tokenizer-train", "world_model": "train"}  # of the configuration, by stage
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Options:
     reference: Path | None = None
     """A finished run of the same configuration that was never stopped; made first if not given."""
     checkpoint_every: int = 0
-    """Steps between the checkpoints of runs with faults; 0: a fortieth of the run."""
+    """Steps between the checkpoints of runs with faults; 0: a fortieth of the shorter training."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +117,7 @@ def make_reference(soak: Soak, show: Callable[[str], None]) -> None:
     for stage in soak.stages:
         shutil.rmtree(folder / stage, ignore_errors=True)
     show(f"the reference: one run without faults, in {folder}")
-    every_step = [word for stage in soak.trained for word in (f"--{SECTIONS[stage]}.log-every", "1")]
-    command = soak.command(folder, soak.options.data_dir, "--no-resume", *every_step)
+    command = soak.command(folder, soak.options.data_dir, "--no-resume", "--runtime.log-every", "1")
     stages = tuple(Stage(folder / stage) for stage in soak.stages)
     run_without_faults(Target(command, stages, soak.out / "reference.log", to_the_end=soak.stages == soak.all_stages))
     (folder / NEVER_STOPPED).touch()
@@ -132,11 +130,10 @@ def prepare(soak: Soak, place: Path) -> Target:
         copy_tree(soak.reference / stage, run / stage)
     place.mkdir(parents=True, exist_ok=True)
     saved = json.loads((soak.reference / "config.json").read_text())
-    flags: list[str] = []
-    for stage in soak.trained:
-        every = soak.options.checkpoint_every or max(1, last_logged(soak.reference / stage) // CHECKPOINTS)
-        logged = saved[SECTIONS[stage].replace("-", "_")]["log_every"]
-        flags += [f"--{SECTIONS[stage]}.checkpoint-every", str(every), f"--{SECTIONS[stage]}.log-every", str(logged)]
+    logged = saved["runtime"]["log_every"]
+    shortest = min(last_logged(soak.reference / stage) for stage in soak.trained)
+    every = soak.options.checkpoint_every or max(1, shortest // CHECKPOINTS)
+    flags = ("--runtime.checkpoint-every", str(every), "--runtime.log-every", str(logged))
     seconds = step_seconds(soak.reference / soak.trained[-1])
     reference = Run(soak.config, soak.reference, soak.options.data_dir)
     return Target(

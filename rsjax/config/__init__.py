@@ -33,7 +33,14 @@ from rsjax.config.token_model import (
     TransformerConfig,
 )
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from rsjax.config.train import ComponentConfig, CurriculumStageConfig, LoopConfig, OptimizerConfig
+from rsjax.config.train import (
+    ComponentConfig,
+    CurriculumStageConfig,
+    LoopConfig,
+    OptimizerConfig,
+    RuntimeConfig,
+    TrainConfig,
+)
 
 __all__ = [
     "ClipShape",
@@ -51,11 +58,13 @@ __all__ = [
     "ModelConfig",
     "OptimizerConfig",
     "RoboScapeConfig",
+    "RuntimeConfig",
     "SampleConfig",
     "SimConfig",
     "TokenModelConfig",
     "TokenizerConfig",
     "TokenizerTrainConfig",
+    "TrainConfig",
     "TransformerConfig",
     "check_numbers",
     "content_key",

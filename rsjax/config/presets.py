@@ -8,15 +8,16 @@ from rsjax.config import (
     Departures,
     EvalConfig,
     GenieConfig,
-    LoopConfig,
     LossConfig,
     MaskConfig,
     OptimizerConfig,
     RoboScapeConfig,
+    RuntimeConfig,
     SampleConfig,
     SimConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
+    TrainConfig,
 )
 from rsjax.config.curriculum import parse_stage
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
@@ -40,7 +41,7 @@ def debug() -> Config:
             norm_groups=8,
             code_bits=8,
         ),
-        tokenizer_train=TokenizerTrainConfig(steps=6, batch_size=2, log_every=2, checkpoint_every=3),
+        tokenizer_train=TokenizerTrainConfig(steps=6, batch_size=2),
         model=RoboScapeConfig(
             width=32,
             blocks=2,
@@ -48,7 +49,8 @@ def debug() -> Config:
             departures=Departures(observed_anchor=True, masked_keypoints=True, visible_keypoints=True),
             loss=LossConfig(num_keypoints=8),
         ),
-        train=LoopConfig(steps=4, batch_size=2, log_every=2, checkpoint_every=2),
+        train=TrainConfig(steps=4, batch_size=2),
+        runtime=RuntimeConfig(log_every=2, checkpoint_every=2),
         eval=EvalConfig(clips=2, batch_size=2, action_draws=1, report_clips=2, localiser_steps=10),
     )
 
@@ -86,9 +88,6 @@ def tiny() -> Config:
             entropy_weight=0.01,
             entropy_offset=0.0,  # the true entropy, with which these weights were chosen
             commitment_weight=0.1,
-            sharding="jit",
-            checkpoint_every=500,
-            eval_every=550,
         ),
         model=RoboScapeConfig(
             width=128,
@@ -115,15 +114,14 @@ def tiny() -> Config:
             mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
             sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
         ),
-        train=LoopConfig(
+        train=TrainConfig(
             steps=1700,
             batch_size=4,
             accumulate=2,  # half the memory, and 0.46 s instead of 0.57 s a step (notebooks/cpu-performance.md)
             optimizer=OptimizerConfig(kind="muon", learning_rate=5e-3, final_share=0.02),
             ema=0.995,
-            checkpoint_every=500,
-            eval_every=1000,
         ),
+        runtime=RuntimeConfig(checkpoint_every=500, eval_every=1000),
         eval=EvalConfig(clips=100, batch_size=20, report_clips=6),
     )
 
@@ -201,27 +199,22 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             batch_size=64,
             frames_per_clip=4,
             optimizer=OptimizerConfig(
-                warmup_steps=0, schedule="steps", drop_at=(200 / 270, 250 / 270), beta1=0.5, beta2=0.9, grad_clip=0.0
+                warmup_steps=0, schedule="steps", drop_at=(200 / 270, 250 / 270), betas=(0.5, 0.9), grad_clip=0.0
             ),
             ema=0.999,
             flip=True,
             perceptual_weight=1.0,
             entropy_group=8,
             adversarial_weight=0.1,
-            log_every=100,
-            checkpoint_every=5000,
-            eval_every=5000,
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
-        train=LoopConfig(
+        train=TrainConfig(
             steps=127_000,
             curriculum=tuple(map(parse_stage, curriculum)),
             batch_size=256,
-            optimizer=OptimizerConfig(beta2=0.999, schedule="linear", final_share=0.0),
-            log_every=100,
-            checkpoint_every=1000,
-            eval_every=5000,
+            optimizer=OptimizerConfig(betas=(0.9, 0.999), schedule="linear", final_share=0.0),
         ),
+        runtime=RuntimeConfig(log_every=100, checkpoint_every=1000, eval_every=5000),
         eval=FULL_SIZE_EVAL,
     )
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from rsjax.config.data import ClipShape, DataConfig
 from rsjax.config.fields import check_numbers, require, require_range
@@ -10,7 +10,7 @@ from rsjax.config.model import ModelConfig, converted
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import RoboScapeConfig
 from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from rsjax.config.train import LoopConfig
+from rsjax.config.train import LoopConfig, RuntimeConfig, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Config:
     tokenizer: TokenizerConfig = TokenizerConfig()  # ignored by a model without tokens or with its own autoencoder
     tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
     model: ModelConfig = RoboScapeConfig()
-    train: LoopConfig = LoopConfig()
+    train: TrainConfig = TrainConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
     eval: EvalConfig = EvalConfig()
 
     def __post_init__(self) -> None:
@@ -84,10 +85,10 @@ class Config:
             self.tokenizer.grid(clips.image_size)
         self.model.check(clips)
 
-    def with_loops(self, **changes: Any) -> "Config":
-        """Returns this configuration with changed fields in both training loops."""
-        tokenizer_train = replace(self.tokenizer_train, **changes)
-        return replace(self, train=replace(self.train, **changes), tokenizer_train=tokenizer_train)
+    def loop(self, stage: Literal["tokenizer", "world_model"]) -> LoopConfig:
+        """Returns the settings of a stage's training loop."""
+        train = self.tokenizer_train if stage == "tokenizer" else self.train
+        return LoopConfig.create(train, self.runtime)
 
     def with_family(self, name: str) -> "Config":
         """Returns this configuration with a model of another family, which keeps the fields that both have.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rsjax.config.fields import fitting_sizes, require, require_range
-from rsjax.config.train import LoopConfig
+from rsjax.config.train import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class TokenizerConfig:
 
 
 @dataclass(frozen=True)
-class TokenizerTrainConfig(LoopConfig):
+class TokenizerTrainConfig(TrainConfig):
     """Settings of the tokenizer's training. The defaults are the reference's, without LPIPS and discriminator.
 
     ``batch_size`` counts clips; ``frames_per_clip`` frames are drawn from each. A field ``NAME_weight`` weighs the

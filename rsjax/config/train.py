@@ -1,7 +1,7 @@
 """Settings of the training loop and its optimizer."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from rsjax.config.fields import require, require_range, runtime
@@ -19,13 +19,11 @@ class OptimizerConfig:
     learning_rate: float = 1e-4
     warmup_steps: int = 50
     # cosine and linear decay from the peak to final_share of it; wsd (warm-up, stable, decay) decays only in the last
-    # decay_share of the run; steps divides by 10 at each share in drop_at. The public Genie uses linear.
+    # fifth of the run; steps divides by 10 at each share in drop_at. The public Genie uses linear.
     schedule: Literal["cosine", "linear", "wsd", "steps"] = "cosine"
     final_share: float = 0.05  # the end of cosine, linear and wsd, as a share of the peak
-    decay_share: float = 0.2  # wsd: the share of the run that decays
     drop_at: tuple[float, ...] = ()  # steps: shares of the run at which the rate is divided by 10
-    beta1: float = 0.9
-    beta2: float = 0.95
+    betas: tuple[float, float] = (0.9, 0.95)  # decay of the averages of gradients and of their squares
     weight_decay: float = 0.0
     grad_clip: float = 1.0  # 0: none
 
@@ -34,13 +32,13 @@ class OptimizerConfig:
             all(0 < share < 1 for share in self.drop_at),
             f"optimizer.drop_at is {self.drop_at}; its entries are shares of the run, between 0 and 1",
         )
-        require(
-            0 < self.decay_share <= 1,
-            f"optimizer.decay_share is {self.decay_share}; it is a share of the run, above 0 and at most 1",
-        )
         amounts = ("learning_rate", "warmup_steps", "weight_decay", "grad_clip")
         require_range(self, "optimizer", 0, math.inf, *amounts)
-        require_range(self, "optimizer", 0, 1, "final_share", "beta1", "beta2")
+        require_range(self, "optimizer", 0, 1, "final_share")
+        require(
+            len(self.betas) == 2 and all(0 <= beta <= 1 for beta in self.betas),
+            f"optimizer.betas are {self.betas}; they are two numbers, each 0 … 1",
+        )
 
 
 @dataclass(frozen=True)
@@ -85,8 +83,8 @@ class CurriculumStageConfig:
 
 
 @dataclass(frozen=True)
-class LoopConfig:
-    """Settings of a training loop, shared by the tokenizer's and the world model's."""
+class TrainConfig:
+    """Settings of a training that decide its result, shared by the tokenizer's and the world model's."""
 
     steps: int = 1000
     batch_size: int = 8  # over all devices
@@ -100,36 +98,72 @@ class LoopConfig:
     # a change of it). Empty: all clips of this run for ``steps`` steps. rsjax/config/curriculum.py says how a stage is
     # written on the command line.
     curriculum: tuple[CurriculumStageConfig, ...] = ()
-    restarts: tuple[int, ...] = ()  # steps at which the learning rate schedule starts again; set by stages
-    # How many steps with a loss or gradient that is not finite are skipped before training stops.
-    skip_budget: int = runtime(10)
-    log_every: int = runtime(20)
-    checkpoint_every: int = runtime(200)
-    keep_last: int = runtime(2)  # keep this many of the newest checkpoints …
-    keep_every: int = runtime(0)  # … those at multiples of this many steps (0: none) …
-    keep_best: bool = runtime(True)  # … and the one with the best validation loss, if eval_every is on
+    accumulate: int = runtime(1)  # parts of a batch computed one after another; raise it where memory runs out
+
+    def __post_init__(self) -> None:
+        require_range(self, "training", int(not self.start_from), 2**31 - 1, "steps")
+        require_range(self, "training", 1, math.inf, "batch_size", "accumulate")
+        require_range(self, "training", 0, 1, "ema")
+        require(
+            self.batch_size % self.accumulate == 0,
+            f"batch_size {self.batch_size} does not divide into accumulate = {self.accumulate} parts; change one",
+        )
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """How the trainings of a run are computed, logged and saved; nothing here changes their results."""
+
+    log_every: int = runtime(20)  # steps
+    checkpoint_every: int = runtime(200)  # steps
     eval_every: int = runtime(0)  # steps between validations, with pictures; 0: none
-    accumulate: int = runtime(1)  # parts of a batch computed one after another: less memory, same step
     # jit: one device. pmap: data parallel. mesh: jit over a mesh of data × fsdp devices, with parameters and optimizer
     # state split into ``fsdp`` parts. pmap and mesh use all devices of all hosts. auto: pmap over as many local devices
     # as divide the batch; mesh with several hosts.
     sharding: Literal["auto", "jit", "pmap", "mesh"] = runtime("auto")
-    fsdp: int = runtime(1)
+    fsdp: int = runtime(1)  # parts of the state, with sharding mesh; raise it where the state does not fit a device
     workers: int = runtime(0)  # processes that read and prepare batches; 0: threads
-    max_damaged: float = runtime(0.01)  # share of the records that may be damaged
+    max_damaged: float = runtime(0.01)  # share of the records that may be damaged before training stops
     wandb: str = runtime("")  # Weights & Biases project; empty: TensorBoard only
     profile: int = runtime(0)  # number of steps to trace after each start, into ``profile`` in the stage's directory
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "log_every", "checkpoint_every", "keep_last", "accumulate", "fsdp"):
-            value = getattr(self, name)
-            least = 0 if name == "steps" and self.start_from else 1
-            require(value >= least, f"{name} of a training loop is {value}; it must be at least {least}")
-        for name in ("skip_budget", "keep_every", "eval_every", "workers", "profile"):
-            require(getattr(self, name) >= 0, f"{name} of a training loop is {getattr(self, name)}; it is at least 0")
-        for name in ("ema", "max_damaged"):
-            require(0 <= getattr(self, name) <= 1, f"{name} of a training loop is {getattr(self, name)}; it is 0 … 1")
-        require(self.steps < 2**31, f"steps of a training loop are {self.steps}; their counter ends at {2**31 - 1}")
+        require_range(self, "runtime", 1, math.inf, "log_every", "checkpoint_every", "fsdp")
+        require_range(self, "runtime", 0, math.inf, "eval_every", "workers", "profile")
+        require_range(self, "runtime", 0, 1, "max_damaged")
+        require(
+            self.fsdp == 1 or self.sharding == "mesh",
+            f"runtime.fsdp is {self.fsdp}, which needs runtime.sharding mesh; it is {self.sharding}",
+        )
+
+
+@dataclass(frozen=True)
+class LoopConfig(RuntimeConfig, TrainConfig):
+    """Everything that one training loop needs; ``Config.loop`` joins the settings of a stage with those of the run.
+
+    Attributes:
+        restarts: steps at which the learning rate schedule starts again; the curriculum's stages set them.
+        skip_budget: how many steps with a loss or gradient that is not finite are skipped before training stops.
+        keep_last, keep_every, keep_best: the checkpoints that stay: the newest ones, those at multiples of so many
+            steps (0: none), and the one with the best validation loss, if there are validations.
+    """
+
+    restarts: tuple[int, ...] = ()
+    skip_budget: int = runtime(10)
+    keep_last: int = runtime(2)
+    keep_every: int = runtime(0)
+    keep_best: bool = runtime(True)
+
+    @classmethod
+    def create(cls, train: TrainConfig, runtime: RuntimeConfig = RuntimeConfig()) -> "LoopConfig":
+        """Joins the settings of a stage's training with those of the run."""
+        return cls(**{field.name: getattr(train, field.name) for field in fields(TrainConfig)}, **vars(runtime))
+
+    def __post_init__(self) -> None:
+        RuntimeConfig.__post_init__(self)
+        TrainConfig.__post_init__(self)
+        require_range(self, "loop", 1, math.inf, "keep_last")
+        require_range(self, "loop", 0, math.inf, "skip_budget", "keep_every")
         require(
             list(self.restarts) == sorted(set(self.restarts)) and all(step > 0 for step in self.restarts),
             f"restarts of a training loop are {self.restarts}; they are steps above 0, in their order",
@@ -137,12 +171,4 @@ class LoopConfig:
         require(
             max(self.restarts, default=-1) < self.steps,
             f"restarts of a training loop are {self.restarts}; they lie before its end, steps = {self.steps}",
-        )
-        require(
-            self.batch_size % self.accumulate == 0,
-            f"batch_size {self.batch_size} does not divide into accumulate = {self.accumulate} parts; change one",
-        )
-        require(
-            self.fsdp == 1 or self.sharding == "mesh",
-            f"fsdp is {self.fsdp}, which needs sharding mesh; sharding is {self.sharding}",
         )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
+from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig, TrainConfig
 from rsjax.config.curriculum import format_stage
 from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
@@ -83,7 +83,7 @@ def plan(
     return loop, LoaderFactory(loop, tuple(resolved), directory / NAME)
 
 
-def check_stages(loop: LoopConfig, own: Store) -> list[Store]:
+def check_stages(train: TrainConfig, own: Store) -> list[Store]:
     """Checks early that the stages' stores exist and, if they are labelled, that some record passes the patterns.
 
     Returns:
@@ -93,7 +93,7 @@ def check_stages(loop: LoopConfig, own: Store) -> list[Store]:
         StoreError: as from :func:`plan`.
     """
     others = []
-    for part in (part for stage in loop.curriculum for part in stage.components):
+    for part in (part for stage in train.curriculum for part in stage.components):
         store = open_store(part.store) if part.store else own
         others += [store] if part.store else []
         if store.labelled(SPLIT):

@@ -111,7 +111,7 @@ def count(shapes: Shapes) -> int:
 
 
 def _train_state_bytes(config: Config, params: Shapes) -> int:
-    optimizer = jax.eval_shape(make_optimizer(config.train).init, params)
+    optimizer = jax.eval_shape(make_optimizer(config.loop("world_model")).init, params)
     copies = 3 if config.train.ema else 2  # parameters, gradients, averages
     return copies * _bytes(params) + _bytes(optimizer)
 

@@ -207,9 +207,9 @@ class _Training:
             note(f"step {done.step} is skipped ({norms}): {skips} of at most {allowed}")
         if skips > allowed:
             raise DivergedError(
-                f"{self.directory}: {skips} steps were not finite, more than skip_budget = {allowed} (the last was "
-                f"step {done.step}, loss {scalars['loss']}); {SKIPPED} lists their batches; raise skip_budget and "
-                f"start again, or train anew with a lower optimizer.learning-rate and --overwrite"
+                f"{self.directory}: {skips} steps were not finite, more than {allowed} (the last was "
+                f"step {done.step}, loss {scalars['loss']}); {SKIPPED} lists their batches; "
+                f"train anew with a lower optimizer.learning-rate and --overwrite"
             )
 
     def _validate(self, state: TrainState, step: int, log: ScalarLog | None) -> Validation:

@@ -31,6 +31,9 @@ class TrainState:
         return self.params if self.ema is None else self.ema
 
 
+DECAY_SHARE = 0.2  # the share of a run in which the schedule wsd decays
+
+
 def learning_rate(loop: LoopConfig) -> optax.Schedule:
     """Returns the learning rate schedule with warm-up, which starts again at each of ``loop.restarts``."""
     begins = [0, *loop.restarts]
@@ -48,7 +51,7 @@ def _schedule(opt: OptimizerConfig, steps: int) -> optax.Schedule:
         drops = optax.piecewise_constant_schedule(peak, {round(share * steps): 0.1 for share in opt.drop_at})
         return lambda step: drops(step) * jnp.minimum(1.0, step / warmup if warmup else 1.0)
     rise = optax.linear_schedule(0.0, peak, warmup)
-    fall = max(1, steps - warmup if opt.schedule == "linear" else round(opt.decay_share * steps))
+    fall = max(1, steps - warmup if opt.schedule == "linear" else round(DECAY_SHARE * steps))
     begin = max(warmup, steps - fall)
     fall = max(1, steps - begin)
     parts = [rise, optax.constant_schedule(peak), optax.linear_schedule(peak, low, fall)]
@@ -62,14 +65,14 @@ def make_optimizer(loop: LoopConfig) -> optax.GradientTransformation:
         inner = optax.contrib.muon(
             learning_rate(loop),
             weight_decay=opt.weight_decay,
-            adam_b1=opt.beta1,
-            adam_b2=opt.beta2,
+            adam_b1=opt.betas[0],
+            adam_b2=opt.betas[1],
             adam_weight_decay=opt.weight_decay,
             muon_weight_dimension_numbers=_matrices,
             consistent_rms=0.2,
         )
     else:
-        inner = optax.adamw(learning_rate(loop), opt.beta1, opt.beta2, weight_decay=opt.weight_decay)
+        inner = optax.adamw(learning_rate(loop), *opt.betas, weight_decay=opt.weight_decay)
     return optax.chain(optax.clip_by_global_norm(opt.grad_clip) if opt.grad_clip else optax.identity(), inner)
 
 

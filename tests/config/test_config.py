@@ -106,14 +106,18 @@ def test_a_stored_configuration_is_fields_by_name_and_may_lack_some() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("train.seed", "3", "LoopConfig.seed must be a whole number; it is '3'"),
-        ("train.steps", True, "LoopConfig.steps must be a whole number; it is True"),
-        ("train.steps", 2.0, "LoopConfig.steps must be a whole number; it is 2.0"),
-        ("train.steps", None, "LoopConfig.steps must be a whole number; it is None"),
-        ("train.keep_best", 1, "LoopConfig.keep_best must be true or false; it is 1"),
-        ("train.ema", "0.9", "LoopConfig.ema must be a number; it is '0.9'"),
-        ("train.sharding", "ring", "LoopConfig.sharding must be one of auto, jit, pmap, mesh; it is 'ring'"),
-        ("train.restarts", [1, "2"], "LoopConfig.restarts must be a whole number; it is '2'"),
+        ("train.seed", "3", "TrainConfig.seed must be a whole number; it is '3'"),
+        ("train.steps", True, "TrainConfig.steps must be a whole number; it is True"),
+        ("train.steps", 2.0, "TrainConfig.steps must be a whole number; it is 2.0"),
+        ("train.steps", None, "TrainConfig.steps must be a whole number; it is None"),
+        ("tokenizer_train.flip", 1, "TokenizerTrainConfig.flip must be true or false; it is 1"),
+        ("train.ema", "0.9", "TrainConfig.ema must be a number; it is '0.9'"),
+        ("runtime.sharding", "ring", "RuntimeConfig.sharding must be one of auto, jit, pmap, mesh; it is 'ring'"),
+        (
+            "tokenizer.channel_multipliers",
+            [1, "2"],
+            "TokenizerConfig.channel_multipliers must be a whole number; it is '2'",
+        ),
         ("sim.camera", ["front"], r"SimConfig.camera must be text; it is \['front'\]"),
         ("name", {}, "Config.name must be text; it is {}"),
         ("model.family", 3, "model has no family"),
@@ -142,14 +146,13 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("train.optimizer", {"learning_rate": math.nan}, "optimizer.learning_rate is nan"),
         ("train.optimizer", {"learning_rate": math.inf}, "train.optimizer.learning_rate is inf; it must be a finite"),
         ("train.optimizer", {"learning_rate": -1e-3}, "optimizer.learning_rate is -0.001; it must be at least 0"),
-        ("train.optimizer", {"beta1": 1.5}, "optimizer.beta1 is 1.5; it must be 0 … 1"),
+        ("train.optimizer", {"betas": (0.9, 1.5)}, "optimizer.betas are (0.9, 1.5); they are two numbers"),
         ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
         ("model.mask", {"corruption_decay": -math.inf}, "model.mask.corruption_decay is -inf; it must be a finite"),
-        ("train", {"ema": math.nan}, "ema of a training loop is nan; it is 0 … 1"),
-        ("train", {"steps": 20, "restarts": (50,)}, "are (50,); they lie before its end, steps = 20"),
-        ("train", {"max_damaged": 2.0}, "max_damaged of a training loop is 2.0"),
-        ("train", {"log_every": 2**63}, "train.log_every is 9223372036854775808; it must fit in 64 bits"),
-        ("", {"train": c.LoopConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),
+        ("train", {"ema": math.nan}, "training.ema is nan; it must be 0 … 1"),
+        ("runtime", {"max_damaged": 2.0}, "runtime.max_damaged is 2.0; it must be 0 … 1"),
+        ("runtime", {"log_every": 2**63}, "runtime.log_every is 9223372036854775808; it must fit in 64 bits"),
+        ("", {"train": c.TrainConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),
         ("tokenizer", {"vocabularies": 0}, "tokenizer.vocabularies is 0; it must be at least 1"),
         ("tokenizer", {"norm_groups": 0}, "tokenizer.norm_groups is 0; it must be at least 1"),
         ("tokenizer", {"channel_multipliers": ()}, "tokenizer.channel_multipliers are ()"),
@@ -210,11 +213,17 @@ def test_more_keypoints_than_tracks_are_fine() -> None:
     assert with_values(BASE, {"model.loss.num_keypoints": 65}).clips.tracks == 64
 
 
-def test_both_training_loops_are_set_alike_and_nothing_else_changes() -> None:
-    before = presets.debug()
-    after = before.with_loops(profile=3, wandb="robots")
-    assert (after.train.profile, after.tokenizer_train.wandb) == (3, "robots")
-    assert after.with_loops(profile=0, wandb="") == before
+def test_a_loop_has_its_own_settings_and_those_that_both_share() -> None:
+    config = with_values(presets.debug(), {"runtime.profile": 3, "train.seed": 5, "tokenizer_train.steps": 7})
+    loops = [config.loop(stage) for stage in ("tokenizer", "world_model")]
+    assert [(loop.steps, loop.seed, loop.profile) for loop in loops] == [(7, 0, 3), (4, 5, 3)]
+
+
+def test_the_schedule_of_a_loop_restarts_within_its_steps_in_their_order() -> None:
+    with pytest.raises(c.ConfigError, match="they lie before its end, steps = 20"):
+        c.LoopConfig(steps=20, restarts=(50,))
+    with pytest.raises(c.ConfigError, match="they are steps above 0, in their order"):
+        c.LoopConfig(steps=20, restarts=(10, 5))
 
 
 def test_the_paper_s_loss_weights() -> None:

@@ -25,7 +25,7 @@ def test_config_fields_are_the_configurations_json_by_dotted_names() -> None:
     for name, field in known.items():
         assert saved[name] == (list(field.value) if isinstance(field.value, tuple) else field.value)
     assert set(saved) - set(known) == {"model.family"}
-    assert known["train.log_every"].runtime
+    assert known["runtime.log_every"].runtime
     assert not known["train.steps"].runtime
 
 

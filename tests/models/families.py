@@ -7,7 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, GenieConfig, LoopConfig
+from rsjax.config import ComponentConfig, Config, CurriculumStageConfig, GenieConfig, RuntimeConfig, TrainConfig
+from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.bench import inputs
 from tests.models.cogvideox import toy as toy_cogvideox
@@ -15,13 +16,14 @@ from tests.models.irasim import toy as toy_irasim
 from tests.models.ivideogpt import toy as toy_ivideogpt
 from tests.tools.pipeline import toy
 
-LOOP: dict[str, Any] = {"steps": 4, "batch_size": 2, "checkpoint_every": 2, "log_every": 1, "ema": 0.9, "eval_every": 4}
+TRAIN: dict[str, Any] = {"steps": 4, "batch_size": 2, "ema": 0.9}
+RUNTIME = RuntimeConfig(log_every=1, checkpoint_every=2, eval_every=4)
 
 
 def engine(config: Config) -> Config:
     """The configuration with two short trainings."""
-    tokenizer = replace(config.tokenizer_train, **LOOP, frames_per_clip=3, depth_share=0.0)
-    return replace(config, tokenizer_train=tokenizer, train=LoopConfig(**LOOP))
+    tokenizer = replace(config.tokenizer_train, **TRAIN, frames_per_clip=3, depth_share=0.0)
+    return replace(config, tokenizer_train=tokenizer, train=TrainConfig(**TRAIN), runtime=RUNTIME)
 
 
 def genie() -> Config:
@@ -42,7 +44,7 @@ def ivideogpt() -> Config:
 def irasim() -> Config:
     """IRASim with an autoencoder of its own, whose batches are accumulated."""
     base = engine(toy_irasim.config(integrate_actions=True))
-    return base.with_loops(accumulate=2)
+    return with_values(base, {"train.accumulate": 2, "tokenizer_train.accumulate": 2})
 
 
 def cogvideox() -> Config:

@@ -10,7 +10,7 @@ import pytest
 
 import rsjax
 from rsjax.clip import Video
-from rsjax.config import Config, LoopConfig, ModelConfig, register_family
+from rsjax.config import Config, ModelConfig, RuntimeConfig, TrainConfig, register_family
 from rsjax.config.model import FAMILIES
 from rsjax.errors import UserError
 from rsjax.models.base import MODELS, WorldModel, implements
@@ -118,10 +118,12 @@ def config(tmp_path: Path) -> Iterator[Config]:
             return codec.decode({"mean": np.repeat(last, actions.shape[1], 1)}, None)
 
     base = toy.config()
-    loop = LoopConfig(steps=4, batch_size=2, log_every=2, eval_every=4)
-    small = replace(base.tokenizer_train, steps=4, batch_size=2, eval_every=4)
+    train = TrainConfig(steps=4, batch_size=2)
+    small = replace(base.tokenizer_train, steps=4, batch_size=2)
+    runtime = RuntimeConfig(log_every=2, eval_every=4)
     store = toy.store(tmp_path / "clips")
-    yield on_store(replace(base, model=Settings(), train=loop, tokenizer_train=small), store.path)
+    config = replace(base, model=Settings(), train=train, tokenizer_train=small, runtime=runtime)
+    yield on_store(config, store.path)
     del FAMILIES["mean"], MODELS[Settings]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rsjax
-from rsjax.config import Config, LoopConfig, OptimizerConfig
+from rsjax.config import Config, OptimizerConfig, RuntimeConfig, TrainConfig
 from rsjax.errors import UserError
 from rsjax.evaluation import registry
 from rsjax.evaluation.registry import Scene, metric
@@ -43,7 +43,10 @@ def drift() -> Iterator[None]:
 def config(tmp_path: Path) -> Config:
     store = toy.store(tmp_path / "clips")
     base = replace(
-        toy.config(), model=ToyConfig(start=0.5), train=LoopConfig(steps=8, batch_size=3, log_every=2, eval_every=4)
+        toy.config(),
+        model=ToyConfig(start=0.5),
+        train=TrainConfig(steps=8, batch_size=3),
+        runtime=RuntimeConfig(log_every=2, eval_every=4),
     )
     base = replace(base, train=replace(base.train, optimizer=OptimizerConfig(learning_rate=0.1, warmup_steps=1)))
     return on_store(base, store.path)

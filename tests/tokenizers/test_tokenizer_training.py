@@ -11,7 +11,7 @@ import optax
 import pytest
 from safetensors.numpy import save_file
 
-from rsjax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config import ConfigError, LoopConfig, TokenizerConfig, TokenizerTrainConfig
 from rsjax.tokenizers import training as module
 from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
 from rsjax.tokenizers.magvit2 import Tokenizer
@@ -39,7 +39,7 @@ def training() -> TokenizerTraining:
 
 def fresh(training: TokenizerTraining) -> TrainState:
     """The state before the first step."""
-    return jax.jit(partial(create_state, training, training.train))()
+    return jax.jit(partial(create_state, training, LoopConfig.create(training.train)))()
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,12 @@ def start(training: TokenizerTraining) -> TrainState:
 
 @pytest.fixture(scope="module")
 def stepped(training: TokenizerTraining, start: TrainState) -> tuple[TrainState, dict[str, Any]]:
-    return jax.jit(partial(train_step, training, WHOLE), compiler_options=QUICK)(start, IMAGES)
+    return jax.jit(partial(train_step, training, LoopConfig.create(WHOLE)), compiler_options=QUICK)(start, IMAGES)
 
 
 def test_without_a_discriminator_the_parameters_are_the_tokenizers_alone() -> None:
     training = TokenizerTraining(CONFIG, PLAIN, 24)
-    state = jax.eval_shape(partial(create_state, training, PLAIN))
+    state = jax.eval_shape(partial(create_state, training, LoopConfig.create(PLAIN)))
     assert state.extra is None
     assert state.params == jax.eval_shape(Tokenizer(CONFIG).init_params, jax.random.key(0))
     assert training.tokenizer_params(state.params) is state.params
@@ -116,7 +116,9 @@ def test_a_step_with_lpips_can_be_saved_and_restored(tmp_path: Path, monkeypatch
     training = TokenizerTraining(CONFIG, replace(PLAIN, perceptual_weight=1.0, lpips_weights="narrow"), 32)
     images = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
     begun = fresh(training)
-    stepped, metrics = jax.jit(partial(train_step, training, training.train), compiler_options=QUICK)(begun, images)
+    stepped, metrics = jax.jit(
+        partial(train_step, training, LoopConfig.create(training.train)), compiler_options=QUICK
+    )(begun, images)
     assert metrics["perceptual"] > 0
     assert_same(stepped.extra, {"lpips": weights})
     checkpoints = Checkpoints(tmp_path)

@@ -63,7 +63,7 @@ def test_a_genie_is_one_branch_with_its_action_encoder() -> None:
 
 def test_the_state_in_training_has_the_bytes_of_a_whole_one_and_of_its_gradients() -> None:
     config = replace(DEBUG, train=replace(DEBUG.train, ema=0.9))
-    state = jax.eval_shape(lambda: create_state(create_model(config), config.train))
+    state = jax.eval_shape(lambda: create_state(create_model(config), config.loop("world_model")))
     whole = bytes_of((state.params, state.opt_state, state.ema)) + bytes_of(state.params)
     assert describe(config).figures["bytes_train_state"] == whole
 

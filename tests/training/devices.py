@@ -226,11 +226,11 @@ def through_checkpoints(trainings: list[Training], start: Any) -> list[TrainStat
 def main() -> dict[str, Any]:
     clips = [batch(seed) for seed in range(STEPS)]
     start = jax.device_get(jax.jit(partial(create_state, MODEL, LOOP))())
-    fresh = jax.device_get(jax.jit(partial(create_state, TOKENIZER, TOKENIZER.train))())
+    fresh = jax.device_get(jax.jit(partial(create_state, TOKENIZER, CONFIG.loop("tokenizer")))())
     trainings = {kind: Training(kind, MODEL, LOOP, clips, start) for kind in SHARDINGS}
     small = {kind: Training(kind, Small(), MUON, clips, None) for kind in ("jit", "fsdp")}
     kinds = ("jit", "pmap", "fsdp")
-    tokenizers = {kind: Training(kind, TOKENIZER, TOKENIZER.train, [IMAGES], fresh) for kind in kinds}
+    tokenizers = {kind: Training(kind, TOKENIZER, CONFIG.loop("tokenizer"), [IMAGES], fresh) for kind in kinds}
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(Training.compiled, [*trainings.values(), *tokenizers.values()]))
 

@@ -156,7 +156,7 @@ def test_the_launch_files_use_options_of_the_command() -> None:
     program, *arguments = shlex.split(command.partition(" -m ")[2])
     assert program == "experiments.train"
     config, options = parse(arguments, program, "", Options())
-    assert (config.train.sharding, config.train.fsdp) == ("mesh", 8)
+    assert (config.runtime.sharding, config.runtime.fsdp) == ("mesh", 8)
     assert (options.coordinator, options.processes, options.process_id) == ("rsjax-train-0.rsjax:8476", 2, 1)
     assert job["completions"] == job["parallelism"] == options.processes
     subprocess.run(["bash", "-n", ROOT / "launch/slurm.sbatch"], check=True)

@@ -119,9 +119,7 @@ def test_steps_that_are_not_finite_are_left_out_and_written_down(tmp_path: Path,
 
 def test_one_step_too_many_that_is_not_finite_stops_the_run(tmp_path: Path) -> None:
     loop = replace(LOOP, skip_budget=1, log_every=100, checkpoint_every=2)
-    with pytest.raises(
-        DivergedError, match=rf"{tmp_path}: 2 steps were not finite, more than skip_budget = 1 .*step 5"
-    ):
+    with pytest.raises(DivergedError, match=rf"{tmp_path}: 2 steps were not finite, more than 1 .*step 5"):
         train(loop, tmp_path, to_batch=poisoned(2, 5))
     assert [row["step"] for row in read_skipped(tmp_path)] == [2, 5]
     assert int(train(loop, tmp_path).step) == 9  # from step 4 on, where nothing is poisoned now

@@ -28,7 +28,7 @@ def rows(model: Trainable[Any], loop: LoopConfig, parts: int) -> dict[str, Row]:
 
 def world_model(preset: str, kind: Any = "adamw", parts: int = 8) -> dict[str, Row]:
     config = presets.get(preset)
-    loop = replace(config.train, ema=0.99, optimizer=OptimizerConfig(kind=kind))
+    loop = replace(config.loop("world_model"), ema=0.99, optimizer=OptimizerConfig(kind=kind))
     return rows(RoboScape.create(config), loop, parts)
 
 
@@ -76,7 +76,7 @@ def test_nearly_all_of_a_state_is_cut(preset: str) -> None:
 
 def test_the_full_size_tokenizer_is_cut_but_for_what_is_small_or_has_no_axis_that_divides() -> None:
     config = presets.get("roboscape_s")
-    loop = config.tokenizer_train
+    loop = config.loop("tokenizer")
     found = rows(TokenizerTraining.create(config), loop, 8)
     whole = {row.path.removeprefix("params/") for row in found.values() if row.spec == P() and prod(row.shape) >= SMALL}
     assert not whole

@@ -35,11 +35,11 @@ def test_the_learning_rate_of_steps_falls_to_a_tenth_at_each_share_of_the_run() 
 
 def test_linear_falls_all_the_way_and_wsd_only_at_the_end() -> None:
     linear, wsd = (
-        learning_rate(LoopConfig(steps=24, optimizer=replace(OPTIMIZER, schedule=schedule, decay_share=0.25)))
+        learning_rate(LoopConfig(steps=30, optimizer=replace(OPTIMIZER, schedule=schedule)))
         for schedule in get_args(Literal["linear", "wsd"])
     )
-    np.testing.assert_allclose([linear(step) for step in (0, 2, 4, 14, 24)], [0, 0.05, 0.1, 0.06, 0.02], rtol=1e-5)
-    np.testing.assert_allclose([wsd(s) for s in (0, 2, 4, 18, 21, 24)], [0, 0.05, 0.1, 0.1, 0.06, 0.02], rtol=1e-5)
+    np.testing.assert_allclose([linear(step) for step in (0, 2, 4, 17, 30)], [0, 0.05, 0.1, 0.06, 0.02], rtol=1e-5)
+    np.testing.assert_allclose([wsd(s) for s in (0, 2, 4, 24, 27, 30)], [0, 0.05, 0.1, 0.1, 0.06, 0.02], rtol=1e-5)
 
 
 @pytest.mark.parametrize("schedule", ["cosine", "linear", "wsd"])
@@ -81,6 +81,7 @@ def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
     step = jax.jit(partial(train_step, model, loop))
     opt, theta = OPTIMIZER, np.concatenate([state.params["w"], state.params["b"][None]]).astype(np.float64)
     average, m, v = theta.copy(), np.zeros(4), np.zeros(4)
+    b1, b2 = opt.betas
     for t in range(1, 4):
         noise = 0.1 * float(jax.random.normal(jax.random.fold_in(jax.random.key(loop.seed + 1), t - 1)))
         inputs = np.concatenate([BATCH["x"], np.ones((len(BATCH["y"]), 1))], axis=1)
@@ -88,10 +89,10 @@ def test_steps_are_clipped_adamw_and_the_average_follows() -> None:
         gradient = 2.0 * 2 * error @ inputs / len(error)  # the term's weight is 2
         norm = np.linalg.norm(gradient)
         clipped = gradient * min(1, opt.grad_clip / norm)
-        m = opt.beta1 * m + (1 - opt.beta1) * clipped
-        v = opt.beta2 * v + (1 - opt.beta2) * clipped**2
+        m = b1 * m + (1 - b1) * clipped
+        v = b2 * v + (1 - b2) * clipped**2
         rate = opt.learning_rate * (t - 1) / opt.warmup_steps
-        direction = m / (1 - opt.beta1**t) / (np.sqrt(v / (1 - opt.beta2**t)) + 1e-8)
+        direction = m / (1 - b1**t) / (np.sqrt(v / (1 - b2**t)) + 1e-8)
         update = -rate * (direction + opt.weight_decay * theta)
         theta = theta + update
         decay = min(loop.ema, t / (9 + t))
@@ -143,7 +144,7 @@ def test_muon_orthogonalises_blocks_and_convolutions_and_leaves_the_rest_to_adam
     for name in ("blocks", "conv1"):
         grads[name]["kernel"] *= np.logspace(0, -1.5, 4)  # badly conditioned
     loop = LoopConfig(steps=20, optimizer=replace(OPTIMIZER, kind="muon", weight_decay=0.0))
-    adam = optax.nadamw(learning_rate(loop), OPTIMIZER.beta1, OPTIMIZER.beta2, weight_decay=0.0)
+    adam = optax.nadamw(learning_rate(loop), *OPTIMIZER.betas, weight_decay=0.0)
     updates = {}
     for kind, tx in {
         "muon": make_optimizer(loop),

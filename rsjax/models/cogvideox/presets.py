@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 
 
@@ -33,15 +33,13 @@ def _cogvideox(name: str, model: CogVideoXConfig) -> Config:
             compute_dtype="bfloat16",
             remat="blocks",
         ),
-        train=LoopConfig(
+        train=TrainConfig(
             steps=10_000,
             batch_size=16,
             start_from="cogvideox",
             optimizer=OptimizerConfig(learning_rate=2e-5, warmup_steps=100, schedule="steps", weight_decay=1e-4),
-            log_every=10,
-            checkpoint_every=500,
-            eval_every=1000,
         ),
+        runtime=RuntimeConfig(log_every=10, checkpoint_every=500, eval_every=1000),
         eval=FULL_SIZE_EVAL,
     )
 
@@ -58,8 +56,6 @@ def cogvideox_tiny(base: Config) -> Config:
             frames_per_clip=16,
             depth_share=0.0,
             optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
-            checkpoint_every=200,
-            eval_every=400,
         ),
         model=CogVideoXConfig(
             autoencoder=CausalVAEConfig(
@@ -82,7 +78,6 @@ def cogvideox_tiny(base: Config) -> Config:
             batch_size=8,
             accumulate=1,
             optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
-            checkpoint_every=300,
-            eval_every=600,
         ),
+        runtime=replace(base.runtime, checkpoint_every=300, eval_every=600),
     )

@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
 from rsjax.models.diffusion.config import DenoiseConfig
 from rsjax.models.irasim.config import IRASimConfig, KLConfig
 
@@ -35,21 +35,19 @@ def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
 
     The public batch is 1 clip a GPU, accumulated twice, on an unknown number of GPUs; 16 is our choice.
     """
-    public = OptimizerConfig(warmup_steps=0, schedule="steps", beta2=0.999, grad_clip=0.1)
+    public = OptimizerConfig(warmup_steps=0, schedule="steps", betas=(0.9, 0.999), grad_clip=0.1)
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
         tokenizer_train=TokenizerTrainConfig(steps=0, start_from="sdxl_vae"),
         model=IRASimConfig(width=width, blocks=blocks, heads=heads, compute_dtype="bfloat16", remat="blocks"),
-        train=LoopConfig(
+        train=TrainConfig(
             steps=300_000,
             batch_size=16,
             optimizer=public,
             ema=0.9999,
-            log_every=100,
-            checkpoint_every=1000,
-            eval_every=10_000,
         ),
+        runtime=RuntimeConfig(log_every=100, checkpoint_every=1000, eval_every=10_000),
         eval=FULL_SIZE_EVAL,
     )
 
@@ -93,6 +91,5 @@ def irasim_tiny(base: Config) -> Config:
             accumulate=1,
             optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
             ema=0.998,
-            eval_every=1200,
         ),
     )

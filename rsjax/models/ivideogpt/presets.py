@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 
 
@@ -22,11 +22,11 @@ def ivideogpt_256() -> Config:
 
 def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
     # LPIPS needs the path of its weights, --tokenizer-train.lpips-weights.
-    constant = OptimizerConfig(learning_rate=5e-4, warmup_steps=500, schedule="steps", beta2=0.999)
+    constant = OptimizerConfig(learning_rate=5e-4, warmup_steps=500, schedule="steps", betas=(0.9, 0.999))
     cosine = OptimizerConfig(
-        warmup_steps=5000, beta2=0.999, weight_decay=0.01, final_share=0.0, grad_clip=0.0, learning_rate=1e-4
+        warmup_steps=5000, betas=(0.9, 0.999), weight_decay=0.01, final_share=0.0, grad_clip=0.0, learning_rate=1e-4
     )
-    config = Config(
+    return Config(
         name=name,
         prompt_frames=model.autoencoder.context_frames,
         sim=SimConfig(image_size=size),
@@ -40,10 +40,10 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
             commitment_weight=1.0,
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
-        train=LoopConfig(steps=100_000, batch_size=64, optimizer=cosine),
+        train=TrainConfig(steps=100_000, batch_size=64, optimizer=cosine),
+        runtime=RuntimeConfig(log_every=100, checkpoint_every=1000, eval_every=5000),
         eval=FULL_SIZE_EVAL,
     )
-    return config.with_loops(log_every=100, checkpoint_every=1000, eval_every=5000)
 
 
 def ivideogpt_tiny(tiny: Config) -> Config:

@@ -73,7 +73,7 @@ def train_adamw(config: Config, batch: int, budget: float) -> Numbers:
 def train(config: Config, batch: int, budget: float) -> Numbers:
     """Measures the world model's training step on one device, and its compilation without caches."""
     model = create_model(config)
-    loop = dataclasses.replace(config.train, batch_size=batch, sharding="jit")
+    loop = dataclasses.replace(config.loop("world_model"), batch_size=batch, sharding="jit")
     state = jax.jit(lambda: create_state(model, loop))()
     clips = inputs.batch(model, config, batch)
     began = time.perf_counter()
@@ -201,7 +201,7 @@ def feed(config: Config, budget: float) -> Numbers:
     Args:
         budget: seconds after which no further step begins, but at least ``LEAST`` steps are run.
     """
-    loop = dataclasses.replace(config.train, sharding="jit", fsdp=1, curriculum=())
+    loop = dataclasses.replace(config.loop("world_model"), sharding="jit", fsdp=1, curriculum=())
     model = create_model(config)
     transform = model.transform(inputs.normalization(config))
     rng = np.random.default_rng(0)

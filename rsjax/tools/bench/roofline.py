@@ -252,7 +252,7 @@ def _measure(
 def _optimizer(config: Config, model: RoboScape, speed: float, budget: float) -> tuple[float, float]:
     """Returns seconds and least seconds of a step of the optimizer; Muon's matrix products are not counted."""
     params = jax.jit(model.init)(jax.random.key(0))
-    optimizer = make_optimizer(config.train)
+    optimizer = make_optimizer(config.loop("world_model"))
     state = jax.jit(optimizer.init)(params)
     moments = sum(x.size for x in jax.tree.leaves(state) if x.ndim)
 

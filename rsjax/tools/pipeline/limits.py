@@ -8,7 +8,7 @@ from typing import Literal
 
 import jax
 
-from rsjax.config import Config, LoopConfig, SimConfig, TransformerConfig
+from rsjax.config import Config, SimConfig, TrainConfig, TransformerConfig
 from rsjax.errors import UserError
 
 GIB = 2**30
@@ -31,7 +31,7 @@ def device_memory() -> int:
     return min(limits) or host_memory() // len(devices)
 
 
-def check_batch(config: Config, loop: LoopConfig, stage: Literal["tokenizer", "world_model"]) -> None:
+def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "world_model"]) -> None:
     """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
     clips = loop.batch_size / (loop.accumulate * jax.device_count())
     needed, there = int(clips * _clip_bytes(config, stage)), device_memory()

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 
 import rsjax
-from rsjax.config import Config, LoopConfig, to_dict
+from rsjax.config import Config, TrainConfig, to_dict
 from rsjax.config.config_fields import config_fields
 from rsjax.data.store import MANIFEST
 from rsjax.files import FileError, parse_json, read_json, write_json
@@ -141,7 +141,7 @@ def _git(root: Path, *arguments: str) -> str | None:
 def training_settings(config: Config) -> dict[str, Any]:
     """Returns the settings, other than seeds, that determine the weights: of the training loops and the tokenizer."""
     parts = {each.name: getattr(config, each.name) for each in fields(config)}
-    trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, LoopConfig)}
+    trained: dict[str, Any] = {name: part for name, part in parts.items() if isinstance(part, TrainConfig)}
     if config.model.uses_tokenizer:
         trained["tokenizer"] = config.tokenizer
     return {name: _without_runtime(part) for name, part in trained.items()}

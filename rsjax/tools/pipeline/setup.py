@@ -46,7 +46,9 @@ def tokenizer_setup(run: Run) -> Setup:
     """
     train, model = run.config.tokenizer_train, create_autoencoder(run.config)
     transform = model.transform()
-    loop, loader = plan(train, run.open_clips(), lambda store: transform, run.directory / "tokenizer")
+    loop, loader = plan(
+        run.config.loop("tokenizer"), run.open_clips(), lambda store: transform, run.directory / "tokenizer"
+    )
     return Setup(model, loop, loader, model.batch, starting(model, train.start_from, "tokenizer"))
 
 
@@ -60,7 +62,7 @@ def world_model_setup(run: Run) -> Setup:
         _note_depth(prepared, store)
         return transform
 
-    loop, loader = plan(train, prepared, transform_of, run.directory / "world_model")
+    loop, loader = plan(cfg.loop("world_model"), prepared, transform_of, run.directory / "world_model")
     return Setup(model, loop, loader, model.batch, starting(model, train.start_from, "world_model"))
 
 

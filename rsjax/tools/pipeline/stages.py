@@ -78,8 +78,8 @@ def _check_starts(run: Run) -> None:
     if not cfg.data.key and not run.finished("collect"):
         check_episodes(cfg.sim, run.clips)
     trained: dict[Literal["tokenizer", "world_model"], tuple[LoopConfig, Callable[[Config], Any]]] = {
-        "tokenizer": (cfg.tokenizer_train, create_autoencoder),
-        "world_model": (cfg.train, create_model),
+        "tokenizer": (cfg.loop("tokenizer"), create_autoencoder),
+        "world_model": (cfg.loop("world_model"), create_model),
     }
     for name, (loop, create) in trained.items():
         if name not in run.stages or run.finished(name):
@@ -155,7 +155,7 @@ def prepare(run: Run) -> None:
     clips, folder, cfg = run.open_clips(), run.directory / "tokens", run.config
     (folder / QUARANTINE).unlink(missing_ok=True)
     assets = Assets(Normalization.create(clips), load_tokenizer(cfg, run.directory))
-    prepared = create_model(cfg).prepare(clips, assets, folder, cfg.train.max_damaged) or clips
+    prepared = create_model(cfg).prepare(clips, assets, folder, cfg.runtime.max_damaged) or clips
     with disk_guard(folder):
         folder.mkdir(parents=True, exist_ok=True)
         assets.normalization.save(folder)

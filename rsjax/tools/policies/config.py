@@ -14,8 +14,7 @@ PUBLIC_OPTIMIZER = OptimizerConfig(
     warmup_steps=500,
     schedule="cosine",
     final_share=0.0,
-    beta1=0.95,
-    beta2=0.999,
+    betas=(0.95, 0.999),
     weight_decay=1e-6,
     grad_clip=0.0,
 )

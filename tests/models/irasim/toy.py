@@ -31,8 +31,10 @@ MODEL = IRASimConfig(
 def config(**changes: Any) -> Config:
     """The toy configuration with this model, some of whose fields are changed."""
     base = toy.config()
-    loop = replace(base.tokenizer_train, depth_share=0.0, eval_every=6)
-    return replace(base, model=replace(MODEL, **changes), tokenizer_train=loop)
+    loop = replace(base.tokenizer_train, depth_share=0.0)
+    return replace(
+        base, model=replace(MODEL, **changes), tokenizer_train=loop, runtime=replace(base.runtime, eval_every=6)
+    )
 
 
 @cache

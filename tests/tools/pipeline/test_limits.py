@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rsjax.config import Config, ConfigError, LoopConfig, presets
+from rsjax.config import Config, ConfigError, TrainConfig, presets
 from rsjax.errors import UserError
 from rsjax.tools.pipeline import limits
 from rsjax.tools.pipeline.limits import GIB, check_batch, check_episodes, check_rollout, device_memory, host_memory
@@ -21,7 +21,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "device_memory", lambda: 16 * GIB)
 
 
-def of(config: Config, size: int, accumulate: int = 1) -> LoopConfig:
+def of(config: Config, size: int, accumulate: int = 1) -> TrainConfig:
     return replace(config.train, batch_size=size, accumulate=accumulate)
 
 
@@ -57,9 +57,9 @@ def test_episodes_beyond_the_disk_are_refused(tmp_path: Path) -> None:
 
 
 def test_steps_end_with_their_counter() -> None:
-    LoopConfig(steps=2**31 - 1)
-    with pytest.raises(ConfigError, match="steps of a training loop are 10000000000; their counter ends at 2147483647"):
-        LoopConfig(steps=10**10)
+    TrainConfig(steps=2**31 - 1)
+    with pytest.raises(ConfigError, match="training.steps is 10000000000; it must be 1 … 2147483647"):
+        TrainConfig(steps=10**10)
 
 
 def test_memory_is_that_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:

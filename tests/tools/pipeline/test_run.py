@@ -57,7 +57,6 @@ def make(run: Run, *stages: str) -> None:
         ("model.loss.gamma", 4.0, "world_model"),
         ("train.ema", 0.5, "world_model"),
         ("train.curriculum", (CurriculumStageConfig(epochs=2.0),), "world_model"),
-        ("train.restarts", (3,), "world_model"),
         ("model.sample.steps", 3, "evaluation"),
         ("eval.action_draws", 2, "evaluation"),
     ],
@@ -73,14 +72,13 @@ def test_a_field_changes_the_keys_of_its_stage_and_of_all_after_it(field: str, v
     ("field", "value"),
     [
         ("sim.workers", 3),
-        ("tokenizer_train.checkpoint_every", 9),
-        ("train.sharding", "mesh"),
+        ("runtime.checkpoint_every", 9),
+        ("runtime.sharding", "mesh"),
         ("train.accumulate", 2),
-        ("train.eval_every", 5),
-        ("train.keep_best", False),
-        ("train.workers", 2),
-        ("train.wandb", "robots"),
-        ("train.profile", 3),
+        ("runtime.eval_every", 5),
+        ("runtime.workers", 2),
+        ("runtime.wandb", "robots"),
+        ("runtime.profile", 3),
     ],
 )
 def test_how_a_run_is_carried_out_changes_no_key(field: str, value: Any) -> None:
@@ -175,8 +173,8 @@ def test_a_run_is_resumed_though_how_it_is_carried_out_differs(tmp_path: Path) -
     run = Run(DEBUG, tmp_path / "run", tmp_path / "data")
     run.prepare(overwrite=False)
     make(run, *STAGES)
-    otherwise = replace(DEBUG.train, eval_every=5, sharding="mesh", keep_last=7, wandb="robots", workers=2)
-    other = Run(replace(DEBUG, train=otherwise), run.directory, run.data_directory)
+    otherwise = replace(DEBUG.runtime, eval_every=5, sharding="mesh", wandb="robots", workers=2)
+    other = Run(replace(DEBUG, runtime=otherwise), run.directory, run.data_directory)
     other.prepare(overwrite=False)
     assert all(other.finished(stage) for stage in STAGES)
 
@@ -193,8 +191,9 @@ def test_only_fields_that_change_the_refused_stage_are_named_down_to_those_of_a_
     run.prepare(overwrite=False)
     make(run, *STAGES)
     changes = replace(two.curriculum[1], epochs=3.0, restart=True)
-    loop = replace(two, curriculum=(two.curriculum[0], changes), log_every=77, skip_budget=3, ema=0.3)
-    config = replace(changed("model.sample.steps", 3), train=loop)
+    loop = replace(two, curriculum=(two.curriculum[0], changes), accumulate=2, ema=0.3)
+    runtime = replace(DEBUG.runtime, log_every=77)
+    config = replace(changed("model.sample.steps", 3), train=loop, runtime=runtime)
     with pytest.raises(RunError) as error:
         Run(config, run.directory, run.data_directory).prepare(overwrite=False)
     named = re.search(r"of another configuration \((.*)\);", str(error.value))

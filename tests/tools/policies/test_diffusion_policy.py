@@ -53,7 +53,7 @@ def test_the_public_size_is_the_public_one() -> None:
     assert (config.observations, config.horizon, config.execute) == (2, 16, 8)
     assert (config.noise_steps, config.sample_steps, config.keypoints) == (100, 100, 32)
     optimizer = config.train.optimizer
-    assert (optimizer.learning_rate, optimizer.beta1, optimizer.beta2, optimizer.weight_decay) == (
+    assert (optimizer.learning_rate, *optimizer.betas, optimizer.weight_decay) == (
         1e-4,
         0.95,
         0.999,

@@ -12,7 +12,7 @@ from typing import Literal
 
 import jax
 
-from rsjax.config import Config, LoopConfig, TokenizerConfig, TokenModelConfig, require
+from rsjax.config import Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tokenizers.flops import tokenizer_flops
@@ -90,8 +90,7 @@ def scale(preset: Config, seconds: float) -> Scale:
         "eval.action_draws": draws,
         "eval.localiser_steps": min(evaluation.localiser_steps, max(1, _round(LOCALISER_SHARE * each / LOCALISER))),
         "train.curriculum": (),  # its epochs would determine the steps; a claim's arms have their own
-        "train.eval_every": 0,
-        "tokenizer_train.eval_every": 0,
+        "runtime.eval_every": 0,
     }
     base = with_values(preset, values)
     steps = (each - START - evaluation_seconds(base)) / step_seconds(base)
@@ -115,13 +114,13 @@ def _round(number: float) -> int:
 
 
 def cut(config: Config, share: float) -> Config:
-    """Returns the configuration with each training loop cut to a share of its steps, at least one step."""
+    """Returns the configuration with each training cut to a share of its steps, at least one, without validations."""
     loops = {
-        field.name: replace(loop, steps=max(1, round(share * loop.steps)), eval_every=0)
+        field.name: replace(loop, steps=max(1, round(share * loop.steps)))
         for field in fields(config)
-        if isinstance(loop := getattr(config, field.name), LoopConfig)
+        if isinstance(loop := getattr(config, field.name), TrainConfig)
     }
-    return replace(config, **loops)  # type: ignore[arg-type]
+    return replace(config, **loops, runtime=replace(config.runtime, eval_every=0))  # type: ignore[arg-type]
 
 
 def train_flops(config: Config) -> int | None:
@@ -183,7 +182,7 @@ def training_cost(config: Config, unit: Literal["seconds", "flops"]) -> tuple[fl
         return loop.steps * tokenizer_step_seconds(config), config.train.steps * step_seconds(config)
     images = loop.steps * loop.batch_size * loop.frames_per_clip
     # Leave out what differs between arms and seeds: some families count by tracing their programs, and this is cached.
-    bare = replace(config, train=LoopConfig(), tokenizer_train=replace(loop, steps=1))
+    bare = replace(config, train=TrainConfig(), tokenizer_train=replace(loop, steps=1))
     return 3.0 * images * _frame_flops(bare), float(train_flops(config) or 0)
 
 

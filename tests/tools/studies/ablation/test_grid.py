@@ -222,7 +222,7 @@ def test_another_configuration_is_refused_by_name_and_nothing_changes(tmp_path: 
 
 
 def test_how_runs_are_carried_out_and_the_seed_may_differ(tmp_path: Path) -> None:
-    base = replace(DEBUG, train=replace(DEBUG.train, log_every=1, seed=9))
+    base = replace(DEBUG, train=replace(DEBUG.train, seed=9), runtime=replace(DEBUG.runtime, log_every=1))
     grid, names = merge(toy.grid("model.loss.gamma=4"), toy.grid("model.loss.gamma=4", base=base), tmp_path)
     assert list(grid.cells) == list(names)
 

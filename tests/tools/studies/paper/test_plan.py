@@ -184,7 +184,7 @@ def test_a_family_has_the_base_presets_clips_and_as_many_seconds_or_operations(n
         one, other = (sum(training_cost(each, equal)) for each in (config, at.base))  # type: ignore[arg-type]
         assert one == pytest.approx(other, rel=0.02)
         both = config.tokenizer_train.steps / whole.tokenizer_train.steps, config.train.steps / whole.train.steps
-        assert both[0] == pytest.approx(both[1], rel=0.02) and config.train.eval_every == 0
+        assert both[0] == pytest.approx(both[1], rel=0.02) and config.runtime.eval_every == 0
 
 
 def test_equal_operations_count_the_shared_tokenizer(three_hours: Plan) -> None:
