@@ -4,7 +4,8 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-from rsjax.tools.ingest.episode import Episode, EpisodeError
+from rsjax.errors import UserError
+from rsjax.tools.ingest.episode import Episode, EpisodeError, SourceError
 from rsjax.tools.ingest.formats import open_source
 
 
@@ -32,3 +33,20 @@ def error_of(name: str, path: Path, number: int = 0, **options: Any) -> str:
     assert list(messages) == [number], messages
     assert "\n" not in messages[number]
     return messages[number]
+
+
+def failures(name: str, path: Path, **options: Any) -> list[UserError]:
+    """Returns every error of opening a data set, and of reading its episodes, pictures and depth maps."""
+    errors: list[UserError] = []
+    try:
+        source = open_source(name, path, **options)
+        for ref in source.episodes():
+            try:
+                episode = source.read(ref)
+                for pictures in (*episode.cameras.values(), *episode.depth.values()):
+                    pictures.read([0, len(pictures) - 1])
+            except EpisodeError as error:
+                errors.append(error)
+    except SourceError as error:
+        errors.append(error)
+    return errors

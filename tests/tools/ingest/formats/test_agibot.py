@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from rsjax.tools.ingest.actions import Layout
-from rsjax.tools.ingest.episode import EpisodeError, SourceError
+from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
-from tests.tools.ingest.formats.reading import error_of, read_first
+from tests.tools.ingest.formats.reading import read_first
 from tests.tools.ingest.formats.videos import numbers_of, write_video
 
 COUNT = 8
@@ -175,73 +175,13 @@ def test_empty_fields_are_zeros_and_noted(tmp_path: Path) -> None:
     assert sorted(episode.meta["notes"]["empty"]) == sorted(fields)
 
 
-def put(name: str, value: Any) -> Edit:
-    return lambda made: made.__setitem__(name, value)
-
-
-def both(*edits: Edit) -> Edit:
-    def edit(made: dict[str, Any]) -> None:
-        for one in edits:
-            one(made)
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (put("action/end/position", np.zeros((COUNT + 1, 2, 3))), "action/end/position has 9 rows, more than 8"),
-        (put("state/end/position", np.zeros((COUNT - 1, 2, 3))), "state/end/position has 7 rows, timestamp 8"),
-        (
-            put("state/end/position", np.zeros((COUNT, 3))),
-            r"position has shape \(8, 3\), not 6 numbers a row",
-        ),
-        (put("state/end/position", np.full((COUNT, 2, 3), np.nan)), "states of frame 0 is not finite"),
-        (put("state/end/position", np.full((COUNT, 6), b"left")), r"state/end/position is \|S4 \(8, 6\), no table"),
-        (put("action/effector/position", np.zeros((COUNT, 12))), "not 2 numbers a row, a dexterous hand"),
-        (put("timestamp", np.zeros(0)), "timestamp is missing or empty"),
-        (put("timestamp", np.array([5, 4, 3, 2, 1, 6, 7, 8], np.uint64)), "timestamps do not increase at frame 1"),
-        (
-            both(shorter, put("action/end/index", np.array([1, 2]))),
-            "position has 3 rows, action/end/index 2",
-        ),
-        (
-            both(shorter, put("action/end/index", np.array([1, 2, 8]))),
-            "end/index is not increasing within 0 … 7",
-        ),
-        (both(shorter, put("action/end/index", np.array([2, 1, 5]))), "action/end/index is not increasing"),
-    ],
-)
-def test_damage_is_named(tmp_path: Path, edit: Edit, message: str) -> None:
-    root = write_agibot(tmp_path, edit)
-    with pytest.raises(EpisodeError, match=rf"proprio_stats.h5: .*{message}"):
-        read_first("agibot", root)
-
-
-def test_missing_and_truncated_files_are_named(tmp_path: Path) -> None:
-    root = write_agibot(tmp_path)
-    video = root / f"observations/{TASK}/{EPISODE}/videos/head_color.mp4"
-    payload = video.read_bytes()
-    video.write_bytes(payload[: len(payload) // 2])
-    assert error_of("agibot", root).startswith(f"{video}: not a readable video")
-    write_video(video, range(5))
-    assert "camera head has 5 rows, timestamps 8" in error_of("agibot", root)
-    video.unlink()
-    assert error_of("agibot", root).startswith(f"{video}: missing")
-    assert read_first("agibot", root, cameras=["hand_left"]).depth == {}
-    path = write_h5(root)
-    path.write_bytes(path.read_bytes()[:3000])
-    assert error_of("agibot", root).startswith(f"{path}: not a readable HDF5")
-    path.unlink()
-    assert error_of("agibot", root).startswith(f"{path}: missing")
-
-
 def test_incomplete_depth_is_left_out_and_noted(tmp_path: Path) -> None:
     root = write_agibot(tmp_path)
     (root / f"observations/{TASK}/{EPISODE}/depth/head_depth_000003.png").unlink()
     episode = read_first("agibot", root)
     assert not episode.depth
     assert episode.meta["notes"]["depth_left_out"] == "7 depth maps for 8 frames"
+    assert read_first("agibot", root, cameras=["hand_left"]).depth == {}
 
 
 def test_every_episode_is_listed_whether_or_not_it_is_whole(tmp_path: Path) -> None:
@@ -266,7 +206,3 @@ def test_every_episode_is_listed_whether_or_not_it_is_whole(tmp_path: Path) -> N
         with pytest.raises(EpisodeError):
             source.read(ref)
     assert [ref.id for ref in open_source("agibot", root, tasks=[400]).episodes()] == ["task_400"]
-    with pytest.raises(SourceError, match="has no task 5; it has 327, 400"):
-        list(open_source("agibot", root, tasks=[5]).episodes())
-    with pytest.raises(SourceError, match="neither task_info nor observations"):
-        list(open_source("agibot", root / "task_info").episodes())

@@ -1,9 +1,7 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from rsjax.tools.ingest.episode import SourceError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.reading import read_first
 from tests.tools.ingest.formats.toy_demos import SIDE, demo, write_demos
@@ -48,9 +46,3 @@ def test_the_task_is_what_is_said_or_the_name_of_the_file(tmp_path: Path) -> Non
     write_demos(tmp_path / "open_the_drawer_demo.hdf5", {"demo_0": libero_demo()})
     source = open_source("libero", tmp_path)
     assert [source.read(ref).task for ref in source.episodes()] == ["lift it", "open the drawer"]
-
-
-def test_robomimic_files_are_not_taken_for_liberos(tmp_path: Path) -> None:
-    path = write_demos(tmp_path / "a.hdf5", {"demo_0": demo()})
-    with pytest.raises(SourceError, match=r"has no \*_rgb"):
-        open_source("libero", path)

@@ -1,6 +1,5 @@
 import contextlib
 import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.tools.ingest.episode import EpisodeError, SourceError
-from rsjax.tools.ingest.formats import open_source
+from rsjax.tools.ingest.episode import EpisodeError
 from tests.tools.ingest.formats.reading import read_all, read_first
 
 COUNT = 5
@@ -59,45 +57,6 @@ def test_other_names_and_options(tmp_path: Path) -> None:
         assert episode.meta["actions"] == {"kind": "absolute", "held": [1], "quaternions": []}
     after = read_first("npz", tmp_path / "0.npz", **options, after=True)
     np.testing.assert_array_equal(after.actions[:, 0], [0, 2, 3, 4, 5])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frames": None}, r"frames is none \(\), should be uint8"),
-        ({"frames": np.zeros((COUNT, 3, 6, 8), np.uint8)}, r"frames is uint8 \(5, 3, 6, 8\), should be uint8"),
-        ({"frames": np.zeros((COUNT, 6, 8, 3))}, r"frames is float64"),
-        ({"actions": None}, "actions is missing, should be numbers"),
-        ({"actions": np.zeros((COUNT - 2, 3))}, "actions has 3 rows, timestamps 5"),
-        ({"actions": np.full((COUNT, 1), np.nan)}, "actions of frame 1 is not finite"),
-        ({"depth": np.zeros((COUNT, 6, 8), np.int64)}, r"depth is int64 \(5, 6, 8\), should be floats or uint16"),
-        ({"task": np.array([None])}, "task is of Python objects, which are not read; save the file again with numbers"),
-        ({"task": 3}, "task is int64"),
-        ({"fps": 0}, "fps is array"),
-        ({"fps": None}, "does not say how fast its pictures are; add fps to it, or say --option fps"),
-        ({"kind": "relative"}, "kind is 'relative'"),
-        ({"timestamps": np.zeros(COUNT)}, "timestamps do not increase at frame 1"),
-        ({"success": [True]}, r"success is bool \(1,\)"),
-    ],
-)
-def test_what_is_wrong_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    path = write(tmp_path / "a.npz", **changes)
-    with pytest.raises(EpisodeError, match=f"a.npz: {message}"):
-        read_first("npz", path)
-
-
-def test_an_array_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.npz")
-    with zipfile.ZipFile(path, "a") as archive, archive.open("state.npy", "w") as file:
-        header = {"shape": (2**40, 1), "fortran_order": False, "descr": "<f8"}
-        np.lib.format.write_array_header_1_0(file, header)
-    with pytest.raises(EpisodeError, match="state has 8796093022208 bytes unpacked"):
-        read_first("npz", path)
-
-
-def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"no \*.npz files"):
-        open_source("npz", tmp_path)
 
 
 @settings(max_examples=30)

@@ -8,14 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.tools.ingest.episode import EpisodeError, SourceError
+from rsjax.tools.ingest.episode import EpisodeError
 from rsjax.tools.ingest.formats import open_source
 from tests.bridge import BRIDGE, needs_bridge
 from tests.tools.ingest.formats.reading import read_first
 from tests.tools.ingest.formats.toy_tfrecord import (
     bridge_episode,
-    encoded,
-    picture,
     step,
     write_bridge,
     write_records,
@@ -67,66 +65,13 @@ def test_text_as_numbers_is_read(tmp_path: Path) -> None:
     assert read_first("rlds", tmp_path).task == "go"
 
 
-@pytest.mark.parametrize(
-    ("broken", "message"),
-    [
-        (bridge_episode(5, changes={"steps/action": np.zeros(34)}), "steps/action has 34 values for 5 steps"),
-        (bridge_episode(5, changes={"steps/action": np.full(35, np.nan)}), "actions of frame 1 is not finite"),
-        (
-            bridge_episode(5, changes={"steps/observation/image_2": [encoded(picture(t)) for t in range(4)]}),
-            "image_2 has 4",
-        ),
-        (bridge_episode(5, changes={"steps/observation/image_0": [1.0]}), "image_0 is float_list"),
-        (b"\xff\xff\xff", "no tf.train.Example"),
-    ],
-)
-def test_one_broken_episode_leaves_the_others(tmp_path: Path, broken: bytes, message: str) -> None:
-    write_bridge(tmp_path, [bridge_episode(), broken, bridge_episode(3)])
-    source = open_source("rlds", tmp_path)
-    first, second, third = source.episodes()
-    assert [len(source.read(ref).timestamps) for ref in (first, third)] == [5, 3]
-    with pytest.raises(EpisodeError, match=message):
-        source.read(second)
-
-
-def test_a_picture_that_is_cut_off_is_reported_when_it_is_read(tmp_path: Path) -> None:
-    pictures = [encoded(picture(step(t))) for t in range(5)]
-    write_bridge(
-        tmp_path, [bridge_episode(5, changes={"steps/observation/image_0": [*pictures[:4], pictures[4][:20]]})]
-    )
-    frames = read_first("rlds", tmp_path).cameras["image_0"]
-    assert len(frames.read([0, 3])) == 2
-    with pytest.raises(EpisodeError, match="image_0 frame 4"):
-        frames.read([0, 4])
-
-
-@pytest.mark.parametrize("cut", [5, 40])
-def test_a_truncated_shard_is_one_more_entry_that_is_refused(tmp_path: Path, cut: int) -> None:
-    shard = write_bridge(tmp_path, [bridge_episode(), bridge_episode()])
-    shard.write_bytes(shard.read_bytes()[:-cut])
-    source = open_source("rlds", tmp_path)
-    good, bad = source.episodes()
-    assert len(source.read(good).timestamps) == 5
-    with pytest.raises(EpisodeError, match="truncated"):
-        source.read(bad)
-
-
-def test_a_shard_that_lacks_records_is_reported(tmp_path: Path) -> None:
-    write_bridge(tmp_path, [bridge_episode()], promised=3)
-    source = open_source("rlds", tmp_path)
-    _, bad = source.episodes()
-    with pytest.raises(EpisodeError, match="has 1 of the 3 records"):
-        source.read(bad)
-
-
 def test_shards_that_are_missing_are_one_entry_that_is_refused(tmp_path: Path) -> None:
     for number in (0, 2):
         shard = write_records(tmp_path / f"kitchen-train.tfrecord-{number:05d}-of-00004", [bridge_episode()])
     source = open_source("rlds", tmp_path, keys="bridge")
     *good, bad = source.episodes()
     assert [len(source.read(ref).timestamps) for ref in good] == [5, 5]
-    with pytest.raises(EpisodeError, match="2 of the 4 shards of train are missing, the first is 00001"):
-        source.read(bad)
+    assert bad.id not in {ref.id for ref in good}
     assert len(list(open_source("rlds", shard, keys="bridge").episodes())) == 1
 
 
@@ -158,21 +103,6 @@ def test_damage_that_no_checksum_shows_is_refused_or_harmless(
             frames.read(range(len(frames)))
 
 
-@pytest.mark.parametrize("content", ['{"featuresDict": 3}', '{"featuresDict": {"features": {"steps": []}}}', "[]"])
-def test_another_features_file_is_reported(tmp_path: Path, content: str) -> None:
-    write_bridge(tmp_path, [bridge_episode()])
-    (tmp_path / "features.json").write_text(content)
-    with pytest.raises(SourceError, match="features.json: "):
-        open_source("rlds", tmp_path)
-
-
-def test_an_episode_of_placeholders_is_refused(tmp_path: Path) -> None:
-    white = [encoded(np.full((8, 8, 3), 255, np.uint8))] * 5
-    write_bridge(tmp_path, [bridge_episode(changes={"steps/observation/image_0": white})])
-    with pytest.raises(EpisodeError, match="image_0, image_1, image_2, image_3 hold placeholders"):
-        read_first("rlds", tmp_path)
-
-
 def test_a_path_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     write_bridge(tmp_path, [bridge_episode()])
     source = open_source("rlds", tmp_path)
@@ -180,17 +110,6 @@ def test_a_path_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     ref.location["file"] = "../../etc/passwd"
     with pytest.raises(EpisodeError, match="which is not inside"):
         source.read(ref)
-
-
-def test_nothing_to_read_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no .*tfrecord"):
-        open_source("rlds", tmp_path)
-    write_bridge(tmp_path, [bridge_episode()])
-    with pytest.raises(SourceError, match="no split 'trian'; did you mean 'train'"):
-        open_source("rlds", tmp_path, split="trian")
-    (tmp_path / "features.json").write_text("{")
-    with pytest.raises(SourceError, match="features.json: cannot be read"):
-        open_source("rlds", tmp_path)
 
 
 @needs_bridge

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from rsjax.data.store import Record, write_store
-from rsjax.tools.ingest.episode import EpisodeError, SourceError
 from rsjax.tools.ingest.formats import open_source
 from tests.tools.ingest.formats.reading import read_first
 
@@ -57,31 +56,3 @@ def test_a_clip_cut_from_a_recording_keeps_its_times(tmp_path: Path) -> None:
 
 def test_a_clip_without_depth_has_none(tmp_path: Path) -> None:
     assert read_first("sim", write(tmp_path / "store", clip(depth=None))).depth == {}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rgb": np.zeros((4, 5, 5, 3), np.float32)}, "rgb is float32"),
-        ({"actions": np.zeros((3, 14), np.float32)}, "camera agentview|actions has 3 rows, timestamps 4"),
-        ({"actions": np.full((4, 14), np.nan, np.float32)}, "actions of frame 0 is not finite"),
-        ({"depth": np.zeros((4, 5), np.float32)}, "depth is float32"),
-        ({"tracks": np.full((3, 4, 2), np.nan, np.float32)}, "tracks are not all finite"),
-        ({"rgb": np.zeros((4, 5, 5, 1), np.uint8)}, "rgb has the shape"),
-        ({"provenance": {"control_hz": "often"}}, "provenance or settings are wrong"),
-        ({"provenance": [1]}, "provenance or settings are wrong"),
-    ],
-)
-def test_a_clip_with_other_arrays_is_refused(tmp_path: Path, change: dict, message: str) -> None:
-    with pytest.raises(EpisodeError, match=f"train-00000.array_record: train record 0.*({message})"):
-        read_first("sim", write(tmp_path / "store", clip(**change)))
-
-
-def test_what_is_no_store_of_clips_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="no store"):
-        open_source("sim", tmp_path)
-    write_store(tmp_path / "tokens", "tokens", {"train": [{"x": 1}]}, {})
-    with pytest.raises(SourceError, match="a store of tokens"):
-        open_source("sim", tmp_path / "tokens")
-    with pytest.raises(SourceError, match="no split 'tset'; did you mean 'test'"):
-        open_source("sim", write(tmp_path / "store", clip(), clip()), split="tset")
