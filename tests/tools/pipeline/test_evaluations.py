@@ -16,6 +16,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.evaluate import Evaluation, HeldOut
 from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import read_frames, read_result
@@ -40,7 +41,13 @@ MADE: list[Path] = []  # where batches of the evaluations that were made lie
 
 
 def scored(
-    trained: TrainedModel, store: Store, protocol: Protocol | None = None, *, held_out: HeldOut, folder: Path
+    trained: TrainedModel,
+    store: Store,
+    protocol: Protocol | None = None,
+    *,
+    held_out: HeldOut,
+    folder: Path,
+    estimator: DepthEstimator | None = None,
 ) -> Evaluation:
     """Stands for an evaluation, whose scores other tests look at: PSNR rises by 1 dB from clip to clip."""
     MADE.append(folder)
