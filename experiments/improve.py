@@ -8,8 +8,8 @@ import tyro
 
 from experiments.cli import main_errors, parse_options, part
 from rsjax.runtime import tune_process
-from rsjax.tools.policies.improvement import Improvement
-from rsjax.tools.policies.trials import Trials
+from rsjax.tools.policies.studies.improvement import Improvement
+from rsjax.tools.policies.studies.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ def main() -> None:
     """Writes results.json, results.md and success.png, and prints the table."""
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.improve", Options.__doc__ or "", Options())
-    from rsjax.tools.policies.improvement import improve
     from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.policy_training import train_policy
     from rsjax.tools.policies.run_data import RunData, sized_policy
-    from rsjax.tools.policies.training import train_policy
-    from rsjax.tools.policies.trials import lift_simulators
+    from rsjax.tools.policies.studies.improvement import improve
+    from rsjax.tools.policies.studies.trials import open_lift
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
     settings, trials = part(options, Improvement), part(options, Trials)
@@ -58,7 +58,7 @@ def main() -> None:
     else:
         policy = train_policy(sized_policy(options.size, options.train_steps), demos, out / "policy")
     starts = run.first_frames(settings.imagined * settings.rounds)
-    with lift_simulators(config, trials) as simulator:
+    with open_lift(config, trials) as simulator:
         improve(policy, demos, starts, model, simulator, settings, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 

@@ -8,7 +8,7 @@ import tyro
 
 from experiments.cli import main_errors, parse_options, part
 from rsjax.runtime import tune_process
-from rsjax.tools.policies.judging import JudgeSettings
+from rsjax.tools.policies.judges.judge_training import JudgeSettings
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.judge", Options.__doc__ or "", Options())
     from rich.console import Console
 
-    from rsjax.tools.policies.judge_validation import table
-    from rsjax.tools.policies.judging import make_judge
+    from rsjax.tools.policies.judges.judge_training import make_judge
+    from rsjax.tools.policies.judges.validation import table
 
     result = make_judge(options.run, options.data_dir, options.store, part(options, JudgeSettings))
     Console().print(table(result))

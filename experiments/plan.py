@@ -1,6 +1,7 @@
 """Plans in a world model and acts in the simulator. ``python -m experiments.plan runs/tiny --energy judge``"""
 
 import sys
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -52,9 +53,10 @@ def main() -> None:
     from rich.console import Console
 
     from rsjax.models.load_run import load
-    from rsjax.tools.policies.planner import PlannerConfig
-    from rsjax.tools.policies.planning import PlanSettings, compare, folder, table
+    from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, table
+    from rsjax.tools.policies.planning.planner import PlannerConfig
     from rsjax.tools.policies.policy import load_policy
+    from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
 
     fields = ("horizon", "candidates", "rounds", "elites", "temperature", "seed")
     planner = PlannerConfig(**{name: getattr(options, name) for name in fields})
@@ -62,7 +64,8 @@ def main() -> None:
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
     trained = load(options.run)
     policies = {f"policy {options.policy}": load_policy(options.policy)} if options.policy else {}
-    result = compare(trained, options.run, settings, policies)
+    with closing(SimulatorWorld.lift(trained.config.sim, 1)) as simulator:
+        result = compare(trained, options.run, simulator, settings, policies)
     Console().print(table(result))
     print(folder(options.run, result["key"]) / "result.json")
 

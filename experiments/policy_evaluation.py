@@ -10,7 +10,7 @@ import tyro
 from experiments.cli import main_errors, parse_options, part
 from rsjax.config import ConfigError
 from rsjax.runtime import tune_process
-from rsjax.tools.policies.trials import Trials
+from rsjax.tools.policies.studies.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.policy_evaluation", Options.__doc__ or "", Options())
     if not options.runs or options.checkpoints < 2:
         raise ConfigError("name a run directory at least, and --checkpoints 2 or more: policy_evaluation runs/tiny")
-    from rsjax.tools.policies.comparison import checkpoints, compare
-    from rsjax.tools.policies.judging import FOLDER
+    from rsjax.tools.policies.judges.judge_training import FOLDER
     from rsjax.tools.policies.policy import common_size, load_policy
-    from rsjax.tools.policies.rejudging import blind, named_judge, rejudge
     from rsjax.tools.policies.run_data import RunData, named, sized_policy
-    from rsjax.tools.policies.trials import lift_simulators
+    from rsjax.tools.policies.studies.policy_evaluation import checkpoints, compare
+    from rsjax.tools.policies.studies.rejudging import blind, named_judge, rejudge
+    from rsjax.tools.policies.studies.trials import open_lift
 
     runs = {name: RunData(run, options.data_dir) for name, run in named(options.runs).items()}
     first, trials = next(iter(runs.values())), part(options, Trials)
@@ -76,7 +76,7 @@ def main() -> None:
         policies = checkpoints(sized_policy(options.size, options.steps), demos, out / "policy", options.checkpoints)
     common_size(policies.values())
     worlds = {name: partial(run.world, trials.together, judge) for name, run in runs.items()}
-    with lift_simulators(config, trials) as simulator:
+    with open_lift(config, trials) as simulator:
         compare(policies, simulator, worlds, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 

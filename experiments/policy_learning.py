@@ -8,8 +8,8 @@ import tyro
 
 from experiments.cli import main_errors, parse_options, part
 from rsjax.runtime import tune_process
-from rsjax.tools.policies.learning import Learning
-from rsjax.tools.policies.trials import Trials
+from rsjax.tools.policies.studies.policy_learning import Learning
+from rsjax.tools.policies.studies.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ def main() -> None:
     tune_process()
     options = parse_options(sys.argv[1:], "python -m experiments.policy_learning", Options.__doc__ or "", Options())
     from rsjax.tools.policies.demos import Demos
-    from rsjax.tools.policies.learning import learn
     from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos
-    from rsjax.tools.policies.trials import lift_simulators
+    from rsjax.tools.policies.studies.policy_learning import learn
+    from rsjax.tools.policies.studies.trials import open_lift
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "policy_learning"
     config, learning, trials = sized_policy(options.size, options.steps), part(options, Learning), part(options, Trials)
@@ -52,7 +52,7 @@ def main() -> None:
     if any(cell.synthetic for cell in learning.chosen()):
         synthetic = synthetic_demos(options.synthetic or options.run / "synthetic" / "clips", options.run)
     real = run.demos(seed=options.seed)
-    with lift_simulators(run.simulator, trials) as simulator:
+    with open_lift(run.simulator, trials) as simulator:
         learn(learning, config, real, synthetic, simulator, trials, out)
     print((out / "results.md").read_text(), out, sep="\n")
 

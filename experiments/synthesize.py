@@ -8,7 +8,7 @@ import tyro
 
 from experiments.cli import main_errors, parse_options, part
 from rsjax.runtime import tune_process
-from rsjax.tools.policies.synthesize import CLIPS, Synthesis
+from rsjax.tools.policies.studies.synthesis import CLIPS, Synthesis
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ def main() -> None:
     options = parse_options(sys.argv[1:], "python -m experiments.synthesize", Options.__doc__ or "", Options())
     from rsjax.data.store import open_store
     from rsjax.progress import Progress
-    from rsjax.tools.policies.episodes import action_range
     from rsjax.tools.policies.run_data import RunData
-    from rsjax.tools.policies.synthesize import synthesize
+    from rsjax.tools.policies.studies.synthesis import synthesize
+    from rsjax.tools.policies.worlds.actions import action_range
 
     run, out = RunData(options.run, options.data_dir), options.out or options.run / "synthetic"
     store = open_store(options.store) if options.store else run.clips
-    low, high, _ = action_range(run.config, run.trained.assets.normalization)
+    limits = action_range(run.config, run.trained.assets.normalization)
     judge = run.judge() if options.judge else None
     with Progress("synthesize", options.demos, "demos") as progress:
         made = synthesize(
@@ -48,7 +48,7 @@ def main() -> None:
             store,
             out,
             part(options, Synthesis),
-            (low, high),
+            limits,
             judge=judge,
             report=lambda done, total: progress.update(done),
         )

@@ -27,7 +27,7 @@ from rsjax.models.roboscape.rollout import rollout
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.bench import inputs
 from rsjax.tools.bench.timing import median_seconds
-from rsjax.tools.policies.vector_env import WorldModelVectorEnv
+from rsjax.tools.policies.worlds.environments import WorldModelVectorEnv
 from rsjax.training.sharding import Sharding
 from rsjax.training.state import create_state
 from rsjax.training.step import train_step

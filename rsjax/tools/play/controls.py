@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from rsjax.config import Config
 from rsjax.data.normalization import Normalization
 from rsjax.tools.play.errors import Refused
-from rsjax.tools.policies.episodes import action_range
+from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.sim.lift import STEP, TURN
 
 
@@ -97,10 +97,10 @@ def controls_of_run(config: Config, normalization: Normalization, names: Sequenc
     """
     if not config.data.key:
         return Controls(_LIFT if config.sim.env == "lift" else _METAWORLD, config.sim.control_steps)
-    low, high, _ = action_range(config, normalization)
+    limits = action_range(config, normalization)
     mean = normalization.action_mean
     each = []
-    for number, (least, most) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+    for number, (least, most) in enumerate(zip(limits.low.tolist(), limits.high.tolist(), strict=True)):
         name = names[number] if number < len(names) else ""
         if not name or name.startswith("("):
             name = f"action {number} {name}".strip()

@@ -3,7 +3,6 @@
 Axes: A action dimensions, S×S pixels.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,12 +15,12 @@ from rsjax.tools.play.messages import choice, whole
 from rsjax.tools.play.run_data import PlayRun
 from rsjax.tools.play.session import Session
 from rsjax.tools.play.tree import Branch, Node
-from rsjax.tools.policies.judge import FILE
-from rsjax.tools.policies.judging import FOLDER
-from rsjax.tools.policies.planning import PlanSettings, actors
+from rsjax.tools.policies.judges.judge_training import FOLDER
+from rsjax.tools.policies.judges.trained_judge import FILE
+from rsjax.tools.policies.planning.closed_loop import PlanSettings, actors
+from rsjax.tools.policies.worlds.world import Actor
 
 KINDS = ("clip", "random", "policy", "planner")
-Act = Callable[[dict[str, np.ndarray]], Any]
 
 
 @dataclass
@@ -33,7 +32,7 @@ class Acting:
     """
 
     kind: str
-    act: Act
+    act: Actor
     last: Node | None = None
 
 
@@ -60,7 +59,7 @@ class Sources:
         acting = self.acting.get(branch.number)
         if acting is None or acting.kind != kind or acting.last is not branch.nodes[-1]:
             acting = self.acting[branch.number] = Acting(kind, self._actor(kind, session, branch))
-        return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)
+        return np.asarray(acting.act(_seen(session, branch.nodes[-1])), np.float32)[0]
 
     def acted(self, branch: Branch, source: dict[str, Any] | None) -> None:
         """Notes that an action of this source (None: a person) led to the branch's last frame."""
@@ -79,11 +78,10 @@ class Sources:
             raise Refused("no_action", f"the clip ends after {len(actions)} frames")
         return actions[frame]
 
-    def _actor(self, kind: str, session: Session, branch: Branch) -> Act:
+    def _actor(self, kind: str, session: Session, branch: Branch) -> Actor:
         if kind == "policy":
             assert self.run.policy is not None
-            act = self.run.policy.actor(session.seed)
-            return lambda seen: act(seen["rgb"][None])[0]
+            return self.run.policy.actor(session.seed)
         settings = PlanSettings(methods=("cem",))
         planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
         return planner(session.seed, branch.nodes[0].moment.rgb)
@@ -104,10 +102,10 @@ def reasons(run: PlayRun) -> dict[str, str]:
 
 def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
     """Returns a policy's observation of a frame."""
-    seen = {"rgb": node.moment.rgb}
+    seen = {"rgb": node.moment.rgb[None]}
     if session.has_depth:
         depth = session.engine.branching(True).depth(node.moment)
-        seen |= {} if depth is None else {"depth": depth}
+        seen |= {} if depth is None else {"depth": depth[None]}
     return seen
 
 

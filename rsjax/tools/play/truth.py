@@ -19,7 +19,7 @@ from rsjax.processes import Helper, WorkerDied
 from rsjax.tools.play.errors import Refused
 from rsjax.tools.play.simulate import Job, Rendered, Simulate, simulate
 from rsjax.tools.play.tree import Node, Truth
-from rsjax.tools.policies.simulator import clip_seed
+from rsjax.tools.sim.episode import clip_seed
 
 SECONDS = 120.0  # time limit for a step or for the simulator's start
 MOST = 2  # simulators of a server

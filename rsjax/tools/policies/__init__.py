@@ -12,19 +12,17 @@ Importing this package registers the environments with Gymnasium::
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rsjax.tools.policies.env import WorldModelEnv
-    from rsjax.tools.policies.simulator import LiftEnv
-    from rsjax.tools.policies.vector_env import WorldModelVectorEnv
+    from rsjax.tools.policies.worlds.environments import LiftEnv, WorldModelEnv, WorldModelVectorEnv
 
 __all__ = ["LiftEnv", "WorldModelEnv", "WorldModelVectorEnv", "register"]
 
-_WHERE = {"LiftEnv": "simulator", "WorldModelEnv": "env", "WorldModelVectorEnv": "vector_env"}
+_MODULE = "rsjax.tools.policies.worlds.environments"
 _ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "rsjax/WorldModel-v0": {
-        "entry_point": "rsjax.tools.policies.env:WorldModelEnv",
-        "vector_entry_point": "rsjax.tools.policies.vector_env:WorldModelVectorEnv",
+        "entry_point": f"{_MODULE}:WorldModelEnv",
+        "vector_entry_point": f"{_MODULE}:WorldModelVectorEnv",
     },
-    "rsjax/Lift-v0": {"entry_point": "rsjax.tools.policies.simulator:LiftEnv"},
+    "rsjax/Lift-v0": {"entry_point": f"{_MODULE}:LiftEnv"},
 }
 
 
@@ -39,11 +37,11 @@ def register() -> None:
 
 def __getattr__(name: str) -> Any:
     """Imports a public class, and with it jax or the simulator, at its first use."""
-    if name not in _WHERE:
+    if name not in ("LiftEnv", "WorldModelEnv", "WorldModelVectorEnv"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"rsjax.tools.policies.{_WHERE[name]}"), name)
+    return getattr(import_module(_MODULE), name)
 
 
 register()

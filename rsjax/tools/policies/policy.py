@@ -11,14 +11,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
 from rsjax.config import ConfigError, LoopConfig, content_key, from_dict, to_dict
 from rsjax.errors import UserError
+from rsjax.evaluation.results import fingerprint
 from rsjax.files import disk_guard, read_json, write_json
 from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy, Range
-from rsjax.tools.policies.keys import arrays_key
+from rsjax.tools.policies.worlds.world import Observation
 from rsjax.trainable import Params
 from rsjax.training.checkpoint import load_weights, save_weights
 
@@ -43,7 +44,7 @@ class Policy:
     def key(self) -> str:
         """A hash of all that actions depend on: weights, range and settings except those of training."""
         model = replace(self.model, config=replace(self.model.config, train=LoopConfig()))
-        return content_key("policy", str(model), str(self.range), arrays_key(self.params))
+        return content_key("policy", str(model), str(self.range), fingerprint((self.params,)))
 
     def actor(self, seed: int = 0) -> "Actor":
         """Returns an actor for new episodes; the seed determines its draws."""
@@ -79,7 +80,7 @@ def load_policy(directory: Path) -> Policy:
 
 
 class Actor:
-    """Acts in B episodes that began together: it takes their frames and returns an action for each.
+    """Acts in B episodes that began together: it takes their observations and returns an action for each.
 
     It makes a new plan after executing as many controls of the last plan as the settings say.
     """
@@ -92,13 +93,18 @@ class Actor:
         self._plan: np.ndarray | None = None
         self._done = 0  # frames so far
 
-    def __call__(self, frames: UInt8[np.ndarray, "B S S 3"]) -> Float32[np.ndarray, "B A"]:
+    def __call__(self, observation: Observation) -> Float32[np.ndarray, "B A"]:
         """Returns the actions to take at these frames.
+
+        Args:
+            observation: "rgb", uint8 (B, S, S, 3); the policy reads nothing else.
 
         Raises:
             UserError: the frames are not of the policy's size.
         """
-        model, size = self._model, self._model.image_size
+        model = self._model
+        size = model.image_size
+        frames = observation["rgb"]
         if np.shape(frames)[1:] != (size, size, 3):
             raise UserError(
                 f"the policy sees frames (B, {size}, {size}, 3), not {np.shape(frames)}; it is another run's"

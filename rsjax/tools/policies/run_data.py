@@ -13,14 +13,13 @@ from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import relocated
-from rsjax.tools.policies.actions import check_takes_actions
 from rsjax.tools.policies.config import PolicyConfig, policy_preset
 from rsjax.tools.policies.demos import Demos, Only, load_demos
-from rsjax.tools.policies.episodes import action_range
-from rsjax.tools.policies.judge import load_judge
-from rsjax.tools.policies.judging import FOLDER
-from rsjax.tools.policies.rollouts import FirstFrame, Imagined
-from rsjax.tools.policies.verdicts import Judge
+from rsjax.tools.policies.judges.judge import Judge
+from rsjax.tools.policies.judges.judge_training import FOLDER
+from rsjax.tools.policies.judges.trained_judge import load_judge
+from rsjax.tools.policies.worlds.actions import check_takes_actions
+from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
 
 TAKEN = {"policy", "simulator", "videos"}  # folders beside those of the runs, in the results of policy_evaluation
 
@@ -68,15 +67,14 @@ class RunData:
             )
         return from_dict(SimConfig, self.clips.manifest["config"])
 
-    def world(self, count: int, judge: Path | None = None) -> Imagined:
+    def world(self, count: int, judge: Path | None = None) -> ModelWorld:
         """Returns the run's world model as a world of ``count`` episodes, with the run's judge or that in a folder.
 
         Raises:
             UserError: the run is unfinished, its model takes no actions, or there is no judge for its frames.
         """
         check_takes_actions(self.config.model, f"{self.run}: the model")
-        low, high, _ = action_range(self.config, self.trained.assets.normalization)
-        return Imagined(self.trained, count, self.judge(judge), low, high)
+        return ModelWorld(self.trained, count, self.judge(judge))
 
     def check_world(self, like: "RunData") -> None:
         """Checks, without loading weights, that policies of another run's clips can act in this run's model.
@@ -107,7 +105,7 @@ class RunData:
         source = self.clips.source(split)
         chosen = readable(source, range(min(count, len(source))))
         return [
-            FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number)
+            FirstFrame(clip["rgb"][0], None if clip["depth"] is None else clip["depth"][0], number, number)
             for number, clip in chosen
         ]
 

@@ -162,6 +162,11 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     )
 
 
+def clip_seed(provenance: dict[str, Any]) -> int:
+    """Returns the seed with which a simulator's ``reset`` starts where a simulated clip started."""
+    return int(np.random.default_rng([provenance["seed"], provenance["episode"]]).integers(2**32))
+
+
 def source_name(config: SimConfig) -> str:
     """Returns the name of the simulator and its robot."""
     return "robosuite/Lift/Panda" if config.env == "lift" else "metaworld/Sawyer"

@@ -142,3 +142,9 @@ class Expert:
             self._goal = self._rng.uniform(low, (0.12, 0.2, TABLE_HEIGHT + 0.25))
             self._finger = OPEN if self._rng.random() < 0.6 else CLOSE
         return self._goal, self._finger
+
+
+def skilled_expert(seed: int) -> Expert:
+    """Returns a scripted expert that always tries to lift: fast, without noise, and centred on the cube."""
+    manner = Manner("lift", 1.0, 0.0, 0.0, 0, 0.06, (0.0, 0.0, -0.004), 6, (0.03, 0.0, 0.15), -1)
+    return Expert(manner, np.random.default_rng(seed))

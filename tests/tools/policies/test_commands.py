@@ -10,14 +10,14 @@ from experiments.cli import parse_options, part
 from rsjax.config import ConfigError
 from rsjax.errors import UserError
 from rsjax.files import write_file
-from rsjax.tools.policies import learning as learning_module
-from rsjax.tools.policies import training as training_module
-from rsjax.tools.policies import trials as trials_module
-from rsjax.tools.policies.improvement import Improvement
-from rsjax.tools.policies.learning import Learning
+from rsjax.tools.policies import policy_training as training_module
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.synthesize import Synthesis
-from rsjax.tools.policies.trials import Trials
+from rsjax.tools.policies.studies import policy_learning as learning_module
+from rsjax.tools.policies.studies import trials as trials_module
+from rsjax.tools.policies.studies.improvement import Improvement
+from rsjax.tools.policies.studies.policy_learning import Learning
+from rsjax.tools.policies.studies.synthesis import Synthesis
+from rsjax.tools.policies.studies.trials import Trials
 from tests.tools.policies.toy import demo_store, demos
 
 
@@ -65,7 +65,7 @@ def test_only_cells_of_synthetic_demonstrations_need_some(
 ) -> None:
     monkeypatch.setattr(RunData, "demos", lambda self, seed: demos(2))
     monkeypatch.setattr(RunData, "simulator", None)
-    monkeypatch.setattr(trials_module, "lift_simulators", lambda config, trials: nullcontext())
+    monkeypatch.setattr(trials_module, "open_lift", lambda config, trials: nullcontext())
 
     def learn(settings: Learning, config: Any, real: Any, synthetic: Any, world: Any, trials: Any, out: Path) -> None:
         assert (len(real), len(synthetic)) == (2, 0)

@@ -19,18 +19,18 @@ from rsjax.data.store import open_store
 from rsjax.errors import UserError
 from rsjax.files import FileError, making
 from rsjax.tools.policies import policy as policy_module
-from rsjax.tools.policies import training
+from rsjax.tools.policies import policy_training as training
 from rsjax.tools.policies.config import PolicyConfig, policy_preset, public, toy
 from rsjax.tools.policies.ddpm import add_noise, cosine_schedule
 from rsjax.tools.policies.demos import Demos, load_demos
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy, Range, Windows, scaled
 from rsjax.tools.policies.policy import Actor, Policy, load_policy
-from rsjax.tools.policies.training import train_policy
-from rsjax.tools.policies.trials import Trials, try_policy
+from rsjax.tools.policies.policy_training import train_policy
+from rsjax.tools.policies.studies.trials import Trials, try_policy
 from rsjax.tools.policies.unet1d import Conv, Double, spatial_softmax, step_embedding
 from rsjax.trainable import StepContext
 from tests.tools.policies.toy import CONTROLS, SIZE, WIDTH, demo_store, demos, picture
-from tests.tools.policies.worlds import simulated
+from tests.tools.policies.toy_worlds import simulated
 
 CONTEXT = StepContext(jnp.int32(0), None, None)
 
@@ -230,7 +230,7 @@ def test_going_on_from_a_policy_starts_with_its_weights(
 
 def test_actions_follow_from_the_seed_and_stay_in_the_demonstrations_range(policy: tuple[Policy, Path]) -> None:
     frames = np.stack([picture(2), picture(9)])
-    one, same, other = (policy[0].actor(seed)(frames) for seed in (0, 0, 1))
+    one, same, other = (policy[0].actor(seed)({"rgb": frames}) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)
     assert one.shape == (2, CONTROLS * WIDTH) and np.abs(one - other).max() > 0
     low, high = (np.tile(end, CONTROLS) for end in (policy[0].range.low, policy[0].range.high))
@@ -249,12 +249,12 @@ def test_an_actor_plans_every_few_frames(policy: tuple[Policy, Path], monkeypatc
     net = replace(trained.model, config=replace(trained.model.config, execute=4))
     actor = Actor(replace(trained, model=net), 0)
     frames = [np.full((2, SIZE, SIZE, 3), number, np.uint8) for number in range(4)]
-    rows = [actor(each) for each in frames]
+    rows = [actor({"rgb": each}) for each in frames]
     assert [each[0, :, 0, 0, 0].tolist() for each in planned] == [[0, 0], [1, 2]]  # frame 0 twice, then 1 and 2
     for row, first in zip(rows, (0.1, 0.12, 0.2, 0.22), strict=True):
         np.testing.assert_allclose(row, np.repeat([first, first + 0.01], WIDTH)[None].repeat(2, 0), atol=1e-6)
     with pytest.raises(UserError, match=r"sees frames \(B, 16, 16, 3\), not \(2, 8, 8, 3\)"):
-        actor(np.zeros((2, 8, 8, 3), np.uint8))
+        actor({"rgb": np.zeros((2, 8, 8, 3), np.uint8)})
 
 
 @given(st.integers(1, 20), st.integers(1, 40), st.integers(1, 40))

@@ -8,9 +8,9 @@ import pytest
 from rsjax.config import Config, presets, to_dict
 from rsjax.errors import UserError
 from rsjax.files import write_json
-from rsjax.tools.policies.judge import Network, TrainedJudge
+from rsjax.tools.policies.judges.judge import HISTORY
+from rsjax.tools.policies.judges.trained_judge import Network, TrainedJudge
 from rsjax.tools.policies.run_data import RunData
-from rsjax.tools.policies.verdicts import HISTORY
 
 
 def run(path: Path, config: Config, trained: bool = True) -> RunData:

@@ -55,20 +55,20 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         last = {"imagined": [True, True], "control": [True, False]}
         return {"before": [False, False], "rounds": [{"imagined": [], "control": []}, last]}
 
-    def plan(trained: Any, place: Path, settings: Any) -> Any:
+    def plan(trained: Any, place: Path, simulator: Any, settings: Any) -> Any:
         asked["plan"] = settings
         ways = {"random": [False, False], "expert": [True, True], "cem": [False, True], "mppi": [True, True]}
         return {"episodes": [{"way": way, "success": hit} for way, row in ways.items() for hit in row]}
 
     monkeypatch.setattr(policies, "_judged", lambda run, size: Data())
-    monkeypatch.setattr(policies, "lift_simulators", lambda *given: nullcontext())
-    monkeypatch.setattr(policies, "action_range", lambda *given: (None, None, None))
+    monkeypatch.setattr(policies, "open_lift", lambda *given: nullcontext())
+    monkeypatch.setattr(policies, "action_range", lambda *given: None)
     monkeypatch.setattr(policies, "synthesize", lambda *given, **named: asked.update(demos=given[3].demos))
     monkeypatch.setattr(policies, "synthetic_demos", lambda *given: demos(40))
     monkeypatch.setattr(policies, "train_policy", lambda *given, **named: None)
-    monkeypatch.setattr(policies.comparison, "checkpoints", lambda config, source, place: {"a": 1, "b": 2})
-    monkeypatch.setattr(policies.comparison, "compare", compare)
-    monkeypatch.setattr(policies.planning, "compare", plan)
+    monkeypatch.setattr(policies.policy_evaluation, "checkpoints", lambda config, source, place: {"a": 1, "b": 2})
+    monkeypatch.setattr(policies.policy_evaluation, "compare", compare)
+    monkeypatch.setattr(policies.closed_loop, "compare", plan)
     monkeypatch.setattr(policies, "learn", learn)
     monkeypatch.setattr(policies, "improve", improve)
     return asked

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,18 +13,19 @@ from rsjax.evaluation.registry import Unavailable
 from rsjax.files import making
 from rsjax.progress import Progress
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.policies import comparison, planning
 from rsjax.tools.policies.config import PolicyConfig
-from rsjax.tools.policies.episodes import action_range
-from rsjax.tools.policies.improvement import Improvement, improve
-from rsjax.tools.policies.judge import FILE as JUDGE_FILE
-from rsjax.tools.policies.judging import FOLDER as JUDGE
-from rsjax.tools.policies.judging import JudgeSettings, make_judge
-from rsjax.tools.policies.learning import Learning, learn
+from rsjax.tools.policies.judges.judge_training import FOLDER as JUDGE
+from rsjax.tools.policies.judges.judge_training import JudgeSettings, make_judge
+from rsjax.tools.policies.judges.trained_judge import FILE as JUDGE_FILE
+from rsjax.tools.policies.planning import closed_loop
+from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.run_data import RunData, sized_policy, synthetic_demos
-from rsjax.tools.policies.synthesize import CLIPS, Synthesis, synthesize
-from rsjax.tools.policies.training import train_policy
-from rsjax.tools.policies.trials import Trials, lift_simulators
+from rsjax.tools.policies.studies import policy_evaluation
+from rsjax.tools.policies.studies.improvement import Improvement, improve
+from rsjax.tools.policies.studies.policy_learning import Learning, learn
+from rsjax.tools.policies.studies.synthesis import CLIPS, Synthesis, synthesize
+from rsjax.tools.policies.studies.trials import Trials, open_lift
+from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.studies.paper.budget import FAMILY_EPISODES
 from rsjax.tools.studies.paper.claim import Arm, Claim, Comparison, register
 from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
@@ -114,11 +115,13 @@ def judged(run: Run) -> Scores:
     """Rolls out eight checkpoints of a policy in the simulator and in the run's world model."""
     size = Size.of(run.config)
     data, place = _judged(run, size), _place(run, size)
-    with making(place, wait=True), lift_simulators(data.simulator, size.trials) as simulator:
+    with making(place, wait=True), open_lift(data.simulator, size.trials) as simulator:
         demos = data.demos()
-        policies = comparison.checkpoints(size.policy, demos.first(min(size.demos, len(demos))), place / "judged")
+        policies = policy_evaluation.checkpoints(
+            size.policy, demos.first(min(size.demos, len(demos))), place / "judged"
+        )
         models = {run.directory.name: partial(data.world, size.trials.together)}
-        (row,) = comparison.compare(policies, simulator, models, size.trials, place / "in-models")["runs"]
+        (row,) = policy_evaluation.compare(policies, simulator, models, size.trials, place / "in-models")["runs"]
     pearson = row["pearson"]["value"]
     same = [np.equal(each["simulator"], each["world_model"]) for each in row["policies"].values()]
     return {
@@ -135,15 +138,15 @@ def learned(run: Run) -> Scores:
     data, place, own = _judged(run, size), _place(run, size), run.directory / FOLDER / "policies"
     real = data.demos()
     many = min(size.demos, len(real))
-    low, high, _ = action_range(data.config, data.trained.assets.normalization)
+    limits = action_range(data.config, data.trained.assets.normalization)
     with Progress("synthesize", many, "demos") as progress:
         show = lambda done, total: progress.update(done)  # noqa: E731
-        synthesize(data.trained, data.clips, own, Synthesis(many, batch=min(10, many)), (low, high), report=show)
+        synthesize(data.trained, data.clips, own, Synthesis(many, batch=min(10, many)), limits, report=show)
     synthetic = synthetic_demos(own / CLIPS, run.directory)
     cells = {"few": f"synthetic-{size.few}", "many": f"synthetic-{many}", "both": f"real-{many}-synthetic-{many}"}
     controls = {"real_few": f"real-{size.few}", "real": f"real-{many}", "repeated": f"real-{many}-repeated"}
     rows: dict[str, list[bool]] = {}
-    with making(place, wait=True), lift_simulators(data.simulator, size.trials) as simulator:
+    with making(place, wait=True), open_lift(data.simulator, size.trials) as simulator:
         for names, folder in ((cells, own), (controls, place)):
             wanted = Learning((size.few, many), cells=tuple(names.values()))
             made = learn(wanted, size.policy, real, synthetic, simulator, size.trials, folder / "learned")
@@ -158,7 +161,7 @@ def improved(run: Run) -> Scores:
     data, place = _judged(run, size), _place(run, size)
     settings = Improvement(imagined=size.demos, steps=size.policy.train.steps // 4, max_steps=size.trials.max_steps)
     demos, model = data.demos().first(size.few), data.world(size.trials.together)
-    with making(place, wait=True), lift_simulators(data.simulator, size.trials) as simulator:
+    with making(place, wait=True), open_lift(data.simulator, size.trials) as simulator:
         policy = train_policy(size.policy, demos, place / "few")
         starts = data.first_frames(settings.imagined * settings.rounds)
         out = run.directory / FOLDER / "improved"
@@ -173,8 +176,9 @@ def planned(run: Run) -> Scores:
     """Plans in the run's world model and acts in the simulator."""
     size = Size.of(run.config)
     data = _judged(run, size)
-    settings = planning.PlanSettings(episodes=size.trials.episodes)
-    episodes = planning.compare(data.trained, run.directory, settings)["episodes"]
+    settings = closed_loop.PlanSettings(episodes=size.trials.episodes)
+    with open_lift(run.config.sim, replace(size.trials, together=1)) as simulator:
+        episodes = closed_loop.compare(data.trained, run.directory, simulator, settings)["episodes"]
     ways = dict.fromkeys(row["way"] for row in episodes)
     return {way: [float(row["success"]) for row in episodes if row["way"] == way] for way in ways}
 

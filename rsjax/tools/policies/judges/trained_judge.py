@@ -1,0 +1,239 @@
+"""A small network that judges a task from the last four frames; it learns from frames that the simulator labelled.
+
+"Uninterpretable" is its third class, trained on frames that are spoilt on purpose: shuffled blocks, two clips on top of
+one another, heavy noise, heavy blur. The validation also judges spoilt held-out frames.
+
+Axes: B videos, F frames of a history, H×W pixels.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from rsjax.config import content_key
+from rsjax.data.codec import decode, encode
+from rsjax.errors import UserError
+from rsjax.evaluation.results import fingerprint
+from rsjax.files import read_json, write_file
+from rsjax.layers.group_norm import GroupNorm
+from rsjax.progress import Progress
+from rsjax.tools.policies.judges.judge import FAIL, HISTORY, LABELS, SUCCESS, UNINTERPRETABLE, last_frames
+
+FILE = "judge.msgpack"
+VALIDATION = "validation.json"
+SIDE = 64  # pixels; frames with a longer side are downsampled for the network
+BATCH = 64  # histories in a training step, of which a quarter are spoilt
+SPOILT = BATCH // 4
+CHUNK = 256  # histories in a forward pass, at most
+
+
+class Network(nn.Module):
+    """Convolutions over a history's frames stacked as channels, then two linear layers."""
+
+    @nn.compact
+    def __call__(self, frames: UInt8[Array, "B F H W 3"]) -> Float[Array, "B 3"]:
+        """Returns the logit of each label."""
+        b, count, height, width, _ = frames.shape
+        x = jnp.moveaxis(frames, 1, 3).reshape(b, height, width, count * 3).astype(jnp.float32) / 127.5 - 1
+        if height > SIDE:
+            x = jax.image.resize(x, (b, SIDE, SIDE, count * 3), "linear")
+        for width, stride in ((24, 2), (32, 2), (32, 1), (48, 2), (48, 2)):
+            x = nn.relu(GroupNorm(8)(nn.Conv(width, (3, 3), (stride, stride))(x)))
+        return nn.Dense(len(LABELS))(nn.relu(nn.Dense(64)(x.reshape(b, -1))))
+
+
+@dataclass(frozen=True)
+class TrainedJudge:
+    """A trained network and the temperature that calibrates it; a :class:`rsjax.tools.policies.judges.judge.Judge`.
+
+    Attributes:
+        side: of the frames that it was trained on, pixels.
+        validation: the content of its ``validation.json``, if it was validated.
+    """
+
+    params: Any
+    temperature: float
+    side: int
+    validation: dict[str, Any] | None = None
+
+    @cached_property
+    def key(self) -> str:
+        """A hash of the weights and the temperature."""
+        return content_key("judge", fingerprint((self.params,)), self.temperature)
+
+    def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
+        history, parts = last_frames(frames), []
+        for start in range(0, len(history), CHUNK):
+            parts.append(np.asarray(_probabilities(self.params, self.temperature, history[start : start + CHUNK])))
+        return np.concatenate(parts)
+
+    def save(self, folder: Path) -> None:
+        """Writes what :func:`load_judge` reads, atomically."""
+        arrays = {"/".join(path): np.asarray(x) for path, x in flatten_dict(self.params).items()}
+        write_file(folder / FILE, encode(arrays | {"temperature": self.temperature, "side": self.side}))
+
+
+def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
+    """Reads a judge that ``python -m experiments.judge`` trained, with its validation if that is of the same judge.
+
+    Args:
+        side: of the frames that the judge will see, pixels; None: not known yet.
+
+    Raises:
+        UserError: there is no judge, its file is damaged, or it does not take frames of that size.
+    """
+    path, report = folder / FILE, folder / VALIDATION
+    try:
+        record = decode(path.read_bytes())
+        temperature, trained_on = float(record.pop("temperature")), int(record.pop("side"))
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{path}: damaged ({error}); train it again with python -m experiments.judge RUN") from error
+    if side not in (None, trained_on):
+        raise UserError(
+            f"{path}: was trained on frames of {trained_on} × {trained_on} pixels, these have {side} × {side}; train "
+            f"one on such frames with python -m experiments.judge RUN"
+        )
+    params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
+    judge = TrainedJudge(params, temperature, trained_on)
+    found = read_json(report, cure="train the judge again") if report.exists() else None
+    # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
+    return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Labelled videos to learn from or to be validated on.
+
+    Attributes:
+        rgb: the N videos.
+        success: the simulator's success predicate at each frame.
+    """
+
+    rgb: UInt8[np.ndarray, "N T H W 3"]
+    success: Bool[np.ndarray, "N T"]
+
+    def histories(self, videos: Int[np.ndarray, " B"], frames: Int[np.ndarray, " B"]) -> UInt8[np.ndarray, "B F H W 3"]:
+        """Returns the history that ends at the given frame, for each given video."""
+        back = np.maximum(frames[:, None] - np.arange(HISTORY)[::-1], 0)
+        return self.rgb[videos[:, None], back]
+
+
+def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> TrainedJudge:
+    """Trains a judge; the result depends on the arguments alone.
+
+    Args:
+        footage: training videos, which must show both success and failure.
+        held: held-out videos, on which the temperature is fitted.
+        steps: steps of Adam, with batches of ``BATCH``.
+
+    Raises:
+        UserError: the videos show only success, or only failure.
+    """
+    found = [np.argwhere(footage.success == done) for done in (True, False)]
+    if not all(map(len, found)):
+        raise UserError(
+            f"the simulator calls {footage.success.mean():.0%} of {footage.success.size} training frames a success; a "
+            f"judge needs clips of both success and failure"
+        )
+    rng, height = np.random.default_rng(seed), footage.rgb.shape[2]
+    params = Network().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
+    optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
+    state, step = optimizer.init(params), _make_step(optimizer)
+    with Progress("judge", steps, "steps") as progress:
+        for number in range(steps):
+            params, state = step(params, state, *_batch(footage, found, rng))
+            progress.update(number + 1)
+    return TrainedJudge(params, _temperature(params, held, rng), height)
+
+
+def spoilt(
+    frames: UInt8[np.ndarray, "B F H W 3"], others: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator
+) -> UInt8[np.ndarray, "B F H W 3"]:
+    """Returns histories that nobody can interpret, each spoilt in one of four ways.
+
+    If the side is not a multiple of 8, shuffled blocks and blur leave a border unchanged.
+
+    Args:
+        others: histories of other videos, which may be put on top.
+    """
+    edge = frames.shape[2] // 8
+    size, lead = 8 * edge, frames.shape[:2]
+    inner, shuffled, blurred = frames[:, :, :size, :size], frames.copy(), frames.astype(float)
+    blocks = inner.reshape(*lead, 8, edge, 8, edge, 3).swapaxes(3, 4)
+    mixed_up = blocks.reshape(*lead, 64, edge, edge, 3)[:, :, rng.permutation(64)]
+    shuffled[:, :, :size, :size] = mixed_up.reshape(blocks.shape).swapaxes(3, 4).reshape(inner.shape)
+    means = inner.reshape(*lead, 4, size // 4, 4, size // 4, 3).mean((3, 5), keepdims=True)
+    blurred[:, :, :size, :size] = means.repeat(size // 4, 3).repeat(size // 4, 5).reshape(inner.shape)
+    mixed = (frames.astype(np.float32) + others) / 2
+    noisy = frames + rng.normal(0, rng.uniform(50, 110), frames.shape)
+    kind = rng.integers(4, size=(len(frames), 1, 1, 1, 1))
+    out = np.select([kind == 0, kind == 1, kind == 2], [shuffled, mixed, noisy], blurred)
+    return np.clip(np.round(out), 0, 255).astype(np.uint8)
+
+
+def _batch(footage: Footage, found: list[np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draws histories and their labels: half of them successes, then a quarter of all spoilt."""
+    half = BATCH // 2
+    chosen = np.concatenate([each[rng.integers(len(each), size=half)] for each in found])
+    frames = _altered(footage.histories(*chosen.T), rng)
+    labels = np.repeat([SUCCESS, FAIL], half)
+    rows = rng.permutation(BATCH)[:SPOILT]
+    others = (rows + rng.integers(1, BATCH, SPOILT)) % BATCH  # never the same history
+    frames[rows] = spoilt(frames[rows], frames[others], rng)
+    labels[rows] = UNINTERPRETABLE
+    return frames, labels
+
+
+def _altered(frames: UInt8[np.ndarray, "B F H W 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "B F H W 3"]:
+    """Changes contrast, brightness, position (by up to 2 pixels) and noise a little, as generated frames vary."""
+    one = (len(frames), 1, 1, 1, 1)
+    shifted = np.roll(frames, rng.integers(-2, 3, 2), axis=(2, 3)).astype(np.float32)
+    out = (shifted - 128) * rng.uniform(0.85, 1.15, one) + 128 + rng.normal(0, 8, one)
+    out += rng.uniform(0, 10, one) * rng.standard_normal(frames.shape, np.float32)
+    return np.clip(np.round(out), 0, 255).astype(np.uint8)
+
+
+def _temperature(params: Any, held: Footage, rng: np.random.Generator) -> float:
+    """Returns the temperature under which the held-out labels are most probable."""
+    found = [each for each in (np.argwhere(held.success == done) for done in (True, False)) if len(each)]
+    if len(found) < 2:
+        return 1.0
+    frames, labels = (np.concatenate(part) for part in zip(*(_batch(held, found, rng) for _ in range(8)), strict=True))
+    logits = np.asarray(_logits(params, frames))
+    grid = np.geomspace(0.25, 8, 61)
+    log_p = jax.nn.log_softmax(logits[None] / grid[:, None, None], axis=-1)
+    return float(grid[np.asarray(log_p)[:, np.arange(len(labels)), labels].mean(1).argmax()])
+
+
+def _make_step(optimizer: optax.GradientTransformation) -> Callable[..., tuple[Any, Any]]:
+    def loss(params: Any, frames: Array, labels: Array) -> Array:
+        return optax.softmax_cross_entropy_with_integer_labels(_logits(params, frames), labels).mean()
+
+    @jax.jit
+    def step(params: Any, state: Any, frames: Array, labels: Array) -> tuple[Any, Any]:
+        updates, state = optimizer.update(jax.grad(loss)(params, frames, labels), state)
+        return optax.apply_updates(params, updates), state
+
+    return step
+
+
+@jax.jit
+def _logits(params: Any, frames: Array) -> Array:
+    return cast(Array, Network().apply({"params": params}, frames))
+
+
+@jax.jit
+def _probabilities(params: Any, temperature: float, frames: Array) -> Array:
+    return jax.nn.softmax(_logits(params, frames) / temperature, axis=-1)

@@ -1,0 +1,111 @@
+"""Measures how far a judge can be trusted: its confusion matrix and calibration on held-out videos of three kinds.
+
+The kinds are raw frames, the tokenizer's reconstructions, and videos generated under the clips' own actions. The labels
+are always the simulator's. On generated videos the model's errors count as the judge's errors: if the model drops a
+cube that was lifted in the clip, a correct judge says "fail" but the label is "success".
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.table import Table
+
+from rsjax.evaluation.statistics import wilson
+from rsjax.tools.policies.judges.judge import FAIL, LABELS, SUCCESS, UNINTERPRETABLE, Judge
+from rsjax.tools.policies.judges.trained_judge import Footage, spoilt
+
+KINDS = ("raw", "reconstructed", "generated")
+BINS = 10
+AT_ONCE = 1024  # histories judged at once
+
+
+def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False) -> dict[str, Any]:
+    """Judges every frame from ``first`` on, and returns counts and rates, ready for JSON.
+
+    Args:
+        spoil: whether to judge also an equal number of spoilt histories, whose label is "uninterpretable".
+    """
+    videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
+    truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
+    rng, probabilities = np.random.default_rng(0), []
+    labels = []
+    for start in range(0, len(videos), AT_ONCE):
+        rows = slice(start, start + AT_ONCE)
+        history = footage.histories(videos[rows], frames[rows])
+        probabilities.append(judge(history))
+        labels.append(truth[rows])
+        if spoil:
+            probabilities.append(judge(spoilt(history, np.roll(history, len(history) // 2, axis=0), rng)))
+            labels.append(np.full(len(history), UNINTERPRETABLE))
+    return scores(np.concatenate(probabilities), np.concatenate(labels))
+
+
+def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]) -> dict[str, Any]:
+    """Returns the confusion matrix (rows: the truth), rates with Wilson intervals, and the calibration.
+
+    ``calibration_error`` is the expected calibration error (ECE): the mean gap between the highest probability and the
+    share of correct labels, over ten equal bins of that probability, weighted by the bins' counts. ``brier`` is the
+    mean squared error of the probabilities. Frames of one clip resemble each other, so the intervals, which count
+    frames as independent, are narrower than they should be.
+    """
+    chosen, sure = probabilities.argmax(-1), probabilities.max(-1)
+    right = chosen == truth
+    matrix = np.zeros((len(LABELS), len(LABELS)), int)
+    np.add.at(matrix, (truth, chosen), 1)
+    place = np.minimum((sure * BINS).astype(int), BINS - 1)
+    bins = [
+        {"confidence": float(sure[place == i].mean()), "right": float(right[place == i].mean()), "frames": int(count)}
+        for i, count in enumerate(np.bincount(place, minlength=BINS))
+        if count
+    ]
+    rates = {f"{LABELS[i]}_found": (int(row[i]), int(row.sum())) for i, row in enumerate(matrix) if row.sum()}
+    rates["right"] = (int(right.sum()), len(right))
+    intervals = {name: wilson(*counts) for name, counts in rates.items()}
+    error = sum(each["frames"] * abs(each["confidence"] - each["right"]) for each in bins) / len(right)
+    return {
+        "labels": list(LABELS),
+        "confusion": matrix.tolist(),
+        **{name: [rate.value, rate.low, rate.high] for name, rate in intervals.items()},
+        "uninterpretable_share": float((chosen == UNINTERPRETABLE).mean()),
+        "calibration_error": error,
+        "brier": float(np.square(probabilities - np.eye(len(LABELS))[truth]).sum(-1).mean()),
+        "bins": bins,
+    }
+
+
+def summary(validation: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Returns the part of a validation that results contain: for each kind of video, everything but the bins."""
+    if validation is None:
+        return None
+    kinds = {kind: validation[kind] for kind in KINDS if kind in validation}
+    return {kind: {name: part[name] for name in part if name != "bins"} for kind, part in kinds.items()}
+
+
+def markdown(judge: dict[str, Any] | None) -> list[str]:
+    """Returns a :func:`summary` as Markdown lines: confusion matrix and calibration, for each kind of video."""
+    if judge is None:
+        return ["", "The judge has no validation.json: how far it can be trusted is unknown."]
+    found = " / ".join(LABELS)
+    lines = ["", f"The judge on held-out clips (frames called {found}, by what they are):", ""]
+    lines += [f"| video | {' | '.join(LABELS)} | right | calibration error |", "|---|---|---|---|---|---|"]
+    for kind, part in judge.items():
+        rows = [" / ".join(map(str, row)) if any(row) else "–" for row in part["confusion"]]
+        right, error = f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"
+        lines.append(f"| {kind} | {' | '.join(rows)} | {right} | {error} |")
+    return lines
+
+
+def table(result: dict[str, Any]) -> Table:
+    """Formats a validation as a table: a row for each kind of video and true label."""
+    out = Table(title=f"judge on {result['clips']} held-out clips: frames by label")
+    for heading in ("video", "truth", *LABELS, "right", "calibration error"):
+        out.add_column(heading, justify="left" if heading in ("video", "truth") else "right")
+    for kind in KINDS:
+        part = result.get(kind)
+        for i, row in enumerate(part["confusion"] if part else ()):
+            if any(row):
+                share = f"{row[i] / sum(row):.1%}"
+                error = f"{part['calibration_error']:.3f}" if i == 0 else ""  # type: ignore[index]
+                out.add_row(kind, LABELS[i], *map(str, row), share, error)
+    return out

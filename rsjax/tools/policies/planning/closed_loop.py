@@ -1,0 +1,307 @@
+"""Compares planning in a world model with other ways to act, in a closed loop with the simulator.
+
+All ways act in the same episodes, because equal seeds give equal starts. The goal image of an episode is the last frame
+of the scripted expert's episode from the same start; the planner does not see how the expert gets there.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from rich.table import Table
+
+from rsjax.config import content_key
+from rsjax.config.fields import require, require_range
+from rsjax.errors import UserError
+from rsjax.evaluation.statistics import wilson
+from rsjax.files import content_hash, parse_json, write_file, write_json
+from rsjax.models.trained import TrainedModel
+from rsjax.progress import Progress
+from rsjax.tools.policies.judges.judge import judge_key
+from rsjax.tools.policies.judges.judge_training import FOLDER
+from rsjax.tools.policies.judges.trained_judge import load_judge
+from rsjax.tools.policies.judges.validation import markdown, summary
+from rsjax.tools.policies.planning.energies import (
+    Score,
+    Seen,
+    imagined,
+    judged,
+    lpips_distance,
+    pixel_distance,
+    token_distance,
+)
+from rsjax.tools.policies.planning.planner import Planner, PlannerConfig
+from rsjax.tools.policies.policy import Policy
+from rsjax.tools.policies.studies.trials import FPS
+from rsjax.tools.policies.worlds.actions import check_takes_actions
+from rsjax.tools.policies.worlds.model_world import model_key
+from rsjax.tools.policies.worlds.world import FIRST_SEED, Actor, Observation, World, run_episodes
+from rsjax.tools.sim.expert import skilled_expert
+from rsjax.tools.studies.report.video import write_mp4
+
+EnergyName: TypeAlias = Literal["judge", "tokens", "pixels", "lpips"]
+MakeActor: TypeAlias = Callable[[int, UInt8[np.ndarray, "S S 3"]], Actor]  # from an episode's seed and goal image
+MEMORY = 2  # frames in the world model's prompt; one at an episode's beginning
+HEADINGS = ("way to act", "success", "95 % interval", "steps", "seconds a decision", "numbers clipped")
+VIDEOS = 3  # videos of each way to act
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """The settings of a comparison.
+
+    Attributes:
+        planner: how the planner searches; its ``method`` is replaced by each of ``methods``.
+        methods: planning methods to compare.
+        energy: "judge": 1 - the probability of success according to the run's judge; otherwise the distance of the
+            last frame to the goal image, in the model's tokens, in pixels, or in LPIPS.
+        lpips_weights: a file of weights for "lpips".
+        episodes: number of episodes, with seeds from ``FIRST_SEED`` on.
+        max_steps: steps of an episode, at most.
+    """
+
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    methods: tuple[str, ...] = ("cem", "mppi")
+    energy: EnergyName = "judge"
+    lpips_weights: str = ""
+    episodes: int = 50
+    max_steps: int = 20
+
+    def __post_init__(self) -> None:
+        require_range(self, "plan", 1, 2**31, "episodes", "max_steps")
+        known = ("judge", "tokens", "pixels", "lpips")
+        require(self.energy in known, f"plan.energy is {self.energy!r}; it is one of {', '.join(known)}")
+        require(self.energy != "lpips" or bool(self.lpips_weights), "plan.energy is lpips; it needs lpips_weights")
+
+
+class PlanningActor:
+    """Acts in one episode: makes a new plan at every frame, with the last frames as the world model's prompt.
+
+    Attributes:
+        seconds: duration of each decision.
+    """
+
+    def __init__(self, planner: Planner, width: int, depth: bool) -> None:
+        self._planner, self._depth = planner, depth
+        self._frames: list[Observation] = []
+        self._actions = [np.zeros(width, np.float32)]
+        self.seconds: list[float] = []
+
+    def __call__(self, observation: Observation) -> Float32[np.ndarray, "1 A"]:
+        began = time.monotonic()
+        self._frames.append({name: frames[0] for name, frames in observation.items()})
+        kept = 1 if len(self._frames) < MEMORY else MEMORY  # two shapes, so that two programs are compiled
+        frames = self._frames[-kept:]
+        # An episode that began with a picture has no depth, whatever the model generates.
+        depth = np.stack([each["depth"] for each in frames]) if self._depth and "depth" in frames[-1] else None
+        seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
+        action = self._planner(seen).astype(np.float32)
+        self._actions.append(action)
+        self.seconds.append(time.monotonic() - began)
+        return action[None]
+
+
+def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
+    """Returns the score that a planner minimises.
+
+    Raises:
+        UserError: the run has no judge for its frames, its model has no tokens, or the weights are missing or damaged.
+    """
+    if settings.energy == "judge":
+        return judged(load_judge(run / FOLDER, len(goal)))
+    if settings.energy == "tokens":
+        return token_distance(trained, goal)
+    return pixel_distance(goal) if settings.energy == "pixels" else lpips_distance(Path(settings.lpips_weights), goal)
+
+
+def actors(
+    trained: TrainedModel, run: Path, settings: PlanSettings, others: dict[str, MakeActor] | None = None
+) -> dict[str, MakeActor]:
+    """Returns the ways to act by name: random, expert, the given others, and the planner with each method."""
+    config = trained.config
+    depth = config.model.uses_depth and trained.assets.normalization.depth_range is not None
+    high, controls = np.ones(config.clips.action_dim), config.sim.control_steps
+
+    def random(seed: int, goal: np.ndarray) -> Actor:
+        rng = np.random.default_rng(seed)
+        return lambda observation: np.tile(rng.uniform(-1, 1, len(high) // controls), controls)[None]
+
+    def planning(method: str) -> MakeActor:
+        search = PlannerConfig(**asdict(settings.planner) | {"method": method, "hold": controls})
+
+        def make(seed: int, goal: np.ndarray) -> Actor:
+            energy = imagined(trained, score_of(trained, run, settings, goal))
+            return PlanningActor(Planner(energy, -high, high, search), len(high), depth)
+
+        return make
+
+    def expert(seed: int, goal: np.ndarray) -> Actor:
+        scripted = skilled_expert(seed)
+        return lambda observation: [scripted.act]
+
+    return {"random": random, "expert": expert, **(others or {}), **{name: planning(name) for name in settings.methods}}
+
+
+def policy_actor(name: str, policy: Policy, trained: TrainedModel) -> MakeActor:
+    """Returns a function that makes an actor from a policy.
+
+    Raises:
+        UserError: the policy's actions or frames differ in size from those of the run's clips.
+    """
+    clips = trained.config.clips
+    if (policy.action_dim, policy.model.image_size) != (clips.action_dim, clips.image_size):
+        raise UserError(
+            f"{name}: it sees {policy.model.image_size} pixels and answers with {policy.action_dim} "
+            f"numbers; the run's clips have {clips.image_size} and {clips.action_dim}"
+        )
+
+    def make(seed: int, goal: np.ndarray) -> Actor:
+        return policy.actor(seed)
+
+    return make
+
+
+def compare(
+    trained: TrainedModel,
+    run: Path,
+    simulator: World,
+    settings: PlanSettings,
+    policies: Mapping[str, Policy] | None = None,
+) -> dict[str, Any]:
+    """Runs episodes in the simulator with each way to act, and returns success rates and times.
+
+    A :func:`folder` of the run gets the result too. It keeps finished episodes, so an interrupted comparison resumes.
+
+    Args:
+        trained: the model of ``run``, which was trained on simulated clips.
+        simulator: the world of these clips, for one episode at a time.
+        policies: further ways to act, by name.
+
+    Raises:
+        UserError: the run is of recordings, its model takes no actions, or something that the energy needs is missing.
+    """
+    config = trained.config
+    if config.data.key:
+        raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
+    check_takes_actions(config.model, f"{run}: the model")
+    policies = policies or {}
+    others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
+    ways = actors(trained, run, settings, others)
+    score_of(trained, run, settings, np.zeros((config.sim.image_size, config.sim.image_size, 3), np.uint8))  # may raise
+    judge = load_judge(run / FOLDER) if settings.energy == "judge" else None
+    lpips = content_hash(Path(settings.lpips_weights)) if settings.energy == "lpips" else ""
+    used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
+    key = content_key("plan", replace(settings, lpips_weights=lpips), config.sim, tuple(ways), used)
+    place, validation = folder(run, key), judge.validation if judge else None
+    done = _kept(place / "result.json", key)
+    total = settings.episodes * len(ways)
+    with Progress("episodes", total, "episodes") as progress:
+        for number in range(settings.episodes):
+            seed, goal = FIRST_SEED + number, None
+            for name, make in ways.items():
+                if not any(row["way"] == name and row["seed"] == seed for row in done):
+                    goal = _goal(simulator, seed, settings.max_steps) if goal is None else goal
+                    video = place / f"{name.replace('/', '-')}-{number:02d}.mp4" if number < VIDEOS else None
+                    done.append(_row(simulator, name, make(seed, goal), seed, video, settings.max_steps))
+                    write_json(place / "result.json", _summary(done, settings, key, validation))
+                progress.update(len(done))
+    result = _summary(done, settings, key, validation)
+    write_file(place / "results.md", _markdown(result).encode())
+    return result
+
+
+def folder(run: Path, key: str) -> Path:
+    """Returns the folder of the comparison with that key: ``result.json``, ``results.md`` and videos."""
+    return run / "plan" / key[:8]
+
+
+def table(result: dict[str, Any]) -> Table:
+    """Formats the result of a comparison as a table."""
+    out = Table(title=_title(result))
+    for heading in HEADINGS:
+        out.add_column(heading, justify="left" if heading == HEADINGS[0] else "right")
+    for row in _cells(result):
+        out.add_row(*row)
+    return out
+
+
+def _markdown(result: dict[str, Any]) -> str:
+    rows = [list(HEADINGS), ["---"] * len(HEADINGS), *_cells(result)]
+    lines = [_title(result), "", *(f"| {' | '.join(row)} |" for row in rows)]
+    judge = markdown(result["judge"]) if result["settings"]["energy"] == "judge" else []
+    return "\n".join([*lines, *judge, ""])
+
+
+def _title(result: dict[str, Any]) -> str:
+    settings = result["settings"]
+    return f"success in the simulator, {settings['episodes']} episodes; energy: {settings['energy']}"
+
+
+def _cells(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for name, way in result["ways"].items():
+        seconds = "–" if way["seconds_per_decision"] is None else f"{way['seconds_per_decision']:.2f}"
+        interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
+        numbers = [f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds, str(way["clipped"])]
+        rows.append([name, *numbers])
+    return rows
+
+
+def _goal(simulator: World, seed: int, max_steps: int) -> UInt8[np.ndarray, "S S 3"]:
+    """Returns the last frame of the expert's episode."""
+    expert = skilled_expert(seed)
+    (episode,) = run_episodes(simulator, lambda observation: [expert.act], [seed], max_steps)
+    return episode.rgb[-1]
+
+
+def _row(simulator: World, name: str, act: Actor, seed: int, video: Path | None, max_steps: int) -> dict[str, Any]:
+    (episode,) = run_episodes(simulator, act, [seed], max_steps)
+    if video:
+        write_mp4(video, episode.rgb, FPS, 4)
+    seconds: list[float] = []
+    if isinstance(act, PlanningActor):
+        seconds = act.seconds[1:] or act.seconds  # the first one compiles
+    return {
+        "way": name,
+        "seed": seed,
+        "success": bool(episode.success.any()),
+        "steps": len(episode.rgb) - 1,
+        "clipped": episode.clipped,
+        "seconds_per_decision": float(np.median(seconds)) if seconds else None,
+    }
+
+
+def _summary(
+    rows: list[dict[str, Any]], settings: PlanSettings, key: str, validation: dict[str, Any] | None
+) -> dict[str, Any]:
+    ways = {}
+    for name in dict.fromkeys(row["way"] for row in rows):
+        of = [row for row in rows if row["way"] == name]
+        seconds = [row["seconds_per_decision"] for row in of if row["seconds_per_decision"] is not None]
+        ways[name] = {
+            **wilson(sum(row["success"] for row in of), len(of)).flat("success"),
+            "episodes": len(of),
+            "steps": float(np.mean([row["steps"] for row in of])),
+            "clipped": sum(row["clipped"] for row in of),
+            "seconds_per_decision": float(np.median(seconds)) if seconds else None,
+        }
+    return {
+        "key": key,
+        "settings": asdict(settings),
+        "judge": summary(validation),
+        "ways": ways,
+        "episodes": rows,
+    }
+
+
+def _kept(path: Path, key: str) -> list[dict[str, Any]]:
+    """Returns the finished episodes of an interrupted comparison; none if it had other settings."""
+    try:
+        saved = parse_json(path.read_bytes())
+    except (OSError, ValueError):
+        return []
+    return list(saved.get("episodes", [])) if saved.get("key") == key else []

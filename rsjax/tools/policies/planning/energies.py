@@ -1,0 +1,91 @@
+"""Energies for the planner: a world model imagines where candidates lead, and a score measures the distance to a goal.
+
+Axes: N candidates, P frames so far, H steps, F generated frames, S×S pixels, A action dimensions.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from rsjax.clip import Video
+from rsjax.errors import UserError
+from rsjax.evaluation.metrics.lpips import distances
+from rsjax.models.trained import TrainedModel
+from rsjax.tokenizers.lpips import load_lpips, min_size
+from rsjax.tools.policies.judges.judge import HISTORY, SUCCESS, Judge
+from rsjax.tools.policies.planning.planner import Energy
+
+# From the last F frames (at most ``HISTORY``) of N generated videos to their scores (N,); lower is better.
+Score: TypeAlias = Callable[[UInt8[np.ndarray, "N F S S 3"]], Float[np.ndarray, " N"]]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a planner has seen of an episode.
+
+    Attributes:
+        rgb: the last frames.
+        depth: of the same frames, metres; None if the model has no depth.
+        actions: row t led to frame t; row 0 is not read.
+    """
+
+    rgb: UInt8[np.ndarray, "P S S 3"]
+    depth: Float32[np.ndarray, "P S S"] | None
+    actions: Float32[np.ndarray, "P A"]
+
+
+def imagined(model: TrainedModel, score: Score) -> Energy:
+    """Returns an energy: the score of the video that a world model generates for each candidate.
+
+    All candidates share the cache of the frames so far, and the random draws. The energy takes a :class:`Seen`.
+    """
+
+    def energy(seen: Seen, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
+        before = np.repeat(seen.actions[None], len(candidates), axis=0)
+        prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])
+        actions, last = np.concatenate([before, candidates], axis=1), min(HISTORY, candidates.shape[1])
+        return score(model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last).rgb)
+
+    return energy
+
+
+def pixel_distance(goal: UInt8[np.ndarray, "S S 3"]) -> Score:
+    """Returns a score: the mean squared difference between the last frame and a goal, both scaled to [0, 1]."""
+    wanted = goal.astype(np.float32) / 255
+    return lambda video: np.square(video[:, -1].astype(np.float32) / 255 - wanted).mean((1, 2, 3))
+
+
+def token_distance(model: TrainedModel, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
+    """Returns a score: the share of bits in which the last frame's tokens differ from the tokens of a goal.
+
+    Raises:
+        UserError: the model has no tokens.
+    """
+    wanted, bits = model.encode(goal[None])["rgb"], model.config.tokenizer.code_bits
+
+    def score(video: UInt8[np.ndarray, "N F S S 3"]) -> Float[np.ndarray, " N"]:
+        found = model.encode(video[:, -1:])["rgb"]
+        return np.bitwise_count(found ^ wanted).mean((1, 2, 3)) / bits
+
+    return score
+
+
+def lpips_distance(weights: Path, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
+    """Returns a score: LPIPS between the last frame and a goal.
+
+    Raises:
+        UserError: the file of weights is missing or damaged, or the frames are too small for its network.
+    """
+    params, side = load_lpips(weights), len(goal)
+    if side < min_size(params):
+        raise UserError(f"{weights}: frames have {side} pixels; this network needs {min_size(params)}")
+    return lambda video: np.asarray(distances(params, np.broadcast_to(goal, video[:, -1].shape), video[:, -1]))
+
+
+def judged(judge: Judge) -> Score:
+    """Returns a score: 1 - the probability of success at the end of the video."""
+    return lambda video: 1 - judge(video)[:, SUCCESS]

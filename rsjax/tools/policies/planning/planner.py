@@ -1,0 +1,192 @@
+"""Model-predictive control: searches for the action sequence with the lowest energy.
+
+The planner knows the world only through the energy, a function ``(frames, candidate actions) → energies``.
+``energies.py`` makes one from a world model and a goal; a simulator or any other predictor serves too.
+
+Axes: N candidates, H steps of the horizon, A action dimensions.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from rsjax.config import ConfigError
+from rsjax.config.fields import require, require_range
+from rsjax.errors import UserError
+
+# From the planner's input (any type) and N candidates (N, H, A) to energies (N,); lower is better, inf excludes one.
+Energy: TypeAlias = Callable[[Any, Float[np.ndarray, "N H A"]], Float[np.ndarray, " N"]]
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """The settings of a planner's search.
+
+    In each round it draws candidates around a mean, and moves the mean towards the good candidates.
+
+    Attributes:
+        method: "cem": the new mean and deviation are those of the ``elites`` best candidates (Rubinstein's
+            cross-entropy method); "mppi": the new mean is that of all candidates, weighted by exp(-energy/λ), and the
+            deviation stays the same (Williams et al. 2017).
+        horizon: steps of a candidate.
+        candidates: candidates in each round; they include the mean itself and the best candidate so far.
+        rounds: rounds of a decision.
+        elites: for "cem".
+        temperature: λ for "mppi", in standard deviations of the candidates' finite energies.
+        spread: standard deviation of the first candidates, as a share of half the actions' range.
+        memory: correlation of a candidate's noise from one step to the next, so that arms do not tremble.
+        hold: controls in an action; the search holds one control for all of them.
+        seed: seed of the draws.
+    """
+
+    method: Literal["cem", "mppi"] = "cem"
+    horizon: int = 6
+    candidates: int = 32
+    rounds: int = 3
+    elites: int = 6
+    temperature: float = 0.5
+    spread: float = 0.6
+    memory: float = 0.6
+    hold: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_range(self, "planner", 1, 2**31, "horizon", "rounds", "hold")
+        require_range(self, "planner", 2, 2**31, "candidates")
+        require_range(self, "planner", 0, 0.999, "memory")
+        require_range(self, "planner", 1, self.candidates, "elites")
+        for name in ("temperature", "spread"):
+            require(getattr(self, name) > 0, f"planner.{name} is {getattr(self, name)}; it must be above 0")
+        if self.method not in ("cem", "mppi"):
+            raise ConfigError(f"planner.method is {self.method!r}; it is cem or mppi")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The result of a search.
+
+    Attributes:
+        actions: the best candidate of all rounds.
+        energy: its energy.
+        best: the lowest energy so far after each round.
+    """
+
+    actions: Float[np.ndarray, "H A"]
+    energy: float
+    best: Float[np.ndarray, " rounds"]
+
+
+def search(
+    energy: Energy,
+    frames: Any,
+    mean: Float[np.ndarray, "H A"],
+    low: Float[np.ndarray, " A"],
+    high: Float[np.ndarray, " A"],
+    config: PlannerConfig,
+    rng: np.random.Generator,
+) -> Plan:
+    """Searches for the action sequence of least energy.
+
+    Args:
+        energy: gives the candidates' energies; it is called ``config.rounds`` times.
+        frames: the first argument of ``energy``, such as the frames so far.
+        mean: where the search begins.
+        low: least actions; candidates are clipped to [low, high].
+        high: greatest actions.
+
+    Raises:
+        UserError: the energies have the wrong shape, or one is NaN or -inf.
+    """
+    deviation = np.broadcast_to(config.spread * (high - low) / 2, mean.shape)
+    best, lowest, history = mean, np.inf, []
+    for _ in range(config.rounds):
+        drawn = mean + deviation * _noise(config, len(low), rng)
+        drawn[0], drawn[1] = mean, best
+        drawn = np.clip(drawn, low, high)
+        energies = _checked(energy(frames, drawn.astype(np.float32)), len(drawn))
+        first = int(energies.argmin())
+        if energies[first] < lowest:
+            best, lowest = drawn[first], float(energies[first])
+        history.append(lowest)
+        finite = np.isfinite(energies)
+        if not finite.any():
+            continue  # nothing to move towards
+        if config.method == "cem":
+            elites = drawn[np.argsort(energies, kind="stable")[: min(config.elites, finite.sum())]]
+            mean, deviation = elites.mean(0), elites.std(0) + 0.05 * (high - low) / 2
+        else:
+            scale = config.temperature * max(float(energies[finite].std()), 1e-12)
+            weights = np.exp(-(energies - energies[first]) / scale)
+            mean = np.einsum("n,nha->ha", weights / weights.sum(), drawn)
+    return Plan(best.astype(np.float32), lowest, np.array(history))
+
+
+class Planner:
+    """Decides one action after another; each search begins with the remaining actions of the last plan.
+
+    Args:
+        energy: see :mod:`rsjax.tools.policies.planning.planner`.
+        low: least actions.
+        high: greatest actions.
+        config: how it searches.
+
+    Attributes:
+        plan: the plan of the last decision; None before the first decision.
+
+    Raises:
+        ConfigError: an action's length is not a multiple of ``config.hold``.
+    """
+
+    def __init__(
+        self, energy: Energy, low: Float[np.ndarray, " A"], high: Float[np.ndarray, " A"], config: PlannerConfig
+    ) -> None:
+        require(
+            len(low) % config.hold == 0,
+            f"planner.hold is {config.hold}; it must divide the {len(low)} numbers of an action",
+        )
+        self._energy, self._config = energy, config
+        self._low, self._high = (np.asarray(each)[: len(low) // config.hold] for each in (low, high))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the plan and resets the random draws, for another episode."""
+        self.plan: Plan | None = None
+        self._rng = np.random.default_rng(self._config.seed)
+
+    def __call__(self, frames: Any) -> Float[np.ndarray, " A"]:
+        """Returns the first action of a new plan.
+
+        Args:
+            frames: the first argument of the energy.
+        """
+        middle = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
+        mean = middle if self.plan is None else np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
+        limits = (self._low, self._high)
+        self.plan = search(self._held, frames, mean, *limits, self._config, self._rng)
+        return np.tile(self.plan.actions[0], self._config.hold)
+
+    def _held(self, frames: Any, candidates: Float[np.ndarray, "N H a"]) -> Float[np.ndarray, " N"]:
+        return self._energy(frames, np.tile(candidates, (1, 1, self._config.hold)))
+
+
+def _noise(config: PlannerConfig, width: int, rng: np.random.Generator) -> Float[np.ndarray, "N H A"]:
+    """Returns normal noise of unit variance in which each step is correlated with the step before."""
+    noise = rng.standard_normal((config.candidates, config.horizon, width))
+    for step in range(1, config.horizon):
+        fresh = np.sqrt(1 - config.memory**2) * noise[:, step]
+        noise[:, step] = config.memory * noise[:, step - 1] + fresh
+    return noise
+
+
+def _checked(energies: Any, count: int) -> Float[np.ndarray, " N"]:
+    found = np.asarray(energies, np.float64)
+    wrong = np.isnan(found) | (found == -np.inf)
+    if found.shape != (count,) or wrong.any():
+        raise UserError(
+            f"the energy of {count} candidates has shape {found.shape}, {wrong.sum()} of it NaN or -inf; "
+            f"expected ({count},), numbers"
+        )
+    return found

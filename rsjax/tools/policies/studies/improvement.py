@@ -1,0 +1,223 @@
+"""Improves a policy in imagination: it acts in the world model, and learns from what the judge calls a success."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config import content_key
+from rsjax.data.codec import Record, decode, encode
+from rsjax.errors import UserError
+from rsjax.evaluation.results import fingerprint
+from rsjax.evaluation.statistics import Estimate, share_difference, verdict, wilson
+from rsjax.files import write_file, write_json
+from rsjax.progress import Progress, note, stage
+from rsjax.tools.policies.config import PolicyConfig
+from rsjax.tools.policies.demos import Demos
+from rsjax.tools.policies.judges.validation import markdown, summary
+from rsjax.tools.policies.policy import Policy
+from rsjax.tools.policies.policy_training import train_policy
+from rsjax.tools.policies.studies.figures import success_curves
+from rsjax.tools.policies.studies.policy_learning import interval_text, percent
+from rsjax.tools.policies.studies.trials import Trials, try_policy
+from rsjax.tools.policies.worlds.model_world import FirstFrame
+from rsjax.tools.policies.worlds.world import World, run_episodes
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The settings for improving a policy.
+
+    Attributes:
+        rounds: rounds of imagining and fine-tuning.
+        imagined: episodes in the world model in each round.
+        max_steps: steps of an episode, at most.
+        steps: fine-tuning steps in each round.
+        share: share of old demonstrations in the data for fine-tuning, at least 0 and below 1.
+        learning_rate: learning rate of fine-tuning, as a share of the training's.
+    """
+
+    rounds: int = 2
+    imagined: int = 200
+    max_steps: int = 30
+    steps: int = 500
+    share: float = 0.5
+    learning_rate: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("rounds", "imagined", "max_steps", "steps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+        if not 0 < self.learning_rate < math.inf:
+            raise UserError(f"--learning-rate is {self.learning_rate}; it is a share of the training's, above 0")
+        if not 0 <= self.share < 1:
+            raise UserError(f"--share is {self.share}; it is a share of old demonstrations, 0 to below 1")
+
+
+def improve(
+    policy: Policy,
+    demos: Demos,
+    starts: Sequence[FirstFrame],
+    model: World,
+    simulator: World,
+    settings: Improvement,
+    trials: Trials,
+    out: Path,
+) -> dict[str, Any]:
+    """Improves a policy, and trains a control for as many steps on the old demonstrations alone.
+
+    Args:
+        policy: the policy to begin with.
+        demos: the demonstrations that the policy was trained on.
+        starts: first frames for imagined episodes; each round continues in this list where the last one ended.
+        model: the world model.
+        simulator: the true simulator, in which success is measured before and after each round.
+        out: the folder for policies, imagined successes, ``results.json``, ``results.md`` and ``success.png``.
+
+    Returns:
+        The content of ``results.json``. An interrupted call resumes.
+    """
+    rows: list[dict[str, Any]] = []
+    arms = {"imagined": policy, "control": policy}
+    config = _tuning(policy.model.config, settings)  # once: the policies of later rounds have this config already
+    before = try_policy(policy, simulator, trials.seeds, trials, out / "before", "before")
+    for number in range(1, settings.rounds + 1):
+        stage(
+            number, settings.rounds, f"round {number}", f"{settings.imagined} imagined episodes, {settings.steps} steps"
+        )
+        made, counts = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}")
+        row: dict[str, Any] = {"round": number, "episodes": settings.imagined, "kept": len(made), "demos": len(demos)}
+        row |= {"uninterpretable": counts["uninterpretable"], "clipped": {"imagining": counts["clipped"]}}
+        for arm, old in arms.items():
+            learns = mixed(demos, made, settings.share, number) if arm == "imagined" and made else demos
+            folder = out / f"round-{number}" / arm
+            arms[arm] = train_policy(config, learns, folder, name=f"round {number} {arm}", seed=number, start=old)
+            tried = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}")
+            row[arm], row["clipped"][arm] = tried.success, tried.clipped
+        if not made:
+            note("the judge called no imagined episode a success: this round learns from the old demonstrations")
+        rows.append(row)
+        about = {"settings": asdict(settings), "trials": asdict(trials), "judge": summary(model.validation)}
+        results = about | {"before": before.success, "clipped": before.clipped, "rounds": rows}
+        results["differences"] = differences(results)
+        _write(out, results)
+    return results
+
+
+def _write(out: Path, results: dict[str, Any]) -> None:
+    write_json(out / "results.json", results)
+    write_file(out / "results.md", table(results).encode())
+    write_file(out / "success.png", success_curves(_series(results), "rounds"))
+
+
+def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
+    optimizer = config.train.optimizer
+    rate = settings.learning_rate * optimizer.learning_rate
+    optimizer = replace(optimizer, learning_rate=rate, warmup_steps=min(optimizer.warmup_steps, settings.steps // 10))
+    return replace(config, train=replace(config.train, steps=settings.steps, optimizer=optimizer))
+
+
+def imagine(
+    policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
+) -> tuple[list[Record], dict[str, int]]:
+    """Imagines the episodes of a round; keeps each group in a file whose name is a hash of everything it depends on.
+
+    Returns:
+        The episodes that the judge calls successes, as demonstrations; and over all episodes, how many end in a frame
+        that the judge calls uninterpretable, and how many numbers of actions were clipped.
+    """
+    begins = (number - 1) * settings.imagined
+    # A start that is used again gets different draws.
+    chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
+    made: list[Record] = []
+    counts = {"uninterpretable": 0, "clipped": 0}
+    folder.mkdir(parents=True, exist_ok=True)
+    files = _files(policy, chosen, model, settings, folder)
+    if others := len({*folder.glob("imagined-*.clips")} - {*files}):
+        note(f"{folder}: {others} files of imagined episodes are of another policy, model, judge or start; not used")
+    with Progress(f"round {number}: imagining", len(chosen), "episodes") as progress:
+        for first, file in zip(range(0, len(chosen), model.count), files, strict=True):
+            group = chosen[first : first + model.count]
+            if not file.exists():
+                actor = policy.actor(begins + first)
+                episodes = run_episodes(model, actor, group, settings.max_steps)
+                good = [{"rgb": one.rgb, "actions": one.actions} for one in episodes if one.success.any()]
+                done = {name: int(sum(getattr(one, name) for one in episodes)) for name in counts}
+                write_file(file, encode({"clips": [encode(one) for one in good], **done}))
+            kept = decode(file.read_bytes())
+            made += [decode(payload) for payload in kept["clips"]]
+            counts = {name: count + kept[name] for name, count in counts.items()}
+            progress.update(first + len(group), kept=len(made))
+    return made, counts
+
+
+def _files(
+    policy: Policy, chosen: Sequence[FirstFrame], model: World, settings: Improvement, folder: Path
+) -> list[Path]:
+    """Returns the file of each group of imagined episodes."""
+    files = []
+    for first in range(0, len(chosen), model.count):
+        starts = fingerprint(([(start.rgb, start.depth, start.draw) for start in chosen[first : first + model.count]],))
+        key = content_key("imagined", policy.key, model.key, model.count, settings.max_steps, first, starts)
+        files.append(folder / f"imagined-{first:05d}-{key[:8]}.clips")
+    return files
+
+
+def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demos:
+    """Returns imagined successes with random old demonstrations, which make up ``share`` of the result."""
+    wanted = round(share / (1 - share) * len(made))
+    rng = np.random.default_rng(seed)
+    chosen = np.concatenate(
+        [rng.permutation(len(demos)) for _ in range(-(-wanted // len(demos)))] or [np.zeros(0, int)]
+    )
+    return Demos((*made, *(demos.records[int(place)] for place in chosen[:wanted])), demos.controls)
+
+
+def differences(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Returns the gain after the last round, compared with before and with the control."""
+    last = {name: np.array([results["rounds"][-1][name]], float) for name in ("imagined", "control")}
+    last["before"] = np.array([results["before"]], float)
+    found = []
+    for one, other in (("imagined", "before"), ("imagined", "control"), ("control", "before")):
+        gap = share_difference(last[one], last[other])
+        found.append({"compares": [one, other], **asdict(gap), "verdict": verdict(gap)})
+    return found
+
+
+def table(results: dict[str, Any]) -> str:
+    """Returns the results in Markdown."""
+    lines = [
+        "| round | imagined | judged a success | uninterpretable | policy | success in the simulator | 95 % |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    share = _share(results["before"])
+    lines.append(f"| 0 | | | | before | {percent(share)} | {interval_text(share)} |")
+    for row in results["rounds"]:
+        for arm in ("imagined", "control"):
+            share, counts = _share(row[arm]), " | | "
+            if arm == "imagined":
+                counts = (
+                    f"{row['episodes']} | {row['kept']} | {percent(wilson(row['uninterpretable'], row['episodes']))}"
+                )
+            lines.append(f"| {row['round']} | {counts} | {arm} | {percent(share)} | {interval_text(share)} |")
+    lines += ["", "| last round | difference | 95 % | better? |", "|---|---|---|---|"]
+    for gap in results["differences"]:
+        estimate = Estimate(gap["value"], gap["low"], gap["high"])
+        names = " - ".join(gap["compares"])
+        lines.append(f"| {names} | {percent(estimate)} | {interval_text(estimate)} | {gap['verdict']} |")
+    return "\n".join([*lines, *markdown(results["judge"]), ""])
+
+
+def _share(success: Sequence[bool]) -> Estimate:
+    return wilson(sum(success), len(success))
+
+
+def _series(results: dict[str, Any]) -> dict[str, list[tuple[float, Estimate]]]:
+    begin = (0.0, _share(results["before"]))
+    return {
+        arm: [begin, *[(float(row["round"]), _share(row[arm])) for row in results["rounds"]]]
+        for arm in ("imagined", "control")
+    }

@@ -1,0 +1,147 @@
+"""Judges saved rollouts of policies again, by people who judge blindly or by a vision-language model.
+
+The simulator's rollouts are among them: comparing their verdicts with the simulator's own predicate shows how often the
+judge is right.
+"""
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rsjax.config import content_key
+from rsjax.errors import UserError
+from rsjax.files import read_json, write_json
+from rsjax.progress import Progress
+from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, UNINTERPRETABLE, Judge
+from rsjax.tools.policies.judges.people_and_vlms import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
+from rsjax.tools.policies.judges.validation import scores, summary
+from rsjax.tools.policies.studies.policy_evaluation import compared, write_results
+from rsjax.tools.policies.studies.trials import Result, Trials
+
+Rollouts = dict[str, list[UInt8[np.ndarray, "T S S 3"]]]  # by policy, one for each episode
+EVERY = 20  # verdicts are saved after each this many videos
+
+
+def blind(out: Path, folder: Path) -> Path:
+    """Writes all rollouts of a comparison as videos for people to judge, and returns the sheet to fill in.
+
+    Raises:
+        UserError: ``out`` has no finished comparison, or the folder has a sheet already.
+    """
+    if (folder / SHEET).exists():
+        raise UserError(f"{folder / SHEET}: exists; its labels would be lost, so name a new folder")
+    worlds = _rollouts(out, _results(out)).values()
+    return write_blinded([video for policies in worlds for videos in policies.values() for video in videos], folder)
+
+
+def named_judge(words: str) -> tuple[Judge, str]:
+    """Returns the judge that ``human:SHEET.csv`` or ``vlm:DIRECTORY`` names, and a name for its folder.
+
+    Raises:
+        UserError: the words name no judge, or its files are missing or damaged.
+    """
+    kind, _, place = words.partition(":")
+    path = Path(place)
+    if kind == "human" and place:
+        return HumanJudge.read(path), f"human-{zlib.crc32(path.read_bytes()):08x}"
+    if kind == "vlm" and place:
+        judge = LanguageJudge.load(path)
+        sizes = sorted((file.name, file.stat().st_size) for file in path.iterdir())
+        return judge, f"vlm-{content_key(str(path.resolve()), str(sizes), judge.question, judge.frames)[:8]}"
+    raise UserError(f"--judge-with {words}: it is human:SHEET.csv, a sheet that --blind wrote, or vlm:DIRECTORY")
+
+
+def rejudge(out: Path, judge: Judge, name: str) -> Path:
+    """Judges all rollouts of a comparison at their last frames, and writes the results that follow.
+
+    Args:
+        out: the folder of the comparison.
+        judge: sees one whole video at a time.
+        name: the end of the name of the judge's folder in ``out``, which also keeps the verdicts so far.
+
+    Returns:
+        The folder, with ``results.json``, ``results.md`` and ``scatter.png`` like the comparison's.
+
+    Raises:
+        UserError: ``out`` has no finished comparison, or the judge cannot judge one of its videos.
+    """
+    results, folder = _results(out), out / f"judged-{name}"
+    rollouts, true = _rollouts(out, results), _true(results)
+    verdicts = _verdicts(rollouts, judge, folder / "verdicts.json")
+    truth = np.concatenate([np.where(each.success, SUCCESS, FAIL) for each in true.values()])
+    checked = scores(np.concatenate([verdicts["simulator"][policy] for policy in true]), truth)
+    rows = []
+    for row in results["runs"]:
+        labels = {policy: found.argmax(-1) for policy, found in verdicts[row["run"]].items()}
+        made = {
+            policy: Result(
+                (found == SUCCESS).tolist(),
+                row["policies"][policy]["clipped"]["world_model"],
+                (found == UNINTERPRETABLE).tolist(),
+            )
+            for policy, found in labels.items()
+        }
+        rows.append(compared(row["run"], true, made) | {"judge": summary({"raw": checked})})
+    write_results(folder, rows, Trials(**results["trials"]))
+    return folder
+
+
+def _results(out: Path) -> dict[str, Any]:
+    file = out / "results.json"
+    results: dict[str, Any] = read_json(
+        file, cure="compare policies first: python -m experiments.policy_evaluation RUN"
+    )
+    if any("clipped" not in policy for row in results["runs"] for policy in row["policies"].values()):
+        raise UserError(f"{file}: is of an older version of rsjax; compare the policies again in another --out")
+    return results
+
+
+def _true(results: Mapping[str, Any]) -> dict[str, Result]:
+    policies = results["runs"][0]["policies"]
+    return {name: Result(each["simulator"], each["clipped"]["simulator"]) for name, each in policies.items()}
+
+
+def _rollouts(out: Path, results: Mapping[str, Any]) -> dict[str, Rollouts]:
+    """Returns the videos of the simulator and of each run."""
+    worlds, policies = ["simulator", *(row["run"] for row in results["runs"])], results["runs"][0]["policies"]
+    count = int(results["trials"]["episodes"])
+    return {
+        world: {name: [_video(out / world / name / f"episode-{i:02d}.npz") for i in range(count)] for name in policies}
+        for world in worlds
+    }
+
+
+def _video(file: Path) -> UInt8[np.ndarray, "T S S 3"]:
+    if not file.exists():
+        raise UserError(
+            f"{file}: missing, as of an older version of rsjax; compare the policies again in another --out"
+        )
+    with np.load(file) as arrays:
+        return np.asarray(arrays["rgb"])
+
+
+def _verdicts(
+    rollouts: Mapping[str, Rollouts], judge: Judge, file: Path
+) -> dict[str, dict[str, Float[np.ndarray, "N 3"]]]:
+    """Returns the judge's probabilities for every video; equal videos are judged once."""
+    known: dict[str, list[float]] = read_json(file, cure=f"delete {file}") if file.exists() else {}
+    names = {
+        world: {policy: [video_name(video) for video in videos] for policy, videos in policies.items()}
+        for world, policies in rollouts.items()
+    }
+    videos = {video_name(video): video for world in rollouts.values() for some in world.values() for video in some}
+    with Progress("judging", len(videos), "videos", len(known)) as progress:
+        for number, (name, video) in enumerate(videos.items(), 1):
+            if name not in known:
+                known[name] = judge(video[None])[0].tolist()
+            if number % EVERY == 0 or number == len(videos):
+                write_json(file, known)
+            progress.update(number)
+    return {
+        world: {policy: np.array([known[name] for name in some]) for policy, some in policies.items()}
+        for world, policies in names.items()
+    }

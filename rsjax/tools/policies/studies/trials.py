@@ -1,0 +1,162 @@
+"""Tries policies from the same starts, and saves which succeed so that an interrupted series of trials resumes."""
+
+import io
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config import SimConfig, content_key
+from rsjax.errors import UserError
+from rsjax.evaluation.statistics import Estimate, wilson
+from rsjax.files import making, read_json, write_file, write_json
+from rsjax.progress import Progress
+from rsjax.tools.policies.policy import Policy
+from rsjax.tools.policies.worlds.model_world import FirstFrame
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.policies.worlds.world import FIRST_SEED, World, run_episodes
+from rsjax.tools.studies.report.video import write_mp4
+
+FPS = 5.0  # of the videos
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The same episodes for every policy.
+
+    Attributes:
+        episodes: episodes of each policy, from fixed seeds.
+        max_steps: steps after which an episode counts as a failure.
+        together: episodes that run at a time.
+        videos: how many episodes are saved as videos.
+    """
+
+    episodes: int = 50
+    max_steps: int = 30
+    together: int = 5
+    videos: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "max_steps", "together"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}; it must be at least 1")
+
+    @property
+    def seeds(self) -> list[int]:
+        """The simulator's seeds."""
+        return [FIRST_SEED + number for number in range(self.episodes)]
+
+
+@dataclass
+class Result:
+    """The results of a policy's trials.
+
+    Attributes:
+        success: by episode.
+        clipped: how many numbers of actions were clipped.
+        uninterpretable: by episode, whether the judge cannot interpret its last frame; False in the simulator.
+    """
+
+    success: list[bool] = field(default_factory=list)
+    clipped: int = 0
+    uninterpretable: list[bool] = field(default_factory=list)
+
+    @property
+    def share(self) -> Estimate:
+        """The share of successes with its Wilson interval."""
+        return wilson(sum(self.success), len(self.success))
+
+
+def try_policy(
+    policy: Policy,
+    world: World,
+    starts: Sequence[Any],
+    trials: Trials,
+    folder: Path,
+    name: str,
+    save_frames: bool = False,
+) -> Result:
+    """Runs a policy from each start, except those whose result is in ``folder`` already.
+
+    Args:
+        folder: the folder of ``success.json``, which grows as episodes end, and of a few videos.
+        name: for the progress line.
+        save_frames: whether to save the frames of each episode as ``episode-NN.npz``, for other judges.
+
+    Raises:
+        UserError: the result in ``folder`` is from other trials, another policy, or another world or judge.
+        FileError: another process runs trials in ``folder``.
+    """
+    file = folder / "success.json"
+    with making(folder, wait=False):
+        kept = _kept(file, [len(starts), trials.max_steps, trials.together], content_key(policy.key, world.key))
+        done = len(kept["success"])
+        with Progress(f"{name}: trials", len(starts), "episodes", done) as progress:
+            # An episode's draws depend on its group, so a resumed series continues at a multiple of ``together``.
+            for first in range(done, len(starts), world.count):
+                group = starts[first : first + world.count]
+                for number, episode in enumerate(
+                    run_episodes(world, policy.actor(first), group, trials.max_steps), first
+                ):
+                    kept["success"].append(bool(episode.success.any()))
+                    kept["uninterpretable"].append(episode.uninterpretable)
+                    kept["clipped"] += episode.clipped
+                    if number < trials.videos:
+                        write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4)
+                    if save_frames:
+                        save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
+                write_json(file, kept)
+                progress.update(len(kept["success"]), success=sum(kept["success"]))
+    return Result(kept["success"], kept["clipped"], kept["uninterpretable"])
+
+
+def _kept(file: Path, settings: list[int], key: str) -> dict[str, Any]:
+    """Returns the content of the file of results so far, or an empty one's content if there is no file."""
+    kept = {"success": [], "clipped": 0, "uninterpretable": [], "trials": settings, "key": key}
+    if file.exists():
+        kept = read_json(file, cure=f"delete {file}")
+    if kept.get("trials") != settings:
+        raise UserError(f"{file}: is of (episodes, steps, together) {kept.get('trials')}, not {settings}; delete it")
+    if kept.get("key") != key:
+        raise UserError(
+            f"{file}: is of another policy, simulator, world model or judge; choose another --out, or delete it"
+        )
+    return kept
+
+
+def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:
+    """Opens the simulators that trials need, and closes them after the ``with`` block."""
+    return closing(SimulatorWorld.lift(config, min(trials.together, trials.episodes)))
+
+
+def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFrame]:
+    """Returns the simulator's first frames for these seeds, from the file if it has those of this simulator."""
+    if file.exists():
+        with np.load(file) as arrays:
+            if arrays["seeds"].tolist() == list(seeds) and "key" in arrays and str(arrays["key"]) == world.key:
+                return _frames(arrays["rgb"], arrays["depth"])
+    rgb, depth = [], []
+    for first in range(0, len(seeds), world.count):
+        observation = world.reset(seeds[first : first + world.count]).observation
+        rgb.append(observation["rgb"])
+        depth.append(observation["depth"])
+    save_arrays(
+        file, key=np.array(world.key), seeds=np.array(seeds), rgb=np.concatenate(rgb), depth=np.concatenate(depth)
+    )
+    return _frames(np.concatenate(rgb), np.concatenate(depth))
+
+
+def save_arrays(file: Path, **arrays: np.ndarray) -> None:
+    """Writes an .npz file, atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_file(file, buffer.getvalue())
+
+
+def _frames(rgb: np.ndarray, depth: np.ndarray) -> list[FirstFrame]:
+    return [
+        FirstFrame(frame, distances, number) for number, (frame, distances) in enumerate(zip(rgb, depth, strict=True))
+    ]

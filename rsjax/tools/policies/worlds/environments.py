@@ -1,0 +1,399 @@
+"""The worlds as Gymnasium environments: ``gymnasium.make("rsjax/WorldModel-v0", run="runs/tiny")`` (docs/policies.md).
+
+Axes: S×S pixels, A action dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from jaxtyping import UInt8
+
+from rsjax.config import SimConfig
+from rsjax.errors import UserError
+from rsjax.models.load_run import load
+from rsjax.models.trained import TrainedModel
+from rsjax.tools.policies.judges.judge import LABELS, Judge
+from rsjax.tools.policies.judges.judge_training import judge_of
+from rsjax.tools.policies.worlds.actions import OutOfRange, check_out_of_range, check_takes_actions
+from rsjax.tools.policies.worlds.model_world import FirstFrame, ModelWorld
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.policies.worlds.starts import Starts
+from rsjax.tools.policies.worlds.world import Observation, WorldState
+from rsjax.tools.sim.lift import State
+
+FAR = 10.0  # metres; nothing that the simulator's cameras see is farther
+STEPS = 30  # default length of an episode: 6 s at 5 frames per second
+DEFAULT = SimConfig(camera="near")
+
+
+@dataclass(frozen=True)
+class EnvironmentSettings:
+    """Settings of an environment in a world model.
+
+    Attributes:
+        data_dir: the directory of simulated data sets, where a run on simulated clips finds its first frames.
+        store: the new path of the run's store of ingested clips, if it was moved.
+        split: the clips whose first frames episodes begin with.
+        max_steps: steps after which an episode is truncated; it may be longer than the model's window.
+        judge: decides reward and termination: a judge, the directory of a trained one, or "run" for the judge that
+            ``experiments.judge`` trained for the run, if any. Without a judge, every reward is 0.
+        out_of_range: whether actions outside the action space are clipped and counted ("clip"), or raise ("refuse").
+    """
+
+    data_dir: Path | str = "data"
+    store: Path | str | None = None
+    split: str = "test"
+    max_steps: int = STEPS
+    judge: Judge | Path | str | None = "run"
+    out_of_range: OutOfRange = "clip"
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1:
+            raise UserError(f"max_steps is {self.max_steps}; an episode has at least 1 step")
+        check_out_of_range(self.out_of_range)
+
+
+class _Model:
+    """What both environments of a world model need: its world, first frames and spaces."""
+
+    def __init__(self, run: Path | str | TrainedModel, count: int, settings: EnvironmentSettings) -> None:
+        if isinstance(run, TrainedModel):
+            trained = run
+            folder = Path(".")
+            name = "the model"
+        else:
+            trained = load(run)
+            folder = Path(run)
+            name = f"{run}: the model"
+        config = trained.config
+        check_takes_actions(config.model, name)
+        size = config.clips.image_size
+        depth_range = trained.assets.normalization.depth_range
+        has_depth = config.model.uses_depth and depth_range is not None
+        store = Path(settings.store) if settings.store else None
+        judge = judge_of(run, settings.judge, size)
+        self.world = ModelWorld(trained, count, judge, whole_videos=False)
+        self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
+        self.action_space = spaces.Box(self.world.actions.low, self.world.actions.high)
+        observation: dict[str, spaces.Space[Any]] = {"rgb": spaces.Box(0, 255, (size, size, 3), np.uint8)}
+        if has_depth:
+            observation["depth"] = spaces.Box(0.0, max(FAR, depth_range[1]), (size, size))  # type: ignore[index]
+        self.observation_space = spaces.Dict(observation)
+
+
+def _info(state: WorldState, clipped: np.ndarray, clip: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the ``info`` of episodes in a world model: success, the judge's label and verdict, and the counts."""
+    labels = ["unjudged"] * len(state.success)
+    verdict = np.zeros((len(labels), len(LABELS)))
+    if state.verdict is not None:
+        labels = [LABELS[number] for number in state.verdict.argmax(-1)]
+        verdict = state.verdict
+    return {
+        "success": state.success,
+        "label": np.array(labels, object),
+        "verdict": verdict,
+        "clipped": clipped.copy(),
+        "clip": clip.copy(),
+    }
+
+
+class WorldModelEnv(gymnasium.Env[Any, Any]):
+    """One episode in the world model of a run. docs/policies.md has the details.
+
+    The observation is a generated frame, {"rgb": uint8 (S, S, 3), "depth": float32 (S, S), metres}, without "depth" if
+    the model generates none. A step is one frame at the clips' rate, and its action is like a row of a clip's actions.
+    When the judge says "success", the reward is 1 and the episode terminates.
+
+    Args:
+        run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
+        render_mode: "rgb_array", or None.
+        settings: fields of :class:`EnvironmentSettings`.
+
+    Raises:
+        UserError: the run is missing or unfinished, its model takes no actions or cannot generate frame by frame, or
+            the judge is missing, damaged or takes frames of another size.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
+
+    def __init__(self, run: Path | str | TrainedModel, render_mode: str | None = None, **settings: Any) -> None:
+        self._settings = EnvironmentSettings(**settings)
+        model = _Model(run, 1, self._settings)
+        self._world = model.world
+        self._starts = model.starts
+        self._frame: np.ndarray | None = None
+        self._clipped = 0
+        self._steps = 0
+        self.render_mode = render_mode
+        self.action_space = model.action_space
+        self.observation_space = model.observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins an episode with the first frame of a clip, by default a random one of the test split.
+
+        Args:
+            seed: determines the choice of clips and the model's draws.
+            options: "clip", the number of a clip, or "rgb" and "depth", a frame; "draw", a number that determines the
+                model's draws (0 gives the video of ``TrainedModel.generate``).
+
+        Raises:
+            StartError: the given frame does not fit, or the run's clips are missing.
+        """
+        super().reset(seed=seed)
+        start = self._starts.choose(self.np_random, options or {})
+        self._clip = start.clip
+        self._clipped = 0
+        self._steps = 0
+        return self._seen(self._world.reset([start]))
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Generates the next frame.
+
+        Args:
+            action: (A,), in the recording's units.
+
+        Returns:
+            Observation, reward, terminated, truncated, and info: "success", "label", "verdict" (probabilities),
+            "clipped" (numbers clipped in this episode), "clip", and "action", the action after clipping.
+
+        Raises:
+            ActionError: the action has the wrong shape or a value that is not finite, or is refused as out of range.
+        """
+        if self._frame is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before its first step")
+        row, outside = self._world.actions.clip(action, None, self._settings.out_of_range)
+        state = self._world.step(row[None])
+        self._clipped += int(outside.sum())
+        self._steps += 1
+        observation, info = self._seen(state)
+        success = bool(state.success[0])
+        over = self._steps >= self._settings.max_steps
+        return observation, float(success), success, over, info | {"action": row}
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Returns the current frame; None without a render mode."""
+        return self._frame if self.render_mode else None
+
+    def _seen(self, state: WorldState) -> tuple[Observation, dict[str, Any]]:
+        observation = {name: frames[0] for name, frames in state.observation.items()}
+        self._frame = observation["rgb"]
+        info = _info(state, np.array([self._clipped]), np.array([self._clip]))
+        return observation, {name: values[0] for name, values in info.items()}
+
+
+class WorldModelVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """``num_envs`` environments like :class:`WorldModelEnv`, all stepped by one compiled program.
+
+    An environment whose episode ended restarts in the next step and ignores that step's action (Gymnasium's NEXT_STEP
+    mode). The values in ``info`` are arrays over the environments.
+
+    Args:
+        run: a run directory of experiments.train, or a model that ``rsjax.load`` loaded.
+        num_envs: the number of environments.
+        settings: fields of :class:`EnvironmentSettings`.
+
+    Raises:
+        UserError: the run is missing or unfinished, or its model takes no actions or cannot generate frame by frame.
+    """
+
+    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - Gymnasium's own type
+
+    def __init__(self, run: Path | str | TrainedModel, num_envs: int = 1, **settings: Any) -> None:
+        self._settings = EnvironmentSettings(**settings)
+        model = _Model(run, num_envs, self._settings)
+        self._world = model.world
+        self._starts = model.starts
+        self.num_envs = num_envs
+        self.single_action_space = model.action_space
+        self.single_observation_space = model.observation_space
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._steps = np.zeros(num_envs, int)
+        self._clipped = np.zeros(num_envs, int)
+        self._clip = np.full(num_envs, -1)
+        self._over = np.zeros(num_envs, bool)
+        self._rng: list[np.random.Generator] = []
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins all episodes, with arguments as for one environment; environment i takes the seed + i.
+
+        From a list of seeds, each environment takes its own. The options apply to all.
+
+        Raises:
+            UserError: there are more or fewer seeds than environments.
+            StartError: the given frame does not fit, or the run's clips are missing.
+        """
+        if seed is not None or not self._rng:
+            self._rng = [np.random.default_rng(each) for each in _seeds(seed, self.num_envs)]
+        everything = np.ones(self.num_envs, bool)
+        state = self._world.reset(self._begin(everything, options or {}))
+        self._over[:] = False
+        return state.observation, _masked(_info(state, self._clipped, self._clip))
+
+    def step(self, actions: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Generates the next frame of every episode; episodes that ended restart instead.
+
+        Args:
+            actions: (num_envs, A), in the recording's units.
+
+        Raises:
+            ActionError: the actions have the wrong shape, or an episode that does not restart has a value that is not
+                finite or is refused as out of range.
+        """
+        if not self._rng:
+            raise gymnasium.error.ResetNeeded("reset the environments before their first step")
+        again = self._over
+        rows, outside = self._world.actions.clip(actions, self.num_envs, self._settings.out_of_range, again)
+        state = self._world.step(rows, ignored=again)
+        self._clipped += outside.sum(1)
+        self._steps += 1
+        if again.any():
+            state = self._world.reset(self._begin(again, {}), which=again)
+        success = state.success & ~again
+        truncated = self._steps >= self._settings.max_steps
+        self._over = success | truncated
+        info = _info(state, self._clipped, self._clip) | {"action": rows}
+        return state.observation, success.astype(np.float64), success, truncated, _masked(info)
+
+    def _begin(self, which: np.ndarray, options: dict[str, Any]) -> list[FirstFrame]:
+        """Chooses first frames for these environments, and sets their counts back."""
+        starts = [self._starts.choose(self._rng[number], options) for number in np.flatnonzero(which)]
+        self._steps[which] = 0
+        self._clipped[which] = 0
+        self._clip[which] = [start.clip for start in starts]
+        return starts
+
+
+def _seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """Returns the seed of each environment."""
+    if seed is None:
+        return [None] * count
+    if np.isscalar(seed):
+        return [int(seed) + number for number in range(count)]  # type: ignore[arg-type]
+    seeds = list(seed)  # type: ignore[arg-type]
+    if len(seeds) != count:
+        raise UserError(f"{len(seeds)} seeds for {count} environments; give one number, or one for each environment")
+    return seeds
+
+
+def _masked(info: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Adds Gymnasium's masks, which say that every environment has each value."""
+    return info | {f"_{name}": np.ones(len(values), bool) for name, values in info.items()}
+
+
+class LiftEnv(gymnasium.Env[Any, Any]):
+    """Lift as a Gymnasium environment that steps from frame to frame of a clip. Call :meth:`close` when done.
+
+    The observation is the frame. When the cube is lifted, the reward is 1 and the episode terminates.
+
+    Args:
+        config: image size, camera and control steps per frame, as for the clips (``load_config(run).sim``).
+        max_steps: steps after which an episode is truncated.
+        out_of_range: whether actions beyond ±1 are clipped and counted ("clip"), or raise an error ("refuse").
+        render_mode: "rgb_array", or None.
+
+    Raises:
+        GLError: no OpenGL context can be made.
+        ConfigError: there is no such camera, or the clips are of another simulator.
+        UserError: ``out_of_range`` is neither of the two.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's own type
+
+    def __init__(
+        self,
+        config: SimConfig = DEFAULT,
+        max_steps: int = STEPS,
+        out_of_range: OutOfRange = "clip",
+        render_mode: str | None = None,
+    ) -> None:
+        check_out_of_range(out_of_range)
+        self._world = SimulatorWorld.lift(config, 1)
+        self._max_steps = max_steps
+        self._out_of_range = out_of_range
+        self._frame: np.ndarray | None = None
+        self._steps = 0
+        self._clipped = 0
+        self.render_mode = render_mode
+        size = config.image_size
+        self.action_space = spaces.Box(-1.0, 1.0, (config.action_dim,))
+        self.observation_space: Any = spaces.Dict(
+            rgb=spaces.Box(0, 255, (size, size, 3), np.uint8), depth=spaces.Box(0.0, FAR, (size, size))
+        )
+
+    @property
+    def success(self) -> bool:
+        """Whether the cube is lifted now, by the simulator's own predicate."""
+        return self._world.simulators[0].success
+
+    @property
+    def state(self) -> State:
+        """Where gripper and cube are, for scripted policies."""
+        state: State = self._world.simulators[0].state
+        return state
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins an episode; the seed (0 … 2³² - 1) determines the arm's start and the cube's place.
+
+        If there is no seed, one is drawn from the generator that the last seed started.
+        """
+        super().reset(seed=seed)
+        start = int(self.np_random.integers(2**32)) if seed is None else seed
+        state = self._world.reset([start])
+        self._steps = 0
+        self._clipped = 0
+        return self._seen(state), {"success": bool(state.success[0]), "clipped": 0}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Runs one frame's control steps.
+
+        Args:
+            action: (A,), like a row of a clip's actions; or a control, which is called at each control step.
+
+        Returns:
+            Observation, reward, terminated, truncated, and info: "success", "clipped" (numbers clipped in this episode)
+            and "action", the action after clipping.
+
+        Raises:
+            ActionError: the action has the wrong shape or a value that is not finite, or is refused as out of range.
+            ArithmeticError: the simulation diverged.
+        """
+        if self._frame is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before its first step")
+        if callable(action):
+            state = self._world.step([action])
+        else:
+            row, outside = self._world.actions.clip(action, None, self._out_of_range)
+            state = self._world.step(row[None])
+            self._clipped += int(outside.sum())
+        if self._world.diverged:
+            raise self._world.diverged[0]
+        self._steps += 1
+        success = bool(state.success[0])
+        info = {"success": success, "clipped": self._clipped, "action": state.actions[0]}
+        return self._seen(state), float(success), success, self._steps >= self._max_steps, info
+
+    def render(self) -> UInt8[np.ndarray, "S S 3"] | None:  # type: ignore[override]
+        """Returns the current frame; None without a render mode."""
+        return self._frame if self.render_mode else None
+
+    def close(self) -> None:
+        """Frees the renderer and the simulation."""
+        self._world.close()
+
+    def _seen(self, state: WorldState) -> Observation:
+        observation = {name: frames[0] for name, frames in state.observation.items()}
+        self._frame = observation["rgb"]
+        return observation

@@ -1,0 +1,175 @@
+"""A trained world model as a world: it generates frames, and a judge decides on success.
+
+Axes: B episodes, P prompt frames, S×S pixels, A action dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from rsjax.clip import Video
+from rsjax.config import content_key
+from rsjax.evaluation.results import fingerprint
+from rsjax.models.base import Imagination, WorldModel
+from rsjax.models.trained import TrainedModel
+from rsjax.tools.policies.judges.judge import HISTORY, SUCCESS, Judge, judge_key
+from rsjax.tools.policies.worlds.actions import ActionRange, action_range
+from rsjax.tools.policies.worlds.world import WorldState
+
+DRAWS = 2**20  # added to a clip's index at each step, so that steps differ in their draws; clip indices are smaller
+
+
+@dataclass(frozen=True)
+class FirstFrame:
+    """Where an episode in a world model begins.
+
+    Attributes:
+        rgb: the first frame.
+        depth: its depth, metres; None for a model without depth.
+        draw: a number that determines the model's draws; 0 gives the video of ``TrainedModel.generate``.
+        clip: the clip's number in its split; -1 for a frame of no clip.
+    """
+
+    rgb: UInt8[np.ndarray, "S S 3"]
+    depth: Float32[np.ndarray, "S S"] | None
+    draw: int
+    clip: int = -1
+
+
+class ModelWorld:
+    """Episodes in a world model, which start from first frames.
+
+    Args:
+        trained: a model that ``rsjax.load`` loaded.
+        count: episodes that run together.
+        judge: decides which frames show success; without a judge none do.
+        actions: the actions that it takes; by default those of its run.
+        whole_videos: whether a family that generates only whole videos may serve, one short video for each frame.
+
+    Raises:
+        UserError: the family cannot generate frame by frame, and ``whole_videos`` is False.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedModel,
+        count: int,
+        judge: Judge | None,
+        actions: ActionRange | None = None,
+        whole_videos: bool = True,
+    ) -> None:
+        self.count = count
+        self.actions = actions or action_range(trained.config, trained.assets.normalization)
+        self.validation: dict[str, Any] | None = getattr(judge, "validation", None)
+        self._trained = trained
+        self._judge = judge
+        self._imagination: Imagination
+        if whole_videos and type(trained.model).imagine is WorldModel.imagine:
+            self._imagination = WholeVideoImagination(trained)
+        else:
+            self._imagination = trained.model.imagine(trained.params, trained.assets, count)
+
+    @cached_property
+    def key(self) -> str:
+        limits = fingerprint((self.actions.low, self.actions.high))
+        return content_key("imagined", 2, model_key(self._trained), judge_key(self._judge), limits)
+
+    def reset(self, starts: Sequence[FirstFrame], which: Bool[np.ndarray, " B"] | None = None) -> WorldState:
+        """Begins an episode from each first frame; the observations are these frames as the model sees them."""
+        everything = which is None
+        if which is None:
+            self._running = len(starts)
+            starts = [*starts, *[starts[-1]] * (self.count - len(starts))]  # one program serves any number
+            which = np.ones(self.count, bool)
+        depth = [start.depth for start in starts if start.depth is not None]
+        first = Video(
+            np.stack([start.rgb for start in starts])[:, None],
+            np.stack(depth)[:, None] if len(depth) == len(starts) else None,
+        )
+        video = self._imagination.restart(which, first, np.array([start.draw for start in starts]))
+        recent = np.repeat(np.asarray(video.rgb), HISTORY, axis=1)
+        observation = _last_frame(video)
+        if everything:
+            self._recent = recent
+            self._observation = observation
+        else:
+            self._recent[which] = recent
+            for name, frames in observation.items():
+                merged = self._observation[name].copy()  # jax's own arrays cannot be written
+                merged[which] = frames
+                self._observation[name] = merged
+        return self._state(np.zeros((self.count, len(self.actions.low)), np.float32), np.zeros(self.count, int))
+
+    def step(self, actions: Float[np.ndarray, "B A"], ignored: Bool[np.ndarray, " B"] | None = None) -> WorldState:
+        rows, outside = self.actions.clip(actions, self._running, ignored=ignored)
+        spare = self.count - self._running
+        rows = np.concatenate([rows, rows[-1:].repeat(spare, axis=0)])
+        clipped = np.concatenate([outside.sum(1), np.zeros(spare, int)])
+        video = self._imagination.step(rows)
+        self._recent = np.concatenate([self._recent[:, 1:], video.rgb], axis=1)
+        self._observation = _last_frame(video)
+        return self._state(rows, clipped)
+
+    def _state(self, actions: Float32[np.ndarray, "B A"], clipped: Int[np.ndarray, " B"]) -> WorldState:
+        running = slice(self._running)
+        success = np.zeros(self._running, bool)
+        verdict = None
+        if self._judge is not None:
+            verdict = self._judge(self._recent)[running]
+            success = verdict.argmax(-1) == SUCCESS
+        observation = {name: frames[running] for name, frames in self._observation.items()}
+        return WorldState(observation, success, actions[running], clipped[running], verdict)
+
+
+def _last_frame(video: Video) -> dict[str, np.ndarray]:
+    frame = {"rgb": np.asarray(video.rgb)[:, -1]}
+    if video.depth is not None:
+        frame["depth"] = np.asarray(video.depth)[:, -1]
+    return frame
+
+
+class WholeVideoImagination:
+    """Implements :class:`rsjax.models.base.Imagination` with ``generate``, for clips that begin together.
+
+    The prompt of each new frame is the last P decoded frames, where P is the model's ``prompt_frames``. Earlier frames
+    are forgotten, and quality drops a little with each decoding. A step costs as much as a video of P + 1 frames.
+    """
+
+    def __init__(self, trained: TrainedModel) -> None:
+        self._trained = trained
+
+    def restart(self, which: Bool[np.ndarray, " B"], first: Video, index: Int[np.ndarray, " B"]) -> Video:
+        assert which.all(), "clips begin together"
+        trained = self._trained
+        self._frames = (trained.model.reconstruct(trained.assets, Video(first.rgb)) or first).rgb
+        self._actions = np.zeros((len(which), 1, trained.config.clips.action_dim), np.float32)
+        self._index = np.asarray(index)
+        self._steps = 0
+        return Video(self._frames)
+
+    def step(self, actions: Float[np.ndarray, "B A"]) -> Video:
+        trained = self._trained
+        prompt_frames = trained.config.prompt_frames
+        rows = np.concatenate([self._actions, actions[:, None]], axis=1)
+        index = (self._index + self._steps * DRAWS) % 2**31
+        video = trained.model.generate(
+            trained.params, trained.assets, Video(self._frames), rows, index=index, depth=False
+        )
+        frame = video.rgb[:, -1:]
+        self._frames = np.concatenate([self._frames, frame], axis=1)[:, -prompt_frames:]
+        self._actions = rows[:, -prompt_frames:]
+        self._steps += 1
+        return Video(frame)
+
+
+def model_key(trained: TrainedModel) -> str:
+    """Returns the key of all that a world model's videos depend on: weights, tokenizer, normalization and settings."""
+    config = trained.config
+    assets = trained.assets
+    settings = (config.prompt_frames, config.clips, config.tokenizer, config.model)
+    weights = fingerprint((trained.params, assets.tokenizer))
+    return content_key("model", str(settings), str(assets.normalization), weights)

@@ -1,0 +1,119 @@
+"""First frames for episodes in a world model: from a run's held-out clips, or from the caller.
+
+Axes: S×S pixels.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsjax.config import Config
+from rsjax.data.clips import readable
+from rsjax.data.store import Source, StoreError
+from rsjax.errors import UserError
+from rsjax.tools.pipeline.run import Run
+from rsjax.tools.pipeline.run_clips import relocated
+from rsjax.tools.policies.worlds.model_world import FirstFrame
+
+
+class StartError(UserError):
+    """Says why an episode cannot begin: the run's clips are missing, or the given frame does not fit."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """The first frames of a run's clips.
+
+    Attributes:
+        config: the run's configuration.
+        run, data_dir, store: where its clips are, as for ``experiments.generate``.
+        split: the clips to choose from.
+        depth: whether a first frame needs depth.
+    """
+
+    config: Config
+    run: Path
+    data_dir: Path
+    store: Path | None
+    split: str
+    depth: bool
+
+    @cached_property
+    def source(self) -> Source:
+        """The clips of the split.
+
+        Raises:
+            StartError: the clips are missing.
+        """
+        try:
+            config = relocated(self.config, self.store) if self.store else self.config
+            store = Run(config, self.run, self.data_dir).open_clips()
+            if self.split not in store.splits:
+                raise StoreError(f"{store.path}: has no split {self.split!r} ({', '.join(store.splits)})")
+            return store.source(self.split)
+        except UserError as error:
+            frame = '"rgb": …, "depth": …' if self.depth else '"rgb": …'
+            raise StartError(
+                f"{error}; without the run's clips, reset needs a first frame of its own: options={{{frame}}}; or name "
+                f"them with data_dir or store"
+            ) from error
+
+    def choose(self, rng: np.random.Generator, options: dict[str, Any]) -> FirstFrame:
+        """Returns the frame in the options, the first frame of the clip that they name, or that of a random clip.
+
+        Args:
+            rng: chooses the clip and the draws, where the options do not.
+            options: "rgb", uint8 (S, S, 3), with "depth", metres (S, S), if the model generates it; or "clip", a
+                number; or neither. "draw" determines the model's draws.
+
+        Raises:
+            StartError: the frame has another size or type, there is no such clip, or the clips are missing.
+        """
+        if unknown := options.keys() - {"rgb", "depth", "clip", "draw"}:
+            raise StartError(f"reset has no option {', '.join(sorted(unknown))} (options: rgb, depth, clip, draw)")
+        number = -1
+        if "rgb" in options or "depth" in options:
+            rgb, depth = self._checked(options)
+        else:
+            number, clip = self._clip(rng, options.get("clip"))
+            rgb = clip["rgb"][0]
+            depth = clip["depth"][0] if self.depth else None
+        drawn = rng.integers(2**31)  # also where the options say otherwise, so that later choices are the same
+        return FirstFrame(rgb, depth, int(options.get("draw", drawn)), number)
+
+    def _clip(self, rng: np.random.Generator, number: Any) -> tuple[int, dict[str, Any]]:
+        """Returns the clip with this number, or a random one for None."""
+        count = len(self.source)
+        if number is None:
+            for chosen, clip in readable(self.source, rng.permutation(count).tolist()):
+                if not self.depth or clip["depth"] is not None:
+                    return chosen, clip
+            raise StartError(f"no clip of the {self.split} split has depth, which this model starts from")
+        if not isinstance(number, int | np.integer) or not 0 <= number < count:
+            raise StartError(f"no clip {number!r} in the {self.split} split, which has 0 … {count - 1}")
+        clip = self.source[int(number)]
+        if self.depth and clip["depth"] is None:
+            raise StartError(f"clip {number} of the {self.split} split has no depth, which this model starts from")
+        return int(number), clip
+
+    def _checked(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Returns the caller's frame and its depth."""
+        size = self.config.clips.image_size
+        rgb = np.asarray(options.get("rgb"))
+        if rgb.shape != (size, size, 3) or rgb.dtype != np.uint8:
+            raise StartError(
+                f"the first frame's rgb has shape {rgb.shape} and type {rgb.dtype}; expected ({size}, {size}, 3), "
+                f"uint8, RGB from 0 to 255"
+            )
+        if not self.depth:
+            return rgb, None
+        depth = np.asarray(options.get("depth"))
+        if depth.shape != (size, size) or depth.dtype.kind not in "fiu" or not np.isfinite(depth).all():
+            raise StartError(
+                f"the first frame's depth has shape {depth.shape} and type {depth.dtype}; this model generates depth, "
+                f"so it starts from finite floats of shape ({size}, {size}), metres along the optical axis"
+            )
+        return rgb, depth.astype(np.float32)

@@ -1,0 +1,244 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from rsjax.clip import Video
+from rsjax.data.store import Store
+from rsjax.errors import UserError
+from rsjax.tools.policies.judges import judge_training as judging
+from rsjax.tools.policies.judges import trained_judge as judge_module
+from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS, last_frames
+from rsjax.tools.policies.judges.people_and_vlms import HumanJudge, LanguageJudge, answer_label, write_blinded
+from rsjax.tools.policies.judges.trained_judge import Footage, Network, TrainedJudge, load_judge, spoilt, train_judge
+from rsjax.tools.policies.judges.validation import markdown, scores, summary, table, validate
+from rsjax.tools.policies.worlds.environments import WorldModelEnv
+from tests.tools.pipeline import toy
+
+
+def footage(videos: int, seed: int) -> Footage:
+    """A square on a ramp that rises, in some videos above the middle, which is success."""
+    rng, frames, size = np.random.default_rng(seed), 6, 32
+    ramp = np.linspace(40, 120, size).astype(np.uint8)
+    rgb = np.broadcast_to(ramp[None, None, :, None, None], (videos, frames, size, size, 3)).copy()
+    height = rng.uniform(2, 12, (videos, 1)) + rng.uniform(0, 4, (videos, 1)) * np.arange(frames)
+    column = rng.integers(0, size - 8, videos)
+    for i, t in np.ndindex(videos, frames):
+        top = size - 8 - int(height[i, t].clip(0, size - 8))
+        rgb[i, t, top : top + 8, column[i] : column[i] + 8] = (230, 30, 30)
+    return Footage(rgb, height > 12)
+
+
+@pytest.fixture(scope="module")
+def judge() -> TrainedJudge:
+    return train_judge(footage(60, 0), footage(20, 1), steps=80)
+
+
+def test_a_judge_tells_success_from_failure_and_from_spoilt_frames(judge: TrainedJudge) -> None:
+    result = validate(judge, footage(20, 2), spoil=True)
+    assert result["right"][0] > 0.8, result
+    assert np.sum(result["confusion"]) == 2 * 20 * 5
+    assert all(result[f"{label}_found"][0] > 0.6 for label in LABELS), result
+    assert table({"clips": 20, "raw": result}).row_count == 3
+    facts = summary({"clips": 20, "raw": result})
+    assert facts is not None and facts["raw"]["confusion"] == result["confusion"] and "bins" not in facts["raw"]
+    cells = [" / ".join(map(str, row)) for row in result["confusion"]]
+    assert f"| raw | {' | '.join(cells)} | {100 * result['right'][0]:.1f} % |" in markdown(facts)[-1]
+
+
+def test_a_judge_comes_back_from_its_file_and_damage_is_named(judge: TrainedJudge, tmp_path: Path) -> None:
+    judge.save(tmp_path / "judge")
+    frames = footage(2, 3).rgb
+    np.testing.assert_array_equal(load_judge(tmp_path / "judge", 32)(frames), judge(frames))
+    assert load_judge(tmp_path / "judge").key == judge.key != replace(judge, temperature=3.0).key
+    for name in ("judge", "run"):  # a directory of one, or the run's own
+        with pytest.raises(UserError, match="was trained on frames of 32 × 32 pixels, these have 64 × 64"):
+            judging.judge_of(tmp_path, tmp_path / name if name == "judge" else name, 64)
+    report = tmp_path / "judge" / "validation.json"
+    for name, known in ((judge.key, True), ("another", False)):
+        report.write_text(json.dumps({"judge": name}))
+        assert (load_judge(tmp_path / "judge").validation is not None) == known
+    np.testing.assert_allclose(judge(frames).sum(-1), 1, rtol=1e-5)
+    np.testing.assert_array_equal(judge(frames), judge(frames[:, -HISTORY:]))
+    with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
+        load_judge(tmp_path)
+    (tmp_path / "judge" / "judge.msgpack").write_bytes(b"nonsense")
+    with pytest.raises(UserError, match="damaged"):
+        load_judge(tmp_path / "judge")
+    one = footage(4, 0)
+    with pytest.raises(UserError, match="both success and failure"):
+        train_judge(Footage(one.rgb, np.zeros_like(one.success)), one, 1)
+
+
+def test_histories_end_with_their_frame() -> None:
+    some = footage(2, 0)
+    np.testing.assert_array_equal(
+        some.histories(np.array([1, 0]), np.array([1, 5])),
+        np.stack([last_frames(some.rgb[1:2, :2])[0], some.rgb[0, 2:6]]),
+    )
+
+
+def test_every_history_is_spoilt_and_in_several_ways() -> None:
+    frames, rng = footage(40, 4).rgb[:, :HISTORY], np.random.default_rng(0)
+    changed = np.abs(spoilt(frames, frames[::-1], rng).astype(float) - frames).mean((1, 2, 3, 4))
+    assert changed.min() > 1 and changed.max() > 10 * changed.min()
+
+
+def test_no_history_is_put_on_top_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def keep(frames: np.ndarray, others: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        pairs.append((frames, others))
+        return frames
+
+    monkeypatch.setattr(judge_module, "spoilt", keep)
+    some, rng = footage(20, 5), np.random.default_rng(0)
+    found = [np.argwhere(some.success == done) for done in (True, False)]
+    for _ in range(30):
+        judge_module._batch(some, found, rng)
+    assert len(pairs) == 30
+    assert all((one != other).any((1, 2, 3, 4)).all() for one, other in pairs)
+
+
+def test_frames_whose_side_is_no_multiple_of_8_are_spoilt_but_for_a_border() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (40, HISTORY, 21, 21, 3), np.uint8)
+    made = spoilt(frames, frames[::-1], np.random.default_rng(1))
+    changed = made != frames
+    assert changed[:, :, :16, :16].any((1, 2, 3, 4)).all()
+    border = changed[:, :, 16:].any((1, 2, 3, 4)) | changed[:, :, :, 16:].any((1, 2, 3, 4))
+    assert 0.25 < border.mean() < 0.75, "blocks and blur leave it"
+
+
+def test_scores_agree_with_a_count_by_hand() -> None:
+    sure = np.array([[0.9, 0.1, 0.0], [0.7, 0.2, 0.1], [0.1, 0.6, 0.3], [0.2, 0.2, 0.6]])
+    result = scores(sure, np.array([0, 1, 1, 1]))
+    assert result["confusion"] == [[1, 0, 0], [1, 1, 1], [0, 0, 0]]
+    assert result["right"][0] == 0.5 and result["success_found"][0] == 1
+    assert result["fail_found"][0] == pytest.approx(1 / 3)
+    assert "uninterpretable_found" not in result and result["uninterpretable_share"] == 0.25
+    assert result["calibration_error"] == pytest.approx((abs(0.9 - 1) + abs(0.7 - 0) + 2 * abs(0.6 - 0.5)) / 4)
+
+
+def test_a_runs_judge_is_made_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The toy's clips teach nothing, so a fresh network stands in for the result of its training."""
+    judge = TrainedJudge(
+        Network().init(jax.random.key(0), np.zeros((1, HISTORY, 64, 64, 3), np.uint8))["params"], 2.0, 64
+    )
+    run, store = tmp_path / "run", toy.store(tmp_path / "clips")
+    trained = toy.trained(store)
+    monkeypatch.setattr(judging, "load", lambda run: trained)
+    monkeypatch.setattr(judging.Run, "open_clips", lambda self: store)
+    seen: list[Footage] = []
+
+    def train(learned: Footage, *_: object) -> TrainedJudge:
+        seen.append(learned)
+        return judge
+
+    monkeypatch.setattr(judging, "train_judge", train)
+    result = judging.make_judge(run, tmp_path, settings=judging.JudgeSettings(reconstructed=2))
+    assert seen[0].rgb.shape[0] == toy.TRAIN + 2
+    assert {kind: np.sum(result[kind]["confusion"]) for kind in ("raw", "reconstructed", "generated")} == {
+        "raw": 2 * toy.TEST * 5,
+        "reconstructed": toy.TEST * 5,
+        "generated": toy.TEST * 5,
+    }
+    loaded = load_judge(run / judging.FOLDER)
+    assert loaded.validation == json.loads((run / "judge" / "validation.json").read_text()) and loaded.validation
+    assert judging.judge_of(run, "run", 64).temperature == loaded.temperature  # type: ignore[union-attr]
+    assert judging.judge_of(tmp_path, "run", 64) is None
+
+
+def test_a_judge_is_validated_on_videos_of_the_clips_tasks_and_depth() -> None:
+    clips = [vars(toy.clip(number, success=True)) for number in range(3)]
+    clips[1]["depth"] = None
+    prompts: list[Video] = []
+
+    def generate(params: Any, assets: Any, prompt: Video, actions: np.ndarray, index: Any, depth: bool) -> Video:
+        prompts.append(prompt)
+        return Video(prompt.rgb.repeat(actions.shape[1], 1))
+
+    model = SimpleNamespace(generate=generate, reconstruct=lambda assets, video: None)
+    config = SimpleNamespace(prompt_frames=1, eval=SimpleNamespace(batch_size=2))
+    trained: Any = SimpleNamespace(config=config, model=model, params=None, assets=None)
+    result = judging.validation(trained, lambda frames: np.tile([0.5, 0.3, 0.2], (len(frames), 1)), clips)
+    assert "reconstructed" not in result and np.sum(result["generated"]["confusion"]) == 3 * 5
+    assert prompts[0].tasks is not None and prompts[0].tasks.tolist() == ["drift", "drift"]
+    assert prompts[0].depth is not None and np.isnan(prompts[0].depth).all((1, 2, 3)).tolist() == [False, True]
+
+
+def test_a_success_ends_an_episode_with_a_reward(tmp_path: Path, store_env: Store) -> None:
+    env = WorldModelEnv(toy.trained(store_env), judge=lambda frames: np.array([[0.8, 0.1, 0.1]]))
+    frame = {"rgb": np.zeros((64, 64, 3), np.uint8), "depth": np.ones((64, 64), np.float32)}
+    assert env.reset(options=frame)[1]["label"] == LABELS[SUCCESS]
+    _, reward, terminated, truncated, info = env.step(np.zeros(28))
+    assert (reward, terminated, truncated, info["success"]) == (1.0, True, False, True)
+    assert info["verdict"].tolist() == [0.8, 0.1, 0.1]
+
+
+@pytest.fixture(scope="module")
+def store_env(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return toy.store(tmp_path_factory.mktemp("judge") / "clips")
+
+
+def test_people_judge_videos_whose_names_say_nothing(tmp_path: Path) -> None:
+    videos = footage(3, 0).rgb
+    sheet = write_blinded(list(videos), tmp_path / "blind")
+    lines = sheet.read_text().splitlines()
+    assert lines[0] == "video,label" and len(lines) == 4 == len(list((tmp_path / "blind").glob("*.mp4"))) + 1
+    with pytest.raises(UserError, match="line 2: the label is empty"):
+        HumanJudge.read(sheet)
+    filled = [lines[0], *(f"{line}{label}" for line, label in zip(lines[1:], ("success", "Fail", "fail"), strict=True))]
+    sheet.write_text("\n".join(filled))
+    verdicts = HumanJudge.read(sheet)(videos)
+    assert sorted(verdicts.argmax(-1)) == [0, 1, 1]
+    with pytest.raises(UserError, match="has no label of 1 of 1 videos"):
+        HumanJudge.read(sheet)(footage(1, 9).rgb)
+    for text, message in {
+        "video\na": "has no column label",
+        "video,label\na,sucess": "'sucess'; did you mean 'success'",
+        "video,label\na,fail\na,success": "line 3: video a has another label above",
+    }.items():
+        sheet.write_text(text)
+        with pytest.raises(UserError, match=message):
+            HumanJudge.read(sheet)
+
+
+def test_a_language_model_answers_in_words(tmp_path: Path) -> None:
+    answers = {"Yes.": 0, " no, it is not": 1, "**Unclear**": 2, "": 2, "maybe": 2}
+    assert {answer: answer_label(answer) for answer in answers} == answers
+    with pytest.raises(UserError, match="needs torch and transformers|no config.json"):
+        LanguageJudge.load(tmp_path)
+
+
+class Words:
+    """Stands in for a processor of transformers: a token of the prompt for each picture and text, one of the answer."""
+
+    def __init__(self) -> None:
+        self.seen: list[list[Any]] = []
+
+    def apply_chat_template(self, chat: list[Any], **settings: Any) -> dict[str, np.ndarray]:
+        assert settings["tokenize"] and settings["add_generation_prompt"] and chat[0]["role"] == "user"
+        self.seen.append(chat[0]["content"])
+        return {"input_ids": np.zeros((1, len(chat[0]["content"])), int)}
+
+    def decode(self, tokens: np.ndarray, skip_special_tokens: bool) -> str:
+        return ("Yes.", "no", "I cannot see it")[tokens.item()]
+
+
+def test_a_language_model_sees_the_last_frames_and_its_answer_counts() -> None:
+    videos, words = footage(3, 0).rgb, Words()
+    answers = iter(range(3))
+
+    def generate(input_ids: np.ndarray, **settings: Any) -> np.ndarray:
+        return np.concatenate([input_ids, [[next(answers)]]], 1)  # the prompt, then the answer
+
+    judge = LanguageJudge(SimpleNamespace(generate=generate), words, "Is it up?", frames=2)
+    np.testing.assert_array_equal(judge(videos), np.eye(3))
+    for video, (*pictures, text) in zip(videos, words.seen, strict=True):
+        np.testing.assert_array_equal([picture["image"] for picture in pictures], video[-2:])
+        assert text["text"] == "Is it up? Answer with one word: yes, no or unclear."

@@ -1,0 +1,229 @@
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rsjax.config import ConfigError
+from rsjax.data.normalization import Normalization
+from rsjax.data.store import Store
+from rsjax.errors import UserError
+from rsjax.models.base import Assets, create_model
+from rsjax.models.trained import TrainedModel
+from rsjax.tools.policies.judges.judge import HISTORY
+from rsjax.tools.policies.planning import closed_loop as planning
+from rsjax.tools.policies.planning import energies
+from rsjax.tools.policies.planning.closed_loop import PlanSettings, compare, folder, table
+from rsjax.tools.policies.planning.energies import Seen, imagined, judged, pixel_distance, token_distance
+from rsjax.tools.policies.planning.planner import Planner, PlannerConfig, search
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.sim.lift import State
+from tests.models.toy_family import ToyConfig
+from tests.tools.pipeline import toy
+from tests.tools.policies.toy_worlds import ToySimulator
+
+LOW, HIGH = -np.ones(2), np.ones(2)
+GOAL = np.array([0.9, -1.4])
+
+
+def distance(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """A point that actions move: how far from the goal it ends."""
+    return np.square(start + 0.5 * candidates.sum(1) - GOAL).sum(-1)
+
+
+def distance_on_the_way(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """The mean over its way: a planner that sees only the end may put it off for ever."""
+    return np.square(start + 0.5 * candidates.cumsum(1) - GOAL).sum(-1).mean(-1)
+
+
+@pytest.mark.parametrize("method", ["cem", "mppi"])
+def test_a_search_finds_the_way_to_the_goal_and_a_closed_loop_reaches_it(method: Any) -> None:
+    config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
+    plan = search(distance, np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    assert plan.energy == pytest.approx(distance(np.zeros(2), plan.actions[None])[0])
+    assert plan.energy < 0.02 < distance(np.zeros(2), np.zeros((1, 4, 2)))[0]
+    assert (np.diff(plan.best) <= 0).all() and plan.best[-1] < plan.best[0]
+    planner, here = Planner(distance_on_the_way, LOW, HIGH, config), np.zeros(2)
+    for _ in range(6):
+        action = planner(here)
+        assert ((action >= LOW) & (action <= HIGH)).all()
+        here = here + 0.5 * action
+    assert np.abs(here - GOAL).max() < 0.15
+    first = Planner(distance_on_the_way, LOW, HIGH, config)(np.zeros(2))
+    planner.reset()
+    np.testing.assert_array_equal(planner(np.zeros(2)), first)
+
+
+@pytest.mark.parametrize("method", ["cem", "mppi"])
+def test_impossible_candidates_are_left_out_of_the_search(method: Any) -> None:
+    def walled(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+        """No way leads through a wall, which most of the first candidates hit."""
+        hit = (start + 0.5 * candidates.cumsum(1))[..., 0].min(-1) < 0
+        return np.where(hit, np.inf, distance(start, candidates))
+
+    config = PlannerConfig(method, horizon=4, candidates=100, rounds=8, elites=10, temperature=0.1)
+    inputs: Any = (np.zeros(2), np.zeros((4, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    assert search(walled, *inputs).energy < 0.05
+    nowhere = search(lambda _, rows: np.full(len(rows), np.inf), *inputs)
+    assert nowhere.energy == np.inf and np.isfinite(nowhere.actions).all()
+
+
+def test_the_mean_of_elites_leaves_impossible_candidates_out() -> None:
+    means: list[np.ndarray] = []
+
+    def only_one(start: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+        means.append(candidates[0])
+        return np.where(np.arange(len(candidates)) == 5, 1.0, np.inf)
+
+    config = PlannerConfig("cem", horizon=2, candidates=8, rounds=2, elites=4)
+    plan = search(only_one, None, np.zeros((2, 2)), LOW, HIGH, config, np.random.default_rng(0))
+    np.testing.assert_array_equal(means[1], plan.actions)
+
+
+def test_held_controls_repeat_and_wrong_energies_are_named() -> None:
+    config = PlannerConfig(candidates=8, elites=2, hold=3)
+    seen: list[np.ndarray] = []
+    planner = Planner(lambda _, rows: seen.append(rows) or rows.sum((1, 2)), -np.ones(6), np.ones(6), config)  # type: ignore[func-returns-value]
+    action = planner(None)
+    np.testing.assert_array_equal(action.reshape(3, 2), np.tile(action[:2], (3, 1)))
+    assert seen[0].shape == (8, 6, 6)
+    with pytest.raises(ConfigError, match="planner.hold is 4; it must divide the 6 numbers"):
+        Planner(distance, -np.ones(6), np.ones(6), replace(config, hold=4))
+    with pytest.raises(ConfigError, match="planner.elites is 9"):
+        replace(config, elites=9)
+    for wrong in (np.zeros((8, 1)), np.full(8, np.nan), np.full(8, -np.inf)):
+        with pytest.raises(UserError, match=r"the energy of 8 candidates has shape .*; expected \(8,\), numbers"):
+            Planner(lambda _, rows, wrong=wrong: wrong, -np.ones(6), np.ones(6), config)(None)  # type: ignore[misc]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> TrainedModel:
+    store: Store = toy.store(tmp_path_factory.mktemp("plan") / "clips")
+    return toy.trained(store)
+
+
+def test_a_planner_acts_in_frames_with_and_without_depth() -> None:
+    asked: list[Seen] = []
+
+    def plan(seen: Any) -> np.ndarray:
+        asked.append(seen)
+        return np.full(2, len(asked))
+
+    for depths in ({"depth": np.ones((1, 4, 4), np.float32)}, {}):
+        asked.clear()
+        act = planning.PlanningActor(cast(Planner, plan), 2, depth=True)
+        for _ in range(3):
+            act({"rgb": np.zeros((1, 4, 4, 3), np.uint8)} | depths)
+        assert [len(seen.rgb) for seen in asked] == [1, 2, 2]
+        assert [None if seen.depth is None else len(seen.depth) for seen in asked] == (
+            [1, 2, 2] if depths else [None] * 3
+        )
+        assert [seen.actions[-1, 0] for seen in asked] == [0, 1, 2]
+
+
+def test_energies_are_scores_of_what_a_model_generates() -> None:
+    config = replace(toy.config(), model=ToyConfig())
+    model = TrainedModel(config, create_model(config), {"gain": 0.3}, Assets(Normalization((0.0,), (1.0,), None), None))
+    rgb, rng = toy.clip(0).rgb[:2], np.random.default_rng(0)
+    candidates = rng.uniform(-0.2, 0.2, (2, 6, 28)).astype(np.float32)
+    seen = Seen(rgb, None, rng.normal(size=(2, 28)).astype(np.float32))
+    actions = np.concatenate([np.repeat(seen.actions[None], 2, 0), candidates], 1)
+    videos = model.plan(rgb, actions).rgb[:, -HISTORY:]
+    goal = videos[1, -1]
+    found = imagined(model, pixel_distance(goal))(seen, candidates)
+    assert found[1] == 0 < found[0]
+    assert found[0] == pytest.approx(np.square((videos[0, -1].astype(float) - goal) / 255).mean(), rel=1e-4)
+    given: list[np.ndarray] = []
+
+    def judge(frames: np.ndarray) -> np.ndarray:
+        given.append(frames)
+        return np.stack([frames[:, -1].mean((1, 2, 3)) / 255] * 3, -1)
+
+    assert imagined(model, judged(judge))(seen, candidates) == pytest.approx(1 - videos[:, -1].mean((1, 2, 3)) / 255)
+    np.testing.assert_array_equal(given[0], videos)
+
+
+def test_the_distance_of_tokens_counts_bits(model: TrainedModel) -> None:
+    frames = np.stack([toy.clip(number).rgb[:1] for number in range(2)])
+    found = token_distance(model, frames[1, 0])(frames)
+    assert found[1] == 0 < found[0] <= 1
+    by_hand = [bin(int(x)).count("1") for x in np.bitwise_xor(*model.encode(frames)["rgb"][:, 0]).ravel()]
+    assert found[0] == pytest.approx(np.mean(by_hand) / model.config.tokenizer.code_bits)
+
+
+def test_the_distance_of_lpips_compares_last_frames_with_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    def distances(params: float, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        assert one.shape == other.shape
+        return params * np.abs(one.astype(float) - other).mean((1, 2, 3))
+
+    monkeypatch.setattr(energies, "load_lpips", lambda weights: 2.0)
+    monkeypatch.setattr(energies, "distances", distances)
+    monkeypatch.setattr(energies, "min_size", lambda params: 8)
+    goal, videos = np.full((8, 8, 3), 7, np.uint8), np.zeros((2, 3, 8, 8, 3), np.uint8)
+    videos[1, -1] = 7
+    assert energies.lpips_distance(Path("weights"), goal)(videos).tolist() == [14, 0]
+    with pytest.raises(UserError, match="weights: frames have 4 pixels; this network needs 8"):
+        energies.lpips_distance(Path("weights"), goal[:4, :4])
+
+
+class FakeLift(ToySimulator):
+    """Stands in for Lift: done once a control's first number is large, as the expert's is far from the cube."""
+
+    state: Any = State(np.zeros(3), np.zeros(3), 0.0, np.array([1.0, 0.0, 0.8]), 0.0)
+
+    def reset(self, seed: int) -> None:
+        self.place = 0.0
+
+    def step(self, control: np.ndarray) -> None:
+        super().step(np.zeros(7))
+        if control[0] > 0.99:
+            self.place = 10.0
+
+
+def lift(diverges: bool = False) -> SimulatorWorld:
+    simulators: Any = [FakeLift(64, diverges)]
+    return SimulatorWorld(simulators, 4, 7)
+
+
+def test_a_comparison_resumes_and_counts(model: TrainedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "imagined", lambda trained, score: lambda seen, rows: -rows[:, 0, 0])
+    search = PlannerConfig(rounds=6, candidates=30, elites=5, horizon=2)
+    settings = PlanSettings(search, energy="pixels", episodes=3, max_steps=3)
+    result = compare(model, tmp_path, lift(), settings)
+    ways = {name: way["success"] for name, way in result["ways"].items()}
+    assert ways == {"random": 0.0, "expert": 1.0, "cem": 1.0, "mppi": 1.0}
+    assert result["ways"]["cem"]["seconds_per_decision"] > 0
+    assert result["ways"]["cem"]["episodes"] == 3 and result["ways"]["random"]["success_high"] > 0.3
+    assert table(result).row_count == 4
+    place = folder(tmp_path, result["key"])
+    saved = (place / "result.json").read_text()
+    assert "| cem | 100% |" in (place / "results.md").read_text()
+    assert {path.name for path in place.glob("*.mp4")} == {f"{way}-{n:02d}.mp4" for way in ways for n in range(3)}
+    one = replace(settings, methods=(), episodes=1)
+    for number in range(2):  # another policy has another folder
+        policy: Any = SimpleNamespace(action_dim=28, model=SimpleNamespace(image_size=64), key=str(number))
+        policy.actor = lambda seed: lambda frames: np.ones((1, 28), np.float32)
+        other = compare(model, tmp_path, lift(), one, {"policy a/b": policy})
+        assert other["ways"]["policy a/b"]["success"] == 1
+        assert (folder(tmp_path, other["key"]) / "policy a-b-00.mp4").exists()
+        assert len(list((tmp_path / "plan").iterdir())) == 2 + number
+    monkeypatch.setattr(planning, "lpips_distance", lambda weights, goal: None)
+    keys = []
+    for name, content in (("a", b"1"), ("b", b"1"), ("a", b"2")):  # weights count by their content
+        (tmp_path / name).write_bytes(content)
+        lpips = replace(one, energy="lpips", lpips_weights=str(tmp_path / name))
+        keys.append(compare(model, tmp_path, lift(), lpips)["key"])
+    assert keys[0] == keys[1] != keys[2]
+    assert compare(model, tmp_path, SimulatorWorld([], 4, 7), settings) == result  # no episode is run again
+    assert (place / "result.json").read_text() == saved
+    with pytest.raises(UserError, match="no judge there; train one with python -m experiments.judge"):
+        compare(model, tmp_path, lift(), replace(settings, energy="judge"))
+    with pytest.raises(ConfigError, match="needs lpips_weights"):
+        replace(settings, energy="lpips")
+    lost = compare(model, tmp_path, lift(diverges=True), replace(settings, episodes=1, max_steps=2))["ways"]
+    assert {name: (way["success"], way["steps"]) for name, way in lost.items()} == dict.fromkeys(ways, (0.0, 2.0))
+    still: Any = replace(model.config.model, action_encoder="none")  # type: ignore[call-arg]
+    with pytest.raises(UserError, match=r"the model takes no actions \(family 'roboscape'\)"):
+        compare(replace(model, config=replace(model.config, model=still)), tmp_path, lift(), settings)

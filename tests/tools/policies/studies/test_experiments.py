@@ -1,0 +1,197 @@
+"""The comparisons of policies, with policies that need no training in worlds of one dot."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rsjax.errors import UserError
+from rsjax.tools.policies.config import toy
+from rsjax.tools.policies.run_data import named
+from rsjax.tools.policies.studies import improvement
+from rsjax.tools.policies.studies import policy_evaluation as comparison
+from rsjax.tools.policies.studies import policy_learning as learning
+from rsjax.tools.policies.studies.improvement import Improvement, improve, mixed
+from rsjax.tools.policies.studies.policy_evaluation import compare
+from rsjax.tools.policies.studies.policy_learning import Learning, claims, learn
+from rsjax.tools.policies.studies.trials import Trials, first_frames
+from tests.tools.policies.toy import demos
+from tests.tools.policies.toy_worlds import ToyPolicy, imagined, simulated
+from tests.tools.policies.toy_worlds import judge as toy_judge
+
+TRIALS = Trials(episodes=10, max_steps=4, together=5, videos=1)  # the dot begins in columns 3 … 4, 0 … 4, 0 … 2
+
+
+def test_each_cell_learns_from_its_demonstrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: dict[str, tuple[int, int]] = {}
+
+    def train(config: Any, source: Any, directory: Path, *, seed: int, name: str) -> ToyPolicy:
+        trained[directory.name] = (len(source), config.train.steps)
+        return ToyPolicy(0.8 + 0.05 * len(source))
+
+    monkeypatch.setattr(learning, "train_policy", train)
+    settings, out = Learning((1, 4), seeds=2), tmp_path / "out"
+    results = learn(settings, toy(), demos(4), demos(5), simulated(5), TRIALS, out)
+    per_seed = {name.removesuffix("-seed0"): each for name, each in trained.items() if name.endswith("seed0")}
+    assert per_seed == {
+        "synthetic-1": (1, 4),
+        "synthetic-4": (4, 4),
+        "real-1": (1, 4),
+        "real-4": (4, 4),
+        "real-4-repeated": (4, 8),
+        "real-4-synthetic-4": (8, 8),
+    }
+    assert len(trained) == 12 and json.loads((out / "results.json").read_text()) == results
+    success = {row["name"]: np.mean(row["success"]) for row in results["rows"]}
+    assert success["synthetic-1"] == success["real-1"] < success["synthetic-4"] == 0.6
+    found = {claim["claim"]: claim for claim in results["claims"]}
+    as_good = found["4 synthetic as good as 4 real"]
+    assert (as_good["value"], as_good["verdict"]) == (0, "cannot tell"), "20 trials each are too few for 10 %"
+    assert found["more synthetic is better"]["value"] == pytest.approx(success["synthetic-4"] - success["synthetic-1"])
+    assert "| synthetic-4 | 4 synthetic | 60 % |" in (out / "results.md").read_text()
+    assert (out / "success.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(UserError, match="9 demonstrations are asked for, there are 4"):
+        learn(Learning((9,)), toy(), demos(4), demos(9), simulated(5), TRIALS, tmp_path / "more")
+    with pytest.raises(UserError, match="no cell real-7; there are synthetic-1"):
+        Learning((1,), cells=("real-7",)).chosen()
+
+
+def test_without_a_difference_nothing_is_claimed() -> None:
+    rows: Any = [
+        {"name": f"{kind}-8", "real": 8 * (kind == "real"), "synthetic": 8 * (kind != "real"), "steps": 1}
+        | {"success": [[kind == "real", kind != "real"] * 6]}
+        for kind in ("synthetic", "real")
+    ]
+    assert [claim["verdict"] for claim in claims(rows, 8)] == ["cannot tell"]
+    for rate, verdict in ((0, "cannot tell"), (0.9, "holds")):  # where nothing succeeds, nothing is as good as another
+        alike = [row | {"success": [[number < 200 * rate for number in range(200)]]} for row in rows]
+        assert [claim["verdict"] for claim in claims(alike, 8)] == [verdict]
+
+
+def test_a_model_that_moves_alike_ranks_alike(tmp_path: Path) -> None:
+    policies: Any = {f"speed-{speed}": ToyPolicy(speed) for speed in (0.1, 0.8, 0.9, 1.0)}
+    models: Any = {"true": lambda: imagined(5), "slow": lambda: imagined(5, pace=0.5)}
+    results = compare(policies, simulated(5), models, TRIALS, tmp_path)
+    same, slow = results["runs"]
+    assert same["run"] == "true" and same["same_outcome"] == 1
+    assert same["pearson"]["value"] == pytest.approx(1) and same["r2_identity"] == same["r2_prediction"] == 1
+    assert (same["mmrv"], same["bias"]) == (0, 0)
+    assert slow["bias"] < 0 and slow["mmrv"] >= 0 and slow["same_outcome"] < 1
+    assert {path.name for path in (tmp_path / "videos").iterdir()} == {
+        f"{run}-{name}-00.mp4" for run in ("true", "slow") for name in policies
+    }
+    text = (tmp_path / "results.md").read_text()
+    assert "R² of y = x is 1 - Σ(y - x)² / Σ(y - ȳ)²" in text
+    assert "| true | 1.000 |" in text and "| speed-1.0 | the simulator | 60 % |" in text
+    assert (tmp_path / "scatter.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "results.json").read_text()) == results
+    again = compare(policies, simulated(5), {}, TRIALS, tmp_path)  # nothing is run again
+    assert again["runs"] == []
+
+
+def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_path: Path) -> None:
+    def blind(frames: np.ndarray) -> np.ndarray:
+        """Finds frames with the dot in column 5 or farther uninterpretable, and the others no success."""
+        far = frames[:, -1, 7, :, 0].argmax(-1) >= 5
+        return np.stack([np.zeros_like(far), ~far, far], -1).astype(float)
+
+    policies: Any = {"a": ToyPolicy(0.8), "b": ToyPolicy(0.8)}
+    compare(policies, simulated(5), {"run": lambda: imagined(5)}, TRIALS, tmp_path)
+    for world in (imagined(5, judge=blind), imagined(5, pace=0.5)):
+        with pytest.raises(
+            UserError, match=r"run/a/success.json: is of another policy, simulator, world model or judge"
+        ):
+            compare(policies, simulated(5), {"run": lambda world=world: world}, TRIALS, tmp_path)  # type: ignore[misc]
+    with pytest.raises(UserError, match=r"simulator/b/success.json: is of another policy"):
+        compare({**policies, "b": ToyPolicy(0.9)}, simulated(5), {}, TRIALS, tmp_path)  # type: ignore[dict-item]
+    file = tmp_path / "simulator" / "a" / "success.json"
+    file.write_text(json.dumps({"success": [], "clipped": 0, "trials": [10, 4, 5]}))
+    with pytest.raises(UserError, match=r"world model or judge; choose another --out, or delete it"):
+        compare(policies, simulated(5), {}, TRIALS, tmp_path)
+
+    results = compare(policies, simulated(5), {"run": lambda: imagined(5, judge=blind)}, TRIALS, tmp_path / "new")
+    (row,) = results["runs"]
+    assert row["uninterpretable"] == 1 and not any(row["policies"]["a"]["world_model"])
+    assert row["pearson"]["value"] is None and row["policies"]["a"]["clipped"] == {"simulator": 0, "world_model": 0}
+    text = (tmp_path / "new" / "results.json").read_text()
+    assert "NaN" not in text and json.loads(text) == results
+    table = (tmp_path / "new" / "results.md").read_text()
+    assert "| run | – | no variation | – |" in table and "| a | run | 0 % | 0 … 28 % | 100 % | 0 |" in table
+    assert "The judge has no validation.json" in table
+    assert toy_judge.__qualname__ == "judge"  # the keys of functions are their names
+
+
+def test_checkpoints_go_from_the_first_steps_to_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopped: list[int] = []
+
+    def train(config: Any, source: Any, directory: Path, *, name: str, stops: list[int]) -> ToyPolicy:
+        stopped.extend(stops)
+        return ToyPolicy(config.train.steps)
+
+    monkeypatch.setattr(comparison, "train_policy", train)
+    monkeypatch.setattr(comparison, "load_policy", lambda place: ToyPolicy(float(place.name.removeprefix("at-"))))
+    config = replace(toy(), train=replace(toy().train, steps=1000))
+    found: Any = comparison.checkpoints(config, demos(), tmp_path, 8)
+    assert stopped == [10, 30, 60, 120, 250, 500, 750]
+    assert [(name, policy.speed) for name, policy in found.items()] == [(f"step-{n}", n) for n in (*stopped, 1000)]
+    assert not capsys.readouterr().out
+    few = comparison.checkpoints(replace(config, train=replace(config.train, steps=20)), demos(), tmp_path, 8)
+    assert len(few) == 6
+    assert "20 training steps have 6 stages, not 8; more steps, or fewer checkpoints" in capsys.readouterr().out
+
+
+def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learnt: dict[str, tuple[int, float]] = {}
+
+    def train(config: Any, source: Any, directory: Path, *, name: str, seed: int, start: ToyPolicy) -> ToyPolicy:
+        learnt[name] = (len(source), config.train.optimizer.learning_rate)
+        assert config.train.steps == 7
+        return ToyPolicy(start.speed + (0.1 if name.endswith("imagined") else 0), replace(start.model, config=config))
+
+    monkeypatch.setattr(improvement, "train_policy", train)
+    settings = Improvement(rounds=2, imagined=10, max_steps=4, steps=7, share=0.5, learning_rate=0.5)
+    starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
+    model: Any = imagined(5)
+    inputs: Any = (ToyPolicy(0.8), demos(3), starts, model, simulated(5), settings, TRIALS, tmp_path)
+    results = improve(*inputs)
+    draws = model._imagination.draws
+    assert draws[0] == [0, 1, 2, 3, 4] and draws[2] == [10, 11, 12, 13, 14]  # a second round has other draws
+    kept = [row["kept"] for row in results["rounds"]]
+    assert kept == [2, 4]  # of columns 0 … 4 twice, those from which 4 steps at this speed come to column 10
+    assert {name: count for name, (count, _) in learnt.items()} == {
+        "round 1 imagined": 4,
+        "round 1 control": 3,
+        "round 2 imagined": 8,
+        "round 2 control": 3,
+    }
+    assert {rate for _, rate in learnt.values()} == {0.5 * toy().train.optimizer.learning_rate}  # in every round
+    assert (
+        np.mean(results["rounds"][-1]["imagined"])
+        > np.mean(results["before"])
+        == np.mean(results["rounds"][-1]["control"])
+    )
+    assert "| 2 | 10 | 4 | 0 % | imagined | 60 % |" in (tmp_path / "results.md").read_text()
+    count = len(draws)
+    assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
+    other: Any = imagined(5, pace=0.5)  # a model of other weights imagines anew
+    made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1")
+    assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(other._imagination.draws) == 2
+
+
+def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:
+    made: Any = demos(6).records
+    for share, count in ((0.0, 6), (0.5, 12), (0.75, 24)):
+        assert len(mixed(demos(4), made, share, 0)) == count
+
+
+def test_runs_are_named_by_what_tells_them_apart() -> None:
+    assert list(named([Path("/a/runs/tiny")])) == ["tiny"]
+    assert list(named([Path("/a/tiny/s0"), Path("/a/genie/s0")])) == ["tiny-s0", "genie-s0"]
+    assert list(named([Path("/a/runs/simulator")])) == ["runs-simulator"]  # results have a folder of that name
+    with pytest.raises(UserError, match="are the same"):
+        named([Path("/a"), Path("/a")])

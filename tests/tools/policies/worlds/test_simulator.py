@@ -1,0 +1,100 @@
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from rsjax.clip import Clip
+from rsjax.config import ConfigError, SimConfig
+from rsjax.errors import UserError
+from rsjax.tools.play.simulate import Job, simulate
+from rsjax.tools.policies.worlds.actions import ActionError
+from rsjax.tools.policies.worlds.environments import LiftEnv
+from rsjax.tools.policies.worlds.simulator_world import SimulatorWorld
+from rsjax.tools.policies.worlds.world import run_episodes
+from rsjax.tools.sim.episode import EpisodePlan, clip_seed, run_episode
+from rsjax.tools.sim.expert import skilled_expert
+from rsjax.tools.sim.lift import LiftSim
+
+CONFIG = SimConfig(episodes=4, test_episodes=1, frames=4, tracks=20, seed=5, camera="near")
+
+
+@pytest.fixture(scope="module")
+def env(gl: str) -> Iterator[LiftEnv]:
+    env = LiftEnv(CONFIG, max_steps=3)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def clip(gl: str) -> Clip:
+    with LiftSim(CONFIG.camera, CONFIG.image_size) as sim:
+        return run_episode(sim, CONFIG, EpisodePlan("000002", 2))
+
+
+def test_the_simulator_beside_the_dream_gives_a_clips_frames(clip: Clip) -> None:
+    work, seed = simulate(CONFIG), clip_seed(clip.provenance)
+    for _ in range(2):  # it begins again for another branch
+        jobs = [Job("", seed, None, True), *(Job("", None, row, True) for row in clip.actions[1:])]
+        frames = [frame for frame in map(work, jobs) if frame is not None]
+        np.testing.assert_array_equal(np.stack([frame.rgb for frame in frames]), clip.rgb)
+        np.testing.assert_array_equal(np.stack([frame.depth for frame in frames]), clip.depth)
+
+
+def test_replaying_a_clip_gives_its_frames(env: LiftEnv, clip: Clip) -> None:
+    rows = iter(clip.actions[1:])
+    with closing(SimulatorWorld.lift(CONFIG, 1)) as world:
+        (episode,) = run_episodes(world, lambda seen: next(rows)[None], [clip_seed(clip.provenance)], 3)
+    frame, _ = env.reset(seed=clip_seed(clip.provenance))
+    frames = [frame] + [env.step(row)[0] for row in clip.actions[1:]]
+    np.testing.assert_array_equal(np.stack([frame["rgb"] for frame in frames]), clip.rgb)
+    np.testing.assert_array_equal(episode.rgb, clip.rgb)
+    np.testing.assert_array_equal(episode.depth, clip.depth)
+    np.testing.assert_array_equal(episode.actions, clip.actions)
+    np.testing.assert_array_equal(episode.success, clip.success)
+    assert episode.clipped == 0
+
+
+def test_the_expert_lifts_and_its_actions_lift_again(gl: str) -> None:
+    expert = skilled_expert(0)
+    with closing(SimulatorWorld.lift(SimConfig(camera="near", image_size=16), 1)) as world:
+        (first,) = run_episodes(world, lambda seen: [expert.act], [11], 20)
+        rows = iter(first.actions[1:])
+        (again,) = run_episodes(world, lambda seen: next(rows)[None], [11], 20)
+    assert first.success[-1] and not first.success[:-1].any()
+    np.testing.assert_array_equal(first.rgb, again.rgb)
+    assert again.success[-1]
+
+
+def test_another_simulator_is_refused() -> None:
+    with pytest.raises(ConfigError, match="sim.env is metaworld"):
+        LiftEnv(replace(CONFIG, env="metaworld"))
+
+
+def test_gymnasiums_checker_passes(env: LiftEnv) -> None:
+    check_env(env, skip_render_check=True)
+    assert "rsjax/Lift-v0" in gymnasium.registry
+
+
+def test_actions_are_clipped_and_counted_or_refused(env: LiftEnv) -> None:
+    env.reset(seed=0)
+    wide = np.zeros(CONFIG.action_dim)
+    wide[[3, 8]] = 1.5, -7
+    assert env.step(wide)[4]["clipped"] == 2
+    assert env.step(wide)[4]["clipped"] == 4
+    with pytest.raises(UserError, match="out_of_range is 'no'; it is clip or refuse"):
+        LiftEnv(CONFIG, out_of_range="no")  # type: ignore[arg-type]
+    strict = LiftEnv(CONFIG, out_of_range="refuse")
+    strict.reset(seed=0)
+    with pytest.raises(ActionError, match=r"actions\[3\] is 1.5; expected -1 to 1, 6-D change"):
+        strict.step(wide)
+    strict.close()
+    with pytest.raises(ActionError, match=r"shape \(7,\); expected \(28,\)"):
+        env.step(np.zeros(7))
+    with pytest.raises(ActionError, match=r"actions\[5\] is nan"):
+        env.step(np.where(np.arange(28) == 5, np.nan, 0))
+    with pytest.raises(ActionError, match="an action is str"):
+        env.step("left")
