@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from rsjax.config import ClipShape
-from rsjax.layers.attention import Dense, KeyValues, attend_cells, attend_parts, put_frames, rotate
+from rsjax.layers.attention import KeyValues, attend_cells, attend_parts, put_frames, rotate
+from rsjax.layers.dense import Dense
 from rsjax.layers.unstacked_params import together
 from rsjax.models.ivideogpt.config import IVideoGPTConfig
 from rsjax.models.ivideogpt.sequence import Layout

@@ -10,6 +10,7 @@ from rsjax.config import (
     TransformerConfig,
 )
 from rsjax.config.token_model import check_sampling
+from rsjax.models.roboscape.departures.integrated_actions import action_inputs
 
 
 @dataclass(frozen=True)
@@ -34,16 +35,19 @@ class Architecture(TransformerConfig):
     @classmethod
     def create(cls, config: Config) -> "Architecture":
         """Returns the architecture of a configuration whose model is RoboScape or Genie."""
-        model, clips, tokenizer = config.model, config.clips, config.tokenizer
+        model = config.model
+        clips = config.clips
         assert isinstance(model, TokenModelConfig)
-        action_inputs = clips.action_dim * (2 if model.departures.integrate_actions else 1)
+        inputs = 0
+        if model.action_encoder != "none":
+            inputs = action_inputs(model.departures, clips.action_dim)
         return cls(
             **{field.name: getattr(model, field.name) for field in fields(TransformerConfig)},
             frames=model.frames(clips),
             grid=config.grid,
-            code_bits=tokenizer.code_bits,
-            vocabularies=tokenizer.vocabularies,
-            action_inputs=0 if model.action_encoder == "none" else action_inputs,
+            code_bits=config.tokenizer.code_bits,
+            vocabularies=config.tokenizer.vocabularies,
+            action_inputs=inputs,
             use_depth=isinstance(model, RoboScapeConfig) and model.use_depth,
         )
 
@@ -55,7 +59,9 @@ class Architecture(TransformerConfig):
     @property
     def branches(self) -> tuple[str, ...]:
         """Names of the network's branches."""
-        return ("rgb", "depth") if self.use_depth else ("rgb",)
+        if self.use_depth:
+            return ("rgb", "depth")
+        return ("rgb",)
 
     @property
     def uncommitted(self) -> int:

@@ -8,29 +8,17 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.config import Departures
-
 
 @struct.dataclass
 class Keypoints:
     """Selected tracks on the token grid."""
 
     cells: Int[Array, "B K T"]  # row·W + column of the nearest cell
-    visible: Bool[Array, "B K T"]  # whether the point counts in this frame
-
-
-def counted_frames(departures: Departures, visible: Bool[Array, "B N T"]) -> Bool[Array, "B N T"]:
-    """Returns the frames in which each point counts: all, or those that show it with ``visible_keypoints``.
-
-    A point that is not visible in the first frame was not sampled (a clip without tracks has none) and never counts.
-    """
-    if departures.visible_keypoints:
-        return visible
-    return jnp.broadcast_to(visible[..., :1], visible.shape)
+    visible: Bool[Array, "B K T"]  # the frames in which the point counts
 
 
 def motion_magnitude(tracks: Float[Array, "*B N T 2"], visible: Bool[Array, "*B N T"]) -> Float[Array, "*B N"]:
-    """Returns M_i = Σ_t ‖p_i^{t+1} - p_i^t‖₂ over the steps where the point is visible before and after."""
+    """Returns M_i = Σ_t ‖p_i^{t+1} - p_i^t‖₂ over the steps where the point counts before and after."""
     # The norm's gradient at 0 is undefined, which is harmless: no gradient flows through tracks.
     steps = jnp.linalg.norm(tracks[..., 1:, :] - tracks[..., :-1, :], axis=-1)
     return jnp.sum(steps * (visible[..., 1:] & visible[..., :-1]), axis=-1)
@@ -43,7 +31,11 @@ def token_cells(tracks: Float[Array, "*B 2"], grid: int) -> Int[Array, "*B"]:
 
 
 def select(tracks: Float[Array, "B N T 2"], visible: Bool[Array, "B N T"], count: int, grid: int) -> Keypoints:
-    """Returns T_sample, the ``count`` tracks that move most, on the token grid."""
+    """Returns T_sample, the ``count`` tracks that move most, on the token grid.
+
+    Args:
+        visible: the frames in which each point counts.
+    """
     _, chosen = jax.lax.top_k(motion_magnitude(tracks, visible), count)
     take = jax.vmap(lambda values, indices: values[indices])
     return Keypoints(token_cells(take(tracks, chosen), grid), take(visible, chosen))

@@ -3,9 +3,8 @@
 1. Every sub-token of every frame, including the first, becomes a random code with probability rate·u, u ~ U(0, 1).
 2. With ``corruption_probability``: f ~ U{P, …, T-1} and r ~ U(keep, 1); in each frame ≥ f, r shrinks by U(decay, 1) and
    sub-tokens become random with probability 1 - r. Otherwise f = 1. (P: prompt frames.)
-3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame. In a share
-   ``visible_prefix`` of the clips (not in the reference) masking begins at a frame drawn per clip, {1, …, T-1}: all
-   frames before it are visible, as past frames are in sampling.
+3. In frames ≥ f, each cell is masked with probability cos(πv/2), v ~ U(0, 1) drawn per clip and frame. The departure
+   ``visible_prefix`` draws a later f for some clips.
 
 u, f and r are drawn per batch; everything else is drawn per clip from its place in the global batch, so that the draws
 do not depend on the clip's device.
@@ -18,7 +17,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Int
 
-from rsjax.config import Departures, MaskConfig
+from rsjax.config import MaskConfig
+from rsjax.models.roboscape.departures.visible_prefix import after_prefix
 from rsjax.tokenizers import lfq
 
 Tokens = dict[str, Int[Array, "B T H W"]]
@@ -61,31 +61,10 @@ def corrupt(
             branch: _replace_sub_tokens(k, grid, replace, code_bits, vocabularies)
             for k, (branch, grid) in zip(branch_keys, clip.items(), strict=True)
         }
-        first = _after_prefix(visible_prefix, mask_key, frames, first_masked)
+        first = after_prefix(visible_prefix, mask_key, frames, first_masked)
         return Masked(noisy, _mask(mask_key, next(iter(clip.values())).shape, first))
 
     return jax.vmap(one_clip)(index, tokens)
-
-
-def dropped_actions(rate: float, key: Array, index: Int[Array, " B"]) -> Bool[Array, " B"]:
-    """Draws the clips that see the null action instead of their own, each with probability ``rate``.
-
-    Args:
-        key: the step's key, as for :func:`corrupt`.
-        index: each clip's place in the global batch.
-    """
-    key = jax.random.fold_in(key, 2)  # independent of the two keys that corrupt splits it into
-    return jax.vmap(lambda place: jax.random.bernoulli(jax.random.fold_in(key, place), rate))(index)
-
-
-def reads_own_frames(departures: Departures, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
-    """Draws whether a step reads the model's own frames; never before step ``self_conditioning_after``.
-
-    Args:
-        key: the step's key, as for :func:`corrupt`.
-    """
-    drawn = jax.random.bernoulli(jax.random.fold_in(key, 3), departures.self_conditioning)
-    return drawn & (step >= departures.self_conditioning_after)
 
 
 def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int) -> tuple[Array, Array]:
@@ -100,15 +79,6 @@ def _batch_plan(config: MaskConfig, prompt_frames: int, key: Array, frames: int)
     survive = keep * jnp.cumprod(jnp.where(late, decay, 1.0))
     extra = jnp.where(happens & late, 1 - survive, 0.0)
     return 1 - (1 - everywhere) * (1 - extra), jnp.where(happens, drawn, 1)
-
-
-def _after_prefix(rate: float, key: Array, frames: int, first_masked: Array) -> Array:
-    """Returns a clip's first masked frame: later than the batch's in a share ``rate`` of the clips."""
-    if not rate:
-        return first_masked
-    happens_key, cut_key = jax.random.split(jax.random.fold_in(key, 0))
-    cut = jnp.where(jax.random.bernoulli(happens_key, rate), jax.random.randint(cut_key, (), 1, frames), 1)
-    return jnp.maximum(first_masked, cut)
 
 
 def _replace_sub_tokens(key: Array, tokens: Array, rate: Array, code_bits: int, vocabularies: int) -> Array:

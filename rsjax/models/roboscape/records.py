@@ -9,7 +9,7 @@ from rsjax.config import ClipShape
 from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays
-from rsjax.data.shift import moved_tracks
+from rsjax.models.roboscape.departures.shifts import drawn_copy
 
 
 @struct.dataclass
@@ -50,26 +50,17 @@ def token_arrays(normalization: Normalization, integrate: bool, record: Record, 
         integrate: whether to append the actions' sums (see ``Normalization.action_inputs``).
         rng: chooses among the clip and its moved copies, if it has any.
     """
-    if "shifts" in record:
-        record = _drawn(record, rng)
+    record = drawn_copy(record, rng)
     has_depth = record["depth"] is not None
+    depth = record["depth"] if has_depth else np.zeros_like(record["rgb"])
     return {
         "rgb": record["rgb"],
-        "depth": record["depth"] if has_depth else np.zeros_like(record["rgb"]),
+        "depth": depth,
         "actions": normalization.action_inputs(record["actions"], integrate),
         "tracks": record["tracks"],
         "visible": record["visible"],
         "has_depth": np.array(has_depth, np.float32),
     }
-
-
-def _drawn(record: Record, rng: np.random.Generator) -> Record:
-    number = rng.integers(len(record["shifts"]) + 1)
-    if number == 0:
-        return record
-    of = {name: record[f"{name}_shifted"] for name in ("rgb", "depth")}
-    tokens = {name: copies if copies is None else copies[number - 1] for name, copies in of.items()}
-    return record | tokens | moved_tracks(record, record["shifts"][number - 1])
 
 
 def token_batch(arrays: Arrays) -> Batch:
@@ -78,9 +69,9 @@ def token_batch(arrays: Arrays) -> Batch:
     ``weight`` is 1 and ``index`` the row by default.
     """
     size = len(arrays["rgb"])
-    defaults = {"weight": np.ones(size, np.float32), "index": np.arange(size, dtype=np.int32)}
-    every = defaults | arrays
-    return Batch(**{name: every[name] for name in (*ARRAYS, "weight", "index")})
+    weight = arrays.get("weight", np.ones(size, np.float32))
+    index = arrays.get("index", np.arange(size, dtype=np.int32))
+    return Batch(**{name: arrays[name] for name in ARRAYS}, weight=weight, index=index)
 
 
 def random_record(rng: np.random.Generator, clips: ClipShape, grid: int, code_bits: int) -> Record:

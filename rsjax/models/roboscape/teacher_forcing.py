@@ -19,8 +19,9 @@ from rsjax.clip import Array
 from rsjax.config import SampleConfig
 from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.models.roboscape.maskgit import sample_tokens
-from rsjax.models.roboscape.transformer import Transformer, empty_cache, shifted
+from rsjax.models.roboscape.transformer import Transformer, empty_cache
 from rsjax.models.roboscape.window import window_actions, window_start
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
@@ -80,7 +81,7 @@ def _score_window(
     slots = max(arch.frames + 1, frames) if arch.departures.rotary else frames
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
     _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
-    before = {name: shifted(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}
+    before = {name: frame_before(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}
 
     def score(t: Array) -> tuple[Scores, Scores]:
         frame = {name: jax.lax.dynamic_slice_in_dim(grid, t, 1, axis=1) for name, grid in tokens.items()}

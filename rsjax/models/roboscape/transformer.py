@@ -14,11 +14,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.attention import PRODUCT, Dense, KeyValues, layer_norm, put_frames
+from rsjax.layers.attention import KeyValues, put_frames
+from rsjax.layers.dense import PRODUCT, Dense, layer_norm
 from rsjax.layers.gelu import gelu
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.blocks import DualBlock
+from rsjax.models.roboscape.attention import Attention
+from rsjax.models.roboscape.departures.action_dropout import with_null_action
+from rsjax.models.roboscape.departures.norms import added_norm
+from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
+from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
@@ -26,6 +31,8 @@ from rsjax.trainable import Params
 Cells = Int[Array, "B T S"] | Float[Array, "B T S D"]
 StackedCache = dict[str, KeyValues]  # by branch
 Cache = StackedCache | list[StackedCache]  # of all blocks; or of each, split by rsjax.layers.unstacked_params
+
+Features = Float[Array, "B T S C"]
 
 MUP_WIDTH = 256  # the public code's base width
 
@@ -54,6 +61,55 @@ class TokenEmbed(nn.Module):
         return jnp.where(mask[..., None], mask_embed, embedded)
 
 
+class STBlock(nn.Module):
+    """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
+
+    The departure ``temporal_norm`` adds a norm before temporal attention; ``config.qk_norm`` removes norm1 and norm2.
+    GELU is exact.
+    """
+
+    config: Architecture
+
+    @nn.compact
+    def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
+        cfg = self.config
+        bf16 = cfg.compute_dtype == "bfloat16"
+        normed = x if cfg.qk_norm else layer_norm("norm1")(x)
+        x = x + Attention(cfg, name="spatial_attn").spatial(normed)
+        normed = added_norm(cfg.departures.temporal_norm, "norm_temporal", x)
+        out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
+        x = x + out
+        normed = x if cfg.qk_norm else layer_norm("norm2")(x)
+        inner = gelu(Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed))
+        return x + Dense(cfg.width, bf16, name="fc2")(inner), cache
+
+
+class DualBlock(nn.Module):
+    """One block of each branch, then h_RGB += W(h_depth) (Eq. 3). Without depth, only the RGB block.
+
+    Inputs and outputs are dicts by branch; the signature is that of ``nn.scan``.
+    """
+
+    config: Architecture
+
+    @nn.compact
+    def __call__(
+        self, x: dict[str, Features], cache: dict[str, KeyValues] | None, start: Any
+    ) -> tuple[dict[str, Features], dict[str, KeyValues] | None]:
+        cfg = self.config
+        out: dict[str, Features] = {}
+        new: dict[str, Any] = {}
+        for branch, features in x.items():
+            branch_cache = None if cache is None else cache[branch]
+            out[branch], new[branch] = STBlock(cfg, name=branch)(features, start, branch_cache)
+        if "depth" in out:
+            # Zero at first, so that pre-trained RGB weights keep their logits.
+            bf16 = cfg.compute_dtype == "bfloat16"
+            project = Dense(cfg.width, bf16, kernel_init=nn.initializers.zeros, name="depth_to_rgb")
+            out["rgb"] = out["rgb"] + project(out["depth"])
+        return out, None if cache is None else new
+
+
 class Transformer(nn.Module):
     """Two branches of spatial-temporal blocks, or the RGB branch alone if ``config.use_depth`` is False."""
 
@@ -75,7 +131,8 @@ class Transformer(nn.Module):
 
         Args:
             tokens: by branch ("rgb", and "depth" if the model has it), or codes; ignored where ``mask`` is True.
-            mask: True for masked cells, in both branches; ``whole_frames`` masks more, see :func:`hidden`.
+            mask: True for masked cells, in both branches; ``whole_frames`` masks more, see
+                :mod:`rsjax.models.roboscape.departures.whole_frames`.
             actions: row t led into frame start + t; ignored if ``config.action_inputs`` is 0.
             start: position of the first of these frames; may be traced. For learned positions a traced start + T must
                 not exceed ``config.frames``, which is not checked.
@@ -94,33 +151,30 @@ class Transformer(nn.Module):
                 no positions for so many frames; or ``previous`` is missing.
         """
         cfg = self.config
-        if drop_actions is not None and not cfg.departures.action_dropout:
+        departures = cfg.departures
+        if drop_actions is not None and not departures.action_dropout:
             raise ValueError("drop_actions needs a model with a null action: model.departures.action_dropout above 0")
-        if cfg.departures.read_previous and previous is None and not (isinstance(start, int) and start == 0):
+        if departures.read_previous and previous is None and not (isinstance(start, int) and start == 0):
             raise ValueError("the model reads the frame before these, which do not begin a clip: pass previous")
         b, t = mask.shape[:2]
-        cells = lambda x: x.reshape(b, t, cfg.grid**2, *x.shape[4:])  # noqa: E731
-        init = nn.initializers.normal(cfg.position_std)
-        rotary = cfg.departures.rotary  # then the blocks encode time
-        if not rotary and t + (start if isinstance(start, int) else 0) > cfg.frames:
-            raise ValueError(f"{t} frames from {start} on; the model has learned positions for {cfg.frames}")
-        position = self.param("pos_embed", init, (1 if rotary else cfg.frames, cfg.grid**2, cfg.width))
-        position = position if rotary else jax.lax.dynamic_slice_in_dim(position, start, t, axis=0)
-        shared = position + self._action(actions, drop_actions) if cfg.action_inputs else position
-        masks = dict.fromkeys(cfg.branches, cells(hidden(cfg, mask, start)))
+        cells = {name: tokens[name].reshape(b, t, cfg.grid**2, *tokens[name].shape[4:]) for name in cfg.branches}
+
+        # Eq. 2: the sum of token, action and position embeddings, by branch.
+        shared = self._positions(t, start)
+        if cfg.action_inputs:
+            shared = shared + self._action(actions, drop_actions)
+        mask = hidden(departures, mask.reshape(b, t, cfg.grid**2), start)
+        masks = dict.fromkeys(cfg.branches, mask)
         if cfg.use_depth and no_depth is not None:
-            masks["depth"] = masks["depth"] | no_depth[:, None, None]  # not in place: the caller owns the mask
-        x = {
-            branch: TokenEmbed(cfg, name=f"{branch}_embed")(cells(tokens[branch]), masked) + shared
-            for branch, masked in masks.items()
-        }
-        if cfg.departures.read_previous:
-            first = (start + jnp.arange(t) == 0)[:, None]
-            for branch, before in (previous or {name: shifted(cells(tokens[name])) for name in x}).items():
-                absent = jnp.broadcast_to(first, before.shape[:3])
-                if branch == "depth" and no_depth is not None:
-                    absent = absent | no_depth[:, None, None]
+            masks["depth"] = mask | no_depth[:, None, None]
+        x = {name: TokenEmbed(cfg, name=f"{name}_embed")(cells[name], masks[name]) + shared for name in cfg.branches}
+        if departures.read_previous:
+            previous = previous or {branch: frame_before(frames) for branch, frames in cells.items()}
+            for branch, before in previous.items():
+                absent = absent_cells(branch, before, start, no_depth)
                 x[branch] = x[branch] + TokenEmbed(cfg, name=f"{branch}_previous_embed")(before, absent)
+
+        # Both branches' blocks, with Eq. 3 after each pair.
         blocks = nn.scan(
             _rematerialised(cfg),
             variable_axes={"params": 0},
@@ -132,27 +186,39 @@ class Transformer(nn.Module):
         new: Any
         x, new = blocks(cfg, name="blocks")(x, together(cache), start)
         if cache is not None:
-            cache = put_frames(cache, new, start, rotary)
+            cache = put_frames(cache, new, start, departures.rotary)
         return {branch: self._head(branch, features) for branch, features in x.items()}, cache
 
+    def _positions(self, frames: int, start: Any) -> Float[Array, "T S C"]:
+        """Returns the embeddings of frames and cells, or with rotary positions those of cells alone, (1, S, C)."""
+        cfg = self.config
+        if not cfg.departures.rotary and frames + (start if isinstance(start, int) else 0) > cfg.frames:
+            raise ValueError(f"{frames} frames from {start} on; the model has learned positions for {cfg.frames}")
+        learned = 1 if cfg.departures.rotary else cfg.frames
+        init = nn.initializers.normal(cfg.position_std)
+        position = self.param("pos_embed", init, (learned, cfg.grid**2, cfg.width))
+        if cfg.departures.rotary:
+            return position
+        return jax.lax.dynamic_slice_in_dim(position, start, frames, axis=0)
+
     def _action(self, actions: Float[Array, "B T A"] | None, drop: Bool[Array, " B"] | None) -> Float[Array, "B T 1 C"]:
+        """Returns the learned action embeddings c = E_a(a), for all cells of a frame."""
         cfg = self.config
         if actions is None:
             raise ValueError(f"the model reads actions ({cfg.action_inputs} numbers a frame), and got none")
         if cfg.action_encoder == "mlp":
-            hidden = gelu(Dense(cfg.width, name="action_encoder_fc1")(actions))
-            encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name="action_encoder_fc2")(hidden)
+            inner = gelu(Dense(cfg.width, name="action_encoder_fc1")(actions))
+            encoded = Dense(cfg.width, kernel_init=nn.initializers.zeros, name="action_encoder_fc2")(inner)
         else:
             encoded = Dense(cfg.width, name="action_encoder")(actions)
         if cfg.departures.action_dropout:
             null = self.param("null_action", nn.initializers.zeros, (cfg.width,))
-            encoded = encoded if drop is None else jnp.where(drop[:, None, None], null, encoded)
+            encoded = with_null_action(encoded, null, drop)
         return encoded[:, :, None]
 
     def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
-        if cfg.departures.final_norm:
-            x = layer_norm(f"{branch}_norm_out")(x)
+        x = added_norm(cfg.departures.final_norm, f"{branch}_norm_out", x)
         if cfg.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
@@ -165,22 +231,6 @@ class Transformer(nn.Module):
         tokens = jnp.zeros((1, 1, cfg.grid, cfg.grid), jnp.int32)
         actions = jnp.zeros((1, 1, cfg.action_inputs))
         return self.init(key, dict.fromkeys(cfg.branches, tokens), tokens == 0, actions)["params"]
-
-
-def hidden(config: Architecture, mask: Bool[Array, "B T H W"], start: Any = 0) -> Bool[Array, "B T H W"]:
-    """Returns the cells hidden from the network: the masked ones, or with ``whole_frames`` all after a clip's first.
-
-    Args:
-        start: position of the first of these frames.
-    """
-    if not config.departures.whole_frames:
-        return mask
-    return mask | (start + jnp.arange(mask.shape[1]) > 0)[:, None, None]
-
-
-def shifted(frames: Cells) -> Cells:
-    """Returns the frame before each frame; for the first frame, the frame itself."""
-    return jnp.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
 
 
 def _rematerialised(config: Architecture) -> Any:

@@ -11,6 +11,8 @@ from rsjax.config import Departures, LossConfig, MaskConfig, RoboScapeConfig
 from rsjax.models.roboscape import keypoints as kp
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.action_dropout import dropped_actions
+from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.records import Batch
 from rsjax.models.roboscape.transformer import Transformer
@@ -75,7 +77,7 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)
-    counted = kp.counted_frames(Departures(), batch.visible)
+    counted = counted_frames(Departures(), batch.visible)
     points = kp.select(batch.tracks, counted, LOSS.num_keypoints, MODEL.grid)
     emphasis = np.asarray(kp.attention_map(points, MODEL.grid, LOSS.gamma))
 
@@ -180,7 +182,7 @@ def test_rgb_terms_teach_the_depth_branch_and_not_the_other_way_round() -> None:
 def test_training_on_dropped_actions_teaches_the_null_action_and_the_encoder() -> None:
     model, loss = depart(MODEL, action_dropout=0.5), LossConfig(use_keypoints=False)
     params, batch = random_params(model), random_batch(8)
-    drop = masking.dropped_actions(0.5, KEY, batch.index)
+    drop = dropped_actions(0.5, KEY, batch.index)
     assert {False, True} == set(np.asarray(drop).tolist())
     gradient = jax.jit(jax.grad(lambda params: terms_of(model, loss, params, batch)["rgb"][0]))(params)
     assert np.any(gradient["null_action"])

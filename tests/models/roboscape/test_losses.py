@@ -1,6 +1,6 @@
 """Each term against a loop written from its equation; s_t is one-hot, so s·log p is the log-probability of its code."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Departures, LossConfig, RoboScapeConfig
-from rsjax.models.roboscape import model as losses
+from rsjax.config import Departures, LossConfig, RoboScapeConfig, presets
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.keypoints import Keypoints, attention_map
-from rsjax.models.roboscape.model import Predictions
+from rsjax.models.roboscape.objective import loss_terms
+from rsjax.models.roboscape.records import Batch
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Term, combine
-from tests.models.roboscape.toy import roboscape
 
 B, T, GRID, BITS, VOCABULARIES = 3, 4, 3, 6, 2
 ARCHITECTURE = Architecture(frames=T, grid=GRID, code_bits=BITS, vocabularies=VOCABULARIES, action_inputs=1)
@@ -50,16 +49,28 @@ def cross_entropy() -> jax.Array:
     return lfq.token_cross_entropy(jnp.array(LOGITS), jnp.array(TOKENS), BITS)
 
 
-def predictions(
-    keypoints: Keypoints = KEYPOINTS, weight: Any = CLIP_WEIGHT, gamma: float = 5.0, **departures: bool
-) -> Predictions:
-    """Both branches with the same logits and tokens, and these keypoints instead of selected ones."""
-    model = roboscape(ARCHITECTURE, RoboScapeConfig(loss=LossConfig(gamma=gamma), departures=Departures(**departures)))
-    batch: Any = SimpleNamespace(weight=jnp.asarray(weight), has_depth=None)
-    logits, tokens = (dict.fromkeys(("rgb", "depth"), jnp.array(x)) for x in (LOGITS, TOKENS))
-    of = Predictions(model, logits, tokens, jnp.array(MASK), batch)
-    of.__dict__["keypoints"] = keypoints
-    return of
+def terms(
+    visible: Any = KEYPOINTS.visible, weight: Any = CLIP_WEIGHT, gamma: float = 5.0, **departures: bool
+) -> dict[str, Term]:
+    """The terms of both branches with the same logits and tokens, and these keypoints as the only tracks."""
+    config = RoboScapeConfig(loss=LossConfig(gamma=gamma), departures=Departures(**departures))
+    return terms_of(config, tracks_of(KEYPOINTS.cells), visible, weight)
+
+
+def tracks_of(cells: Any) -> np.ndarray:
+    """Tracks through the centres of these cells."""
+    rows, columns = np.divmod(np.asarray(cells), GRID)
+    return ((np.stack([columns, rows], axis=-1) + 0.5) / GRID).astype(np.float32)
+
+
+def terms_of(config: RoboScapeConfig, tracks: Any, visible: Any, weight: Any) -> dict[str, Term]:
+    still = jnp.zeros((B, T, 1))
+    index = jnp.arange(B)
+    tokens, logits, mask = jnp.array(TOKENS), jnp.array(LOGITS), jnp.array(MASK)
+    batch = Batch(tokens, tokens, still, jnp.asarray(tracks), jnp.asarray(visible), jnp.asarray(weight), index)
+    both = {"rgb": logits, "depth": logits}
+    targets = {"rgb": tokens, "depth": tokens}
+    return loss_terms(config, ARCHITECTURE, both, targets, mask, batch)
 
 
 def assert_term(term: Term, expected: tuple[float, float]) -> None:
@@ -75,20 +86,19 @@ def test_cross_entropy_of_a_token_is_that_of_the_whole_vocabulary() -> None:
     np.testing.assert_allclose(cross_entropy()[1, 2, 0, 1], -log_p(1, 2, 0, 1), rtol=1e-5)
 
 
-@pytest.mark.parametrize("term", [losses.rgb_term, losses.depth_term])
-def test_rgb_and_depth_are_equation_4(term: Any) -> None:
-    expected = plain_cross_entropy(np.ones((B, T, GRID, GRID)))
-    assert_term(term(predictions()), expected)
+@pytest.mark.parametrize("name", ["rgb", "depth"])
+def test_rgb_and_depth_are_equation_4(name: str) -> None:
+    assert_term(terms()[name], plain_cross_entropy(np.ones((B, T, GRID, GRID))))
 
 
 def test_attention_is_equation_7() -> None:
     attention = np.asarray(attention_map(KEYPOINTS, GRID, 5.0))
-    assert_term(losses.attention_term(predictions()), plain_cross_entropy(attention))
+    assert_term(terms(visible_keypoints=True)["attention"], plain_cross_entropy(attention))
 
 
 def test_a_flat_attention_map_gives_the_rgb_term() -> None:
-    flat = predictions(gamma=1.0)
-    assert losses.attention_term(flat) == losses.rgb_term(flat)
+    flat = terms(gamma=1.0)
+    assert flat["attention"] == flat["rgb"]
 
 
 def plain_mean_codes() -> np.ndarray:
@@ -109,7 +119,7 @@ def test_mean_codes_are_the_mean_over_all_tokens() -> None:
 
 @pytest.mark.parametrize("masked_only", [False, True])
 @pytest.mark.parametrize("observed", [False, True])
-def test_keypoints_are_equation_5(observed: bool, masked_only: bool) -> None:
+def test_keypoints_are_equation_5_where_they_count(observed: bool, masked_only: bool) -> None:
     s_hat = plain_mean_codes()
     total = weight = 0.0
     for clip in np.flatnonzero(CLIP_WEIGHT):
@@ -122,22 +132,53 @@ def test_keypoints_are_equation_5(observed: bool, masked_only: bool) -> None:
                 if KEYPOINTS.visible[clip, i, t] and (not masked_only or MASK[clip, t].ravel()[cell]):
                     total += np.sum((s_hat[clip, t, cell] - first) ** 2)
                     weight += 1
-    of = predictions(observed_anchor=observed, masked_keypoints=masked_only)
-    assert_term(losses.keypoint_term(of), (total, weight))
+    found = terms(observed_anchor=observed, masked_keypoints=masked_only, visible_keypoints=True)
+    assert_term(found["keypoint"], (total, weight))
 
 
-def test_points_that_count_weigh_what_equation_5_divides_by() -> None:
-    seen = Keypoints(KEYPOINTS.cells, jnp.ones((B, 5, T), bool))
-    _, weight = losses.keypoint_term(predictions(seen, np.ones(B)))
-    assert float(weight) == B * (T - 1) * 5
+@pytest.mark.parametrize("name", ["roboscape_s", "roboscape_m", "roboscape_l"])
+def test_the_full_size_presets_have_the_printed_keypoint_terms(name: str) -> None:
+    """M_i over all frames, Eq. 5 with ŝ_1 and all cells, divided by (T-1)K, and Eq. 6 wherever a track passes."""
+    model = presets.get(name).model
+    assert isinstance(model, RoboScapeConfig)
+    k = 3
+    config = replace(model, loss=replace(model.loss, num_keypoints=k))
+    visible = np.array(KEYPOINTS.visible)
+    visible[:, :, 0] = True  # as of every point that was sampled in the initial frame
+    tracks = tracks_of(KEYPOINTS.cells)
+    s_hat = plain_mean_codes()
+    distance = 0.0
+    attention = np.ones((B, T, GRID, GRID))
+    for clip in range(B):
+        motion = [sum(float(np.linalg.norm(path[t + 1] - path[t])) for t in range(T - 1)) for path in tracks[clip]]
+        for i in np.argsort(motion)[-k:]:
+            cells = np.asarray(KEYPOINTS.cells[clip, i])
+            distance += sum(np.sum((s_hat[clip, t, cells[t]] - s_hat[clip, 0, cells[0]]) ** 2) for t in range(1, T))
+            for t in range(T):
+                attention[clip, t].ravel()[cells[t]] = model.loss.gamma
+    found = terms_of(config, tracks, visible, np.ones(B, np.float32))
+    assert_term(found["keypoint"], (distance, B * (T - 1) * k))
+    everywhere = terms_of(config, tracks, visible, CLIP_WEIGHT)
+    assert_term(everywhere["attention"], plain_cross_entropy(attention))
 
 
-def test_a_hidden_point_counts_nowhere() -> None:
-    later = jnp.arange(T) > 0  # the first frame's cell is the anchor, visible by definition
-    moved = Keypoints(jnp.where(KEYPOINTS.visible | ~later, KEYPOINTS.cells, 0), KEYPOINTS.visible)
-    before, after = (losses.keypoint_term(predictions(points, np.ones(B))) for points in (KEYPOINTS, moved))
-    assert before == after
-    np.testing.assert_array_equal(attention_map(KEYPOINTS, GRID, 5.0)[:, 1:], attention_map(moved, GRID, 5.0)[:, 1:])
+def test_a_track_that_begins_hidden_does_not_exist() -> None:
+    """A clip without tracks has only such ones, of which no term may see anything."""
+    absent = terms(visible=np.zeros((B, 5, T), bool))
+    assert absent["keypoint"] == (0, 0)
+    assert absent["attention"] == absent["rgb"]
+
+
+def test_a_hidden_point_counts_nowhere_with_visible_keypoints() -> None:
+    visible = np.array(KEYPOINTS.visible)
+    visible[:, :, 0] = True
+    config = RoboScapeConfig(departures=Departures(visible_keypoints=True))
+    moved = np.where(visible, KEYPOINTS.cells, 0)
+    before, after = (
+        terms_of(config, tracks_of(cells), visible, np.ones(B, np.float32)) for cells in (KEYPOINTS.cells, moved)
+    )
+    for name in ("keypoint", "attention"):
+        np.testing.assert_allclose(before[name], after[name], rtol=1e-6)
 
 
 def test_the_objective_is_equation_8() -> None:

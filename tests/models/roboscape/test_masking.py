@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsjax.config import MaskConfig
-from rsjax.models.roboscape.masking import Masked, corrupt, dropped_actions
+from rsjax.models.roboscape.departures.action_dropout import dropped_actions
+from rsjax.models.roboscape.masking import Masked, corrupt
 
 T, GRID, BITS, VOCABULARIES = 10, 8, 18, 2
 BATCHES, CLIPS = 64, 16

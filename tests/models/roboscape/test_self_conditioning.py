@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from rsjax.config import MaskConfig, RoboScapeConfig
-from rsjax.models.roboscape import masking
+from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.self_conditioning import previous_frames
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import lfq
 from rsjax.trainable import StepContext, combine
@@ -74,7 +73,7 @@ def test_a_step_on_own_frames_reads_the_mean_codes_of_a_pass_on_true_ones(monkey
 def test_the_prompts_frames_stay_true(prompt: int) -> None:
     tokens = {"rgb": jnp.full((1, 5, 1, 1), 15)}  # all bits 1
     zeros = {"rgb": jnp.zeros((1, 5, 1, 2, 4))}  # so that all mean codes are 0
-    read = previous_frames(lambda: zeros, tokens, 4, True, prompt)["rgb"]
+    read = previous_frames(lambda: (zeros, None), tokens, 4, True, prompt)["rgb"]
     true = [1.0] * (prompt + 1)  # frame 0 reads itself
     np.testing.assert_array_equal(read[0, :, 0, 0], (true + [0.0] * 5)[:5])
 
@@ -90,6 +89,6 @@ def test_before_its_first_own_frames_a_step_is_the_one_on_true_frames() -> None:
 def test_a_share_of_the_steps_reads_own_frames() -> None:
     departures = replace(MODEL.departures, self_conditioning=0.3, self_conditioning_after=100)
     keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(1100))
-    drawn = np.asarray(jax.vmap(partial(masking.reads_own_frames, departures))(keys, jnp.arange(1100)))
+    drawn = np.asarray(jax.vmap(partial(conditions_itself, departures))(keys, jnp.arange(1100)))
     assert not drawn[:100].any()
     assert 0.25 < drawn[100:].mean() < 0.35

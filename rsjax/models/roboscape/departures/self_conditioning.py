@@ -15,14 +15,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.models.roboscape.transformer import shifted
+from rsjax.config import Departures
+from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.tokenizers import lfq
 
 Previous = dict[str, Float[Array, "B T S D"]]
 
 
+def conditions_itself(departures: Departures, key: Array, step: Int[Array, ""]) -> Bool[Array, ""]:
+    """Draws whether a step reads the model's own frames; never before step ``self_conditioning_after``.
+
+    Args:
+        key: the step's key, the same on all devices.
+    """
+    drawn = jax.random.bernoulli(jax.random.fold_in(key, 3), departures.self_conditioning)
+    return drawn & (step >= departures.self_conditioning_after)
+
+
 def previous_frames(
-    predict: Callable[[], dict[str, Float[Array, "B T S n V"]]],
+    predict: Callable[[], tuple[dict[str, Float[Array, "B T S n V"]], Any]],
     tokens: dict[str, Int[Array, "B T H W"]],
     code_bits: int,
     own: Bool[Array, ""] | bool,
@@ -33,7 +44,7 @@ def previous_frames(
     The prompt's frames stay true, as in a rollout. No gradient flows into the predictions.
 
     Args:
-        predict: returns the logits of all frames, each from the true frames before it; not computed unless ``own``.
+        predict: the network on the true frames: returns its logits and its cache; not computed unless ``own``.
         tokens: of the true frames, by branch.
         own: whether to return the model's codes; the same on all devices.
         prompt_frames: those that generation starts from.
@@ -41,12 +52,13 @@ def previous_frames(
     true = {name: _codes(grid, code_bits) for name, grid in tokens.items()}
 
     def predicted() -> Previous:
-        means = {name: lfq.mean_codes(logits, code_bits) for name, logits in predict().items()}
+        logits, _ = predict()
+        means = {name: lfq.mean_codes(x, code_bits) for name, x in logits.items()}
         joined = partial(jnp.concatenate, axis=1)
         return {name: joined([true[name][:, :prompt_frames], mean[:, prompt_frames:]]) for name, mean in means.items()}
 
     read: Any = jax.lax.cond(own, predicted, lambda: true)
-    return {name: jax.lax.stop_gradient(shifted(codes)) for name, codes in read.items()}
+    return {name: jax.lax.stop_gradient(frame_before(codes)) for name, codes in read.items()}
 
 
 def _codes(grid: Int[Array, "B T H W"], code_bits: int) -> Float[Array, "B T S D"]:

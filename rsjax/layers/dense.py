@@ -1,0 +1,38 @@
+"""Linear layers and LayerNorm as in the public PyTorch code."""
+
+import flax.linen as nn
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float
+
+from rsjax.layers.matmul import matmul
+
+# torch's default for linear layers, U(±1/√fan_in), as in the public code.
+TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation policies
+
+
+class Dense(nn.Module):
+    """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32.
+
+    On a CPU without bf16 units it multiplies in float32 even then.
+    """
+
+    features: int
+    bf16: bool = False
+    use_bias: bool = True
+    kernel_init: nn.initializers.Initializer = TORCH_KERNEL
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*N K"]) -> Float[Array, "*N M"]:
+        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
+        if self.bf16:
+            out = matmul(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], self.features)
+        else:
+            out = x @ kernel
+        out = checkpoint_name(out, PRODUCT)
+        return out + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else out
+
+
+def layer_norm(name: str | None) -> nn.LayerNorm:
+    """Returns a float32 LayerNorm with torch's epsilon."""
+    return nn.LayerNorm(epsilon=1e-5, name=name)

@@ -1,0 +1,88 @@
+"""Attention of a spatial-temporal block: within a frame (bidirectional), and over time (causal, with an exact cache).
+
+Axes: B clips, T frames, S cells of a frame, C width, h heads, e = C/h head width, q queries, k keys.
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rsjax.layers.attention import KeyValues, attend, attend_cells, attend_few, frames_held
+from rsjax.layers.dense import Dense, layer_norm
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.rotary import rotated
+
+
+class Attention(nn.Module):
+    """Multi-head attention with its projections. Rows of the qkv projection are (3, heads, head width)."""
+
+    config: Architecture
+
+    def setup(self) -> None:
+        cfg = self.config
+        bf16 = cfg.compute_dtype == "bfloat16"
+        self.qkv = Dense(3 * cfg.width, bf16, use_bias=False)
+        self.proj = Dense(cfg.width, bf16)
+        if cfg.qk_norm:
+            self.norm = layer_norm(None)
+
+    def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
+        """Lets every cell attend to all cells of its frame."""
+        q, k, v = (self._heads(y) for y in self._project(x))
+        return self.proj(attend_cells(q, k, v, self.config.compute_dtype == "bfloat16").reshape(x.shape))
+
+    def temporal(
+        self, x: Float[Array, "B T S C"], start: Any = 0, cache: KeyValues | None = None
+    ) -> tuple[Float[Array, "B T S C"], KeyValues | None]:
+        """Lets every cell attend to the same cell in its own frame and the ``config.frames - 1`` frames before it.
+
+        Args:
+            x: frames start … start + T - 1.
+            start: position of x's first frame (may be traced).
+            cache: keys and values of frames before ``start``, frame f in slot f mod N of N; later frames in it are not
+                read. If positions exceed N, slots are reused, which needs N ≥ config.frames + T - 1 so that a frame's
+                whole window stays in the cache.
+
+        Returns:
+            The output, and x's own keys and values for :func:`put_frames` (None without a cache). Writing them here
+            would copy the cache in every block of every pass.
+
+        Raises:
+            ValueError: x has more frames than the cache.
+        """
+        cfg = self.config
+        q, k, v = self._project(x)
+        positions = start + jnp.arange(x.shape[1])
+        q, k = (rotated(cfg.departures, self._heads(y), positions).reshape(y.shape) for y in (q, k))
+        if cache is None:
+            q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))
+            out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
+            return self.proj(out.reshape(x.shape)), None
+        frames, slots = x.shape[1], cache.k.shape[-2]
+        if frames > slots:
+            raise ValueError(f"{frames} frames do not fit a cache of {slots}")
+        q, new = self._head_major(q), KeyValues(self._head_major(k), self._head_major(v))
+        sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
+        out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4)
+        return self.proj(out.reshape(x.shape)), new
+
+    def _head_major(self, x: Float[Array, "B T S C"]) -> Float[Array, "B S h T e"]:
+        return self._heads(x).transpose(0, 2, 3, 1, 4)
+
+    def _sees(self, queries: Int[Array, " q"], keys: Int[Array, " k"]) -> Bool[Array, "q k"]:
+        age = queries[:, None] - keys[None, :]
+        return (age >= 0) & (age < self.config.frames) & (keys >= 0)
+
+    def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
+        q, k, v = jnp.split(self.qkv(x), 3, axis=-1)
+        if self.config.qk_norm:
+            q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
+        if self.config.mup:
+            # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code.
+            q = q * (8 * self.config.head_width**-0.5)
+        return q, k, v
+
+    def _heads(self, x: Float[Array, "*N C"]) -> Float[Array, "*N h e"]:
+        return x.reshape(*x.shape[:-1], self.config.heads, self.config.head_width)

@@ -1,0 +1,93 @@
+"""RoboScape's training objective (paper Eq. 4 to 8), term by term.
+
+Each term is a sum over cells or keypoints and the number of them; :func:`rsjax.trainable.combine` divides and adds the
+terms up by their weights λ (Eq. 8). Where Eq. 4 and 7 sum over frames, the sums here run over the masked cells, the
+only ones that the network has to predict.
+
+A new term is a line in :func:`loss_terms` and a field ``NAME_weight`` in :class:`rsjax.config.LossConfig`.
+
+Axes: B clips, T frames, H×W = S cells, n vocabularies of V codes, D code bits, K keypoints.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from rsjax.config import RoboScapeConfig, TokenModelConfig
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures.masked_keypoints import compared
+from rsjax.models.roboscape.departures.observed_anchor import anchor
+from rsjax.models.roboscape.departures.visible_keypoints import counted_frames
+from rsjax.models.roboscape.keypoints import attention_map, select
+from rsjax.models.roboscape.records import Batch
+from rsjax.tokenizers import lfq
+from rsjax.trainable import Term
+
+
+def loss_terms(
+    config: TokenModelConfig,
+    architecture: Architecture,
+    logits: dict[str, Float[Array, "B T S n V"]],
+    targets: dict[str, Int[Array, "B T H W"]],
+    mask: Bool[Array, "B T H W"],
+    batch: Batch,
+) -> dict[str, Term]:
+    """Returns (weighted sum, weight) of every term whose weight λ is not 0.
+
+    Args:
+        logits: of every cell, by branch.
+        targets: the true tokens, by branch.
+        mask: the masked cells, in both branches.
+        batch: the clips. Those of weight 0 count nowhere, those without depth not in the depth term.
+    """
+    bits = architecture.code_bits
+    grid = architecture.grid
+    departures = config.departures
+    terms: dict[str, Term] = {}
+
+    # Eq. 4: L_RGB = -Σ_t s_t log p(ŝ_t), and L_Depth alike from z_t.
+    nats = lfq.token_cross_entropy(logits["rgb"], targets["rgb"], bits)
+    masked = mask * batch.weight[:, None, None, None]
+    terms["rgb"] = jnp.sum(nats * masked), jnp.sum(masked)
+    if "depth" in logits:
+        depth_nats = lfq.token_cross_entropy(logits["depth"], targets["depth"], bits)
+        clips = batch.weight
+        if batch.has_depth is not None:
+            clips = clips * batch.has_depth
+        masked_depth = mask * clips[:, None, None, None]
+        terms["depth"] = jnp.sum(depth_nats * masked_depth), jnp.sum(masked_depth)
+
+    if isinstance(config, RoboScapeConfig) and config.loss.use_keypoints:
+        # T_sample: the K tracks of the largest M_i, on the token grid.
+        count = min(config.loss.num_keypoints, batch.tracks.shape[1])
+        keypoints = select(batch.tracks, counted_frames(departures, batch.visible), count, grid)
+
+        # Eq. 5: L_Keypoint = 1/((T-1)K) Σ_i Σ_t≥2 ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖².
+        cells = keypoints.cells.swapaxes(1, 2)  # B T K
+        s_hat = lfq.mean_codes(logits["rgb"], bits)  # B T S D
+        first = anchor(departures, s_hat, targets["rgb"])
+        distance = keypoint_distance(s_hat, first, cells)
+        counts = keypoints.visible.swapaxes(1, 2)[:, 1:] * batch.weight[:, None, None]
+        counts = counts * compared(departures, mask, cells)[:, 1:]
+        terms["keypoint"] = jnp.sum(distance * counts), jnp.sum(counts)
+
+        # Eq. 6 and 7: L_Attention = -Σ_t A_t ⊙ s_t log p(ŝ_t). It is divided by the number of cells, not by Σ A.
+        attention = attention_map(keypoints, grid, config.loss.gamma)
+        terms["attention"] = jnp.sum(nats * attention * masked), jnp.sum(masked)
+
+    weights = config.loss_weights
+    return {name: term for name, term in terms.items() if name in weights}
+
+
+def keypoint_distance(
+    s_hat: Float[Array, "B T S D"], first: Float[Array, "B 1 S D"], cells: Int[Array, "B T K"]
+) -> Float[Array, "B T-1 K"]:
+    """Returns ‖ŝ_t(p_i^t) - ŝ_1(p_i^1)‖² of each keypoint in every frame t ≥ 2.
+
+    Args:
+        s_hat: ŝ, the mean codes under the predicted probabilities.
+        first: the codes of the first frame to align with.
+        cells: the keypoints' cells.
+    """
+    later = jnp.take_along_axis(s_hat[:, 1:], cells[:, 1:, :, None], axis=2)
+    anchors = jnp.take_along_axis(first, cells[:, :1, :, None], axis=2)
+    return jnp.sum(jnp.square(later - anchors), axis=-1)
