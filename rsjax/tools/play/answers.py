@@ -35,7 +35,10 @@ def answers(kind: str) -> Callable[[Answer], Answer]:
 
 async def answer(viewer: Viewer, message: Message) -> Message:
     """Does what a message asks for and returns the final answer, with the message's id."""
-    own = message["id"] if type(message.get("id")) is int and 0 < message["id"] <= MOST_ID else 0
+    if type(message.get("id")) is int and 0 < message["id"] <= MOST_ID:
+        own = message["id"]
+    else:
+        own = 0
     try:
         whole(message, "id", 1, MOST_ID)
         if message["type"] not in ANSWERS:
@@ -70,7 +73,10 @@ async def _start(viewer: Viewer, message: Message) -> Message:
     session = viewer.session
     seed = whole(message, "seed", 0, MOST_SEED, session.seed)
     uploaded = message.get("upload") is True
-    start = session.upload_start() if uploaded else session.clip_start(whole(message, "clip", 0, MOST_SEED))
+    if uploaded:
+        start = session.upload_start()
+    else:
+        start = session.clip_start(whole(message, "clip", 0, MOST_SEED))
     await session.begin(start, seed)
     viewer.begun()
     await viewer.show(0, 0, message["id"])
@@ -94,9 +100,11 @@ async def _watch(viewer: Viewer, message: Message) -> Message:
 
 @answers("step")
 async def _step(viewer: Viewer, message: Message) -> Message:
-    session, began = viewer.session, time.monotonic()
+    session = viewer.session
+    began = time.monotonic()
     branch = session.grown.branch(whole(message, "branch", 0, MOST_NUMBER))
-    source, given = message.get("source"), message.get("action")
+    source = message.get("source")
+    given = message.get("action")
     if (source is None) == (given is None) or not isinstance(source, dict | None):
         raise Refused("bad_message", "a step has either an action, a list of numbers, or a source, an object")
     if source is not None:
@@ -107,14 +115,18 @@ async def _step(viewer: Viewer, message: Message) -> Message:
     await viewer.show(branch.number, frame, message["id"])
     node = branch.nodes[frame]
     facts = {"branch": branch.number, "frame": frame, "action": [round(float(x), 6) for x in action]}
-    unsure = viewer.mean_bits(node) if "uncertainty" in session.watched else None
+    if "uncertainty" in session.watched:
+        unsure = viewer.mean_bits(node)
+    else:
+        unsure = None
     milliseconds = round(1000 * (time.monotonic() - began), 2)
     return {"type": "stepped"} | facts | {"clipped": clipped, "ms": milliseconds, "uncertainty": unsure}
 
 
 @answers("fork")
 async def _fork(viewer: Viewer, message: Message) -> Message:
-    branch, frame = whole(message, "branch", 0, MOST_NUMBER), whole(message, "frame", 0, MOST_SEED)
+    branch = whole(message, "branch", 0, MOST_NUMBER)
+    frame = whole(message, "frame", 0, MOST_SEED)
     fresh = choice(message, "draw", ("same", "new"), "same") == "new"
     return {"type": "branch"} | viewer.session.fork(branch, frame, fresh).describe()
 
@@ -127,8 +139,10 @@ async def _drop(viewer: Viewer, message: Message) -> Message:
 
 @answers("frames")
 async def _frames(viewer: Viewer, message: Message) -> Message:
-    branch, chosen = whole(message, "branch", 0, MOST_NUMBER), kinds(message, ("rgb", *shown.KINDS))
-    first, count = whole(message, "first", 0, MOST_SEED), whole(message, "count", 1, MOST_FRAMES)
+    branch = whole(message, "branch", 0, MOST_NUMBER)
+    chosen = kinds(message, ("rgb", *shown.KINDS))
+    first = whole(message, "first", 0, MOST_SEED)
+    count = whole(message, "count", 1, MOST_FRAMES)
     nodes = viewer.session.grown.branch(branch).nodes
     if first >= len(nodes):
         raise Refused("no_frame", f"branch {branch} has frames 0 to {len(nodes) - 1}, not {first}")
@@ -139,8 +153,10 @@ async def _frames(viewer: Viewer, message: Message) -> Message:
 
 @answers("record")
 async def _record(viewer: Viewer, message: Message) -> Message:
-    kind, branch = choice(message, "format", ("mp4", "gif")), whole(message, "branch", 0, MOST_NUMBER)
-    panes, scale = words(message, "panes", MOST_PANES), whole(message, "scale", 1, 8, 4)
+    kind = choice(message, "format", ("mp4", "gif"))
+    branch = whole(message, "branch", 0, MOST_NUMBER)
+    panes = words(message, "panes", MOST_PANES)
+    scale = whole(message, "scale", 1, 8, 4)
     fps = number(message, "fps", 1, 60, viewer.session.run.fps)
     if not panes:
         raise Refused("bad_message", "panes is empty; choose one at least")
@@ -183,7 +199,9 @@ async def _load(viewer: Viewer, message: Message) -> Message:
 
 async def _grow(viewer: Viewer, saved: Saved, answered: int) -> None:
     """Generates a saved session's branches again."""
-    session, done, total = viewer.session, 0, sum(len(branch.steps) for branch in saved.branches)
+    session = viewer.session
+    done = 0
+    total = sum(len(branch.steps) for branch in saved.branches)
     for place, branch in enumerate(saved.branches):
         if branch.parent is not None:
             session.fork(branch.parent, branch.fork, fresh=False)

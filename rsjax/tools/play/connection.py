@@ -17,7 +17,9 @@ from rsjax.tools.play.messages import UPLOAD_BYTES, parse
 from rsjax.tools.play.send_queue import Outbox
 from rsjax.tools.play.viewer import Viewer
 
-RATE, BURST = 120.0, 240.0  # messages per second, and at once
+# messages per second, and at once
+RATE = 120.0
+BURST = 240.0
 STRIKES = 20  # excess or invalid messages after which a page is disconnected
 QUEUE = 64  # waiting messages, at most
 
@@ -26,12 +28,14 @@ class Bucket:
     """Limits the rate of messages: a bucket that fills at a constant rate, from which each message takes one unit."""
 
     def __init__(self) -> None:
-        self._level, self._then = BURST, time.monotonic()
+        self._level = BURST
+        self._then = time.monotonic()
 
     def take(self) -> bool:
         """Takes one unit, and returns whether there was one."""
         now = time.monotonic()
-        self._level, self._then = min(BURST, self._level + RATE * (now - self._then)), now
+        self._level = min(BURST, self._level + RATE * (now - self._then))
+        self._then = now
         if self._level < 1:
             return False
         self._level -= 1
@@ -42,7 +46,8 @@ class Connection:
     """One page's connection to its session."""
 
     def __init__(self, socket: WebSocket, hub: Hub) -> None:
-        self._socket, self._hub = socket, hub
+        self._socket = socket
+        self._hub = hub
         self._outbox = Outbox()
         self._todo: asyncio.Queue[dict[str, Any] | bytes] = asyncio.Queue(QUEUE)
         self._steps = self._strikes = 0
@@ -128,7 +133,10 @@ class Connection:
                 made = await (upload(viewer, item) if isinstance(item, bytes) else answer(viewer, item))
             except Exception:
                 traceback.print_exc()
-                number = 0 if isinstance(item, bytes) else error_id(json.dumps(item))
+                if isinstance(item, bytes):
+                    number = 0
+                else:
+                    number = error_id(json.dumps(item))
                 made = refusal(number, Refused("failed", "something went wrong; the server's terminal says what"))
             if isinstance(item, dict) and item["type"] == "step":
                 self._steps -= 1
@@ -155,7 +163,9 @@ def error_id(text: str | None) -> int:
         number = json.loads(text or "null")["id"]
     except (ValueError, TypeError, KeyError, RecursionError):
         return 0
-    return number if type(number) is int and 0 < number < 2**32 else 0
+    if type(number) is int and 0 < number < 2**32:
+        return number
+    return 0
 
 
 async def _closed(socket: WebSocket, code: int, reason: str) -> None:

@@ -101,10 +101,16 @@ def controls_of_run(config: Config, normalization: Normalization, names: Sequenc
     mean = normalization.action_mean
     each = []
     for number, (least, most) in enumerate(zip(limits.low.tolist(), limits.high.tolist(), strict=True)):
-        name = names[number] if number < len(names) else ""
+        if number < len(names):
+            name = names[number]
+        else:
+            name = ""
         if not name or name.startswith("("):
             name = f"action {number} {name}".strip()
-        rest = 0.0 if least < 0 < most else float(mean[number])
+        if least < 0 < most:
+            rest = 0.0
+        else:
+            rest = float(mean[number])
         each.append(Control(name, name, least, most, rest, "axis", "as recorded", None))
     return Controls(tuple(each), 1)
 

@@ -57,12 +57,14 @@ class Engine:
     """
 
     def __init__(self, model: TrainedModel, lanes: int = 1) -> None:
-        self.lanes, self.frames = lanes, 0
+        self.lanes = lanes
+        self.frames = 0
         self._model = model
         self._branching: dict[bool, Branching] = {}
         self._waiting: deque[Work] = deque()
         self._compiled: set[tuple[bool, tuple[int, int, bool]]] = set()
-        self._wake, self._closed = threading.Condition(), False
+        self._wake = threading.Condition()
+        self._closed = False
         self.branching(False)
         self._thread = threading.Thread(target=self._run, name="play-engine", daemon=True)
         self._thread.start()
@@ -127,7 +129,8 @@ class Engine:
             return works
 
     def _advance(self, works: list[Work]) -> list[Moment]:
-        key, fresh = works[0].key, works[0].key not in self._compiled
+        key = works[0].key
+        fresh = works[0].key not in self._compiled
         if fresh:
             _tell(works, f"compiling for {_count(key[1][0], 'decoding step')} …", True)
         try:
@@ -141,11 +144,13 @@ class Engine:
 
 def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> float:
     """Compiles the program for these settings and returns the seconds that a frame takes afterwards."""
-    moment, seconds = engine.begin(first), 0.0
+    moment = engine.begin(first)
+    seconds = 0.0
     for _ in range(2):
         began = time.monotonic()
         work = Work(moment, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None)
-        moment, seconds = engine.submit(work).result(), time.monotonic() - began
+        moment = engine.submit(work).result()
+        seconds = time.monotonic() - began
     return seconds
 
 

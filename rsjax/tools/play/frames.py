@@ -10,7 +10,8 @@ from PIL import Image
 
 HEADER = struct.Struct("<BBHIIBBHHHf")  # version, kind, branch, frame, id, format, 0, width, height, 0, scale
 VERSION = 1
-RAW, WEBP = 0, 2
+RAW = 0
+WEBP = 2
 KINDS = {"rgb": 1, "depth": 2, "truth": 3, "truth_depth": 4, "uncertainty": 5}
 LOSSLESS = 128  # pixels per side, up to which pictures are sent without loss
 

@@ -53,7 +53,8 @@ class Guard:
 
     def wrong_origin(self, headers: Headers) -> str:
         """Returns why a socket's Origin is refused, or ""; programs that are not browsers send none."""
-        origin, host = headers.get("origin"), headers.get("host", "").lower()
+        origin = headers.get("origin")
+        host = headers.get("host", "").lower()
         if origin is None or origin.lower() in (f"http://{host}", f"https://{host}"):
             return ""
         return f"pages of {origin!r:.80} cannot connect"
@@ -68,7 +69,8 @@ class Guarded:
     """Refuses requests for other hosts, and adds headers to every response."""
 
     def __init__(self, app: App, guard: Guard) -> None:
-        self._app, self._guard = app, guard
+        self._app = app
+        self._guard = guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":

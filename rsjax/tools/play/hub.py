@@ -51,8 +51,14 @@ class Hub:
     def __init__(
         self, run: PlayRun, engine: Engine, most: int, idle: float, grace: float = GRACE, truths: Truths | None = None
     ) -> None:
-        self.run, self.engine, self.most, self.idle, self._grace = run, engine, most, idle, grace
-        self._memories, self._side, self.files = Memories(most), Side(), Files(run.out)
+        self.run = run
+        self.engine = engine
+        self.most = most
+        self.idle = idle
+        self._grace = grace
+        self._memories = Memories(most)
+        self._side = Side()
+        self.files = Files(run.out)
         self._truths = truths or Truths.of(run.simulator)
         self._seats: dict[str, Seat] = {}
 
@@ -84,7 +90,8 @@ class Hub:
     def leave(self, seat: Seat, close: Callable[[int, str], None]) -> None:
         """Notes that a page has left; its session stays for a while."""
         if seat.close == close:  # otherwise another page has taken the session over
-            seat.close, seat.left = None, time.monotonic()
+            seat.close = None
+            seat.left = time.monotonic()
             seat.viewer.session.out = None
             seat.viewer.rest()
 

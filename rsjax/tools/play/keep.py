@@ -48,7 +48,10 @@ class Files:
     def place(self, session: Session, what: str) -> Path:
         """Returns a path for a new file; only the server chooses its name."""
         start = session.start
-        begun = "picture" if start is None or start.number is None else f"clip{start.number}"
+        if start is None or start.number is None:
+            begun = "picture"
+        else:
+            begun = f"clip{start.number}"
         return self.folder / f"{time.strftime('%Y%m%d-%H%M%S')}-{begun}-{secrets.token_hex(3)}{what}"
 
     def add(self, path: Path) -> dict[str, Any]:
@@ -70,8 +73,12 @@ def record(session: Session, path: Path, number: int, panes: list[str], fps: flo
     Raises:
         Refused: there is no such pane, the video is too large, or it cannot be written to the disk.
     """
-    nodes, side = session.grown.branch(number).nodes, session.run.data.config.clips.image_size
-    most = MOST_GIF if path.suffix == ".gif" else MOST_BYTES
+    nodes = session.grown.branch(number).nodes
+    side = session.run.data.config.clips.image_size
+    if path.suffix == ".gif":
+        most = MOST_GIF
+    else:
+        most = MOST_BYTES
     if len(nodes) > most or len(nodes) * len(panes) * 3 * (scale * side) ** 2 > MOST_BYTES:
         raise Refused("too_large", "the video would be too large; take a smaller scale, fewer panes, or MP4")
     columns = [pane_frames(session, nodes, pane) for pane in panes]
@@ -108,7 +115,8 @@ def export(session: Session, path: Path, numbers: list[int]) -> Path:
     Raises:
         Refused: no branch is long enough, or the store cannot be written to the disk.
     """
-    branches, length = [session.grown.branch(number) for number in numbers], session.run.data.config.clips.frames
+    branches = [session.grown.branch(number) for number in numbers]
+    length = session.run.data.config.clips.frames
     if not any(True for branch in branches for _ in _windows(branch, length)):
         raise Refused("no_frame", f"a clip has {length} frames; no branch has as many of its own yet")
     with _writing():
@@ -126,13 +134,24 @@ def _windows(branch: Branch, length: int) -> Iterator[int]:
 
 
 def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str, Any]:
-    nodes, start, run = branch.nodes[first : first + length], session.start, session.run
+    nodes = branch.nodes[first : first + length]
+    start = session.start
+    run = session.run
     width = run.controls.width
     actions = [np.zeros(width, np.float32), *(node.action for node in nodes[1:])]
     origin: dict[str, Any] = {} if start is None or start.clip is None else start.clip["provenance"]
-    clip = None if start is None else start.number
-    manifest = {} if run.store is None else run.store.manifest
-    steps = 1 if start is None or start.clip is None else controls_of(start.clip, manifest)
+    if start is None:
+        clip = None
+    else:
+        clip = start.number
+    if run.store is None:
+        manifest = {}
+    else:
+        manifest = run.store.manifest
+    if start is None or start.clip is None:
+        steps = 1
+    else:
+        steps = controls_of(start.clip, manifest)
     made: dict[str, Any] = {
         "rgb": np.stack([node.moment.rgb for node in nodes]),
         "actions": np.stack(actions),  # type: ignore[arg-type]

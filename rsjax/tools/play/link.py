@@ -58,7 +58,8 @@ def state_of(session: Session) -> str:
     Raises:
         Refused: the session has no start, or is too long.
     """
-    tree, start = session.grown, session.start
+    tree = session.grown
+    start = session.start
     assert start is not None
     places = {number: place for place, number in enumerate(tree.branches)}
     begun: dict[str, Any] = {"clip": start.number}
@@ -100,7 +101,8 @@ def read_state(session: Session, text: object) -> Saved:
         if sum(map(len, made)) >= session.limits["frames"]:
             raise Refused("bad_state", f"the link has more than {session.limits['frames']} frames")
         branches = [_read_branch(session, row, *each) for row, each in zip(rows, enumerate(made), strict=True)]
-        seed, lanes = whole(values, "seed", 0, MOST_SEED), whole(values, "lanes", 1, 256)
+        seed = whole(values, "seed", 0, MOST_SEED)
+        lanes = whole(values, "lanes", 1, 256)
         settings = session.settings.changed(values["settings"], session.limits)
     except Refused as error:
         raise Refused("bad_state", error.message) from error
@@ -124,7 +126,8 @@ def _unpacked(text: object) -> dict[str, Any]:
 
 
 def _start(session: Session, values: dict[str, Any]) -> Start:
-    begun, size = values["start"], session.run.data.config.clips.image_size
+    begun = values["start"]
+    size = session.run.data.config.clips.image_size
     if "upload" not in begun:
         if values["split"] != session.run.split:
             raise Refused("bad_state", f"the link begins with a clip of the split {values['split']!r:.20}")
@@ -140,7 +143,10 @@ def _branch(branch: Branch, places: dict[int, int]) -> dict[str, Any]:
     made = branch.nodes[1 + int(branch.fork or 0) :]
     actions = np.array([node.action for node in made], "<f4")
     how = [[vars(how), len(list(same))] for how, same in groupby(node.decoding for node in made)]
-    parent = None if branch.parent is None else places[branch.parent]
+    if branch.parent is None:
+        parent = None
+    else:
+        parent = places[branch.parent]
     facts = {"parent": parent, "fork": int(branch.fork or 0), "draw": branch.draw, "how": how}
     return facts | {"actions": base64.b64encode(actions.tobytes()).decode()}
 
@@ -157,13 +163,17 @@ def _read_branch(session: Session, row: dict[str, Any], place: int, numbers: Flo
     decodings: list[Decoding] = []
     for values, count in row["how"]:
         settings = session.settings.changed({name: values[name] for name in session.settings.describe()}, limits)
-        seed, draw = whole(values, "seed", 0, MOST_SEED), whole(values, "draw", 0, MOST_SEED)
+        seed = whole(values, "seed", 0, MOST_SEED)
+        draw = whole(values, "draw", 0, MOST_SEED)
         decodings += [settings.decoding(seed, draw)] * whole({"count": count}, "count", 1, limits["frames"])
         if len(decodings) > len(actions):
             break
     if len(decodings) != len(actions):
         raise ValueError("other numbers of actions and settings")
-    parent = None if place == 0 else whole(row, "parent", 0, place - 1)
+    if place == 0:
+        parent = None
+    else:
+        parent = whole(row, "parent", 0, place - 1)
     steps = list(zip(actions, decodings, strict=True))
     return SavedBranch(parent, whole(row, "fork", 0, MOST_SEED), whole(row, "draw", 0, MOST_SEED), steps)
 

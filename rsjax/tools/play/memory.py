@@ -18,7 +18,9 @@ class Memories:
     """
 
     def __init__(self, least: int, most: int = BYTES) -> None:
-        self._least, self._most, self._bytes = least, most, 0
+        self._least = least
+        self._most = most
+        self._bytes = 0
         self._nodes: OrderedDict[int, tuple[Node, int, Callable[[Moment], Moment]]] = OrderedDict()
 
     def note(self, node: Node, lighten: Callable[[Moment], Moment]) -> None:

@@ -72,7 +72,9 @@ def kinds(message: dict[str, Any], known: Sequence[str]) -> list[str]:
 
 
 def _short(value: object) -> str:
-    return "missing" if value is None else f"{value!r:.40}"
+    if value is None:
+        return "missing"
+    return f"{value!r:.40}"
 
 
 def _refuse_constant(name: str) -> float:

@@ -38,7 +38,10 @@ class Upload:
     def message(self) -> str:
         """Says in words what was done to the picture."""
         width, height = self.size
-        cut = "" if width == height else f"cut to its middle {self.square} × {self.square}, "
+        if width == height:
+            cut = ""
+        else:
+            cut = f"cut to its middle {self.square} × {self.square}, "
         side = len(self.rgb)
         return f"{width} × {height} pixels, {cut}{'kept' if self.square == side else f'scaled to {side} × {side}'}"
 
@@ -61,7 +64,10 @@ def read_picture(payload: bytes, side: int) -> Upload:
         raise Refused("bad_image", "this is no PNG, JPEG or WebP picture that can be read") from error
     square = min(upright.size)
     middle = ImageOps.fit(upright, (square, square))
-    scaled = middle if square == side else middle.resize((side, side), Image.Resampling.LANCZOS)
+    if square == side:
+        scaled = middle
+    else:
+        scaled = middle.resize((side, side), Image.Resampling.LANCZOS)
     return Upload(np.asarray(scaled), upright.size, square)
 
 

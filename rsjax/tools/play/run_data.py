@@ -52,7 +52,9 @@ class PlayRun:
         """The run's clips; None if they are missing, so that sessions can begin only with uploaded pictures."""
         try:
             store = self.data.clips
-            return store if self.split in store.splits else None
+            if self.split in store.splits:
+                return store
+            return None
         except UserError:
             return None
 
@@ -63,21 +65,30 @@ class PlayRun:
             store = self.data.clips
         except UserError as error:
             return first_line(error)
-        return "" if self.split in store.splits else f"{store.path}: has no split {self.split}"
+        if self.split in store.splits:
+            return ""
+        return f"{store.path}: has no split {self.split}"
 
     @cached_property
     def source(self) -> Source | None:
-        return None if self.store is None else self.store.source(self.split)
+        if self.store is None:
+            return None
+        return self.store.source(self.split)
 
     @property
     def clips(self) -> int:
         """The number of clips to begin with."""
-        return 0 if self.source is None else len(self.source)
+        if self.source is None:
+            return 0
+        return len(self.source)
 
     def clip(self, number: int) -> Record:
         """Returns a clip; raises :class:`Refused` if there is no clip with this number, or it is damaged."""
         if self.source is None or not 0 <= number < self.clips:
-            has = f"has 0 to {self.clips - 1}" if self.clips else f"is missing: {self.missing}"
+            if self.clips:
+                has = f"has 0 to {self.clips - 1}"
+            else:
+                has = f"is missing: {self.missing}"
             raise Refused("no_clip", f"there is no clip {number}; the {self.split} split {has}")
         try:
             return self.source[number]
@@ -92,12 +103,18 @@ class PlayRun:
 
     def first(self, clip: Record) -> Video:
         """Returns a clip's first frame, with depth if the model and the clip have it."""
-        depth = clip["depth"][None, :1] if self.has_depth and clip["depth"] is not None else None
+        if self.has_depth and clip["depth"] is not None:
+            depth = clip["depth"][None, :1]
+        else:
+            depth = None
         return Video(clip["rgb"][None, :1], depth)
 
     @cached_property
     def controls(self) -> Controls:
-        names = self.store.manifest.get("action_dimensions") if self.store else None
+        if self.store:
+            names = self.store.manifest.get("action_dimensions")
+        else:
+            names = None
         return controls_of_run(self.data.config, self.trained.assets.normalization, names or ())
 
     @property
@@ -111,7 +128,10 @@ class PlayRun:
     @cached_property
     def simulator(self) -> SimConfig | None:
         """The simulator that the clips are from; None for recordings."""
-        source = str(self.store.manifest.get("source") or "") if self.store else ""
+        if self.store:
+            source = str(self.store.manifest.get("source") or "")
+        else:
+            source = ""
         if self.store is None or not source.startswith(SIMULATED):
             return None
         return from_dict(SimConfig, self.store.manifest["config"])
@@ -131,8 +151,12 @@ class PlayRun:
 
     def describe(self) -> dict[str, Any]:
         """Returns the description of the run for a page."""
-        config, model = self.data.config, self.trained
-        near_far = model.assets.normalization.depth_range if self.has_depth else None
+        config = self.data.config
+        model = self.trained
+        if self.has_depth:
+            near_far = model.assets.normalization.depth_range
+        else:
+            near_far = None
         return {
             "name": self.data.run.absolute().name,
             "family": config.model.family,

@@ -107,7 +107,8 @@ def listen(host: str, port: int) -> socket.socket:
 def _prepare(run: PlayRun, engine: Engine) -> None:
     """Compiles the programs for the first frame, so that nobody waits for them later."""
     note("compiling (seconds, or minutes for a large model the first time) …")
-    first, size = Video(_grey(run)), run.controls.width
+    first = Video(_grey(run))
+    size = run.controls.width
     with suppress(Refused):
         first = run.first(run.clip(0))
     decoding = first_settings(run.data.config).decoding(0, 0)
@@ -121,9 +122,18 @@ def _grey(run: PlayRun) -> np.ndarray:
 
 
 def _address(listener: socket.socket, host: str, guard: Guard) -> str:
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    name = f"[{name}]" if ":" in name else name
-    token = f"?token={guard.token}" if guard.token else ""
+    if host in ("0.0.0.0", "::"):
+        name = socket.gethostname()
+    else:
+        name = host
+    if ":" in name:
+        name = f"[{name}]"
+    else:
+        name = name
+    if guard.token:
+        token = f"?token={guard.token}"
+    else:
+        token = ""
     return f"http://{name}:{listener.getsockname()[1]}/{token}"
 
 

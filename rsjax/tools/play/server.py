@@ -78,8 +78,10 @@ class Routes:
     """The server's routes. No path comes from a request: names are looked up in a list that is made at the start."""
 
     def __init__(self, hub: Hub, guard: Guard) -> None:
-        self._hub, self._guard = hub, guard
-        own, shared = _files(PAGE), _files(PLAYER)
+        self._hub = hub
+        self._guard = guard
+        own = _files(PAGE)
+        shared = _files(PLAYER)
         self._page = own | {f"player/{name}": path for name, path in shared.items()}
 
     async def index(self, request: Request) -> Response:
@@ -99,7 +101,8 @@ class Routes:
         try:
             first, count = (int(request.query_params.get(name, value)) for name, value in _LISTED)
         except ValueError:
-            first, count = -1, 0
+            first = -1
+            count = 0
         if first < 0 or not 0 < count <= MOST_CLIPS:
             return _refused(400, "bad_message", f"first is 0 or more, count is from 1 to {MOST_CLIPS}")
         return JSONResponse(await asyncio.to_thread(self._list, first, count))
@@ -132,14 +135,18 @@ class Routes:
             await Connection(socket, self._hub).serve(socket.query_params.get("session"))
 
     def _list(self, first: int, count: int) -> dict[str, Any]:
-        run, clips = self._hub.run, []
+        run = self._hub.run
+        clips = []
         for number in range(first, min(first + count, run.clips)):
             try:
                 clip = run.clip(number)
             except Refused:
                 continue
             labelled = run.store is not None and run.store.manifest.get("success_share") is not None
-            success = bool(clip["success"][-1]) if labelled else None
+            if labelled:
+                success = bool(clip["success"][-1])
+            else:
+                success = None
             facts = {"clip": number, "task": str(clip["task"]), "frames": len(clip["rgb"]), "success": success}
             clips.append(facts)
         return {"split": run.split, "total": run.clips, "clips": clips}

@@ -70,11 +70,14 @@ class Session:
     """
 
     def __init__(self, run: PlayRun, engine: Engine, memories: Memories) -> None:
-        self.name, self.used = secrets.token_urlsafe(16), time.monotonic()
-        self.run, self.engine = run, engine
+        self.name = secrets.token_urlsafe(16)
+        self.used = time.monotonic()
+        self.run = run
+        self.engine = engine
         self.out: Outbox | None = None
         self.watched: list[str] = []
-        self.settings, self.seed = first_settings(run.data.config), 0
+        self.settings = first_settings(run.data.config)
+        self.seed = 0
         self.upload: Upload | None = None
         self.start: Start | None = None
         self.tree: Tree | None = None
@@ -114,13 +117,16 @@ class Session:
     async def begin(self, start: Start, seed: int) -> None:
         """Begins a new tree; the old one is forgotten."""
         if start.clip is not None:
-            first, draw = self.run.first(start.clip), int(start.number or 0)
+            first = self.run.first(start.clip)
+            draw = int(start.number or 0)
         else:
             assert start.upload is not None
-            first, draw = Video(start.upload.rgb[None, None]), 0
+            first = Video(start.upload.rgb[None, None])
+            draw = 0
         moment = await asyncio.to_thread(self.engine.begin, first)
         self.forget()
-        self.start, self.seed = start, seed
+        self.start = start
+        self.seed = seed
         self.tree = Tree(Node(moment), draw)
 
     def clip_start(self, number: int) -> Start:
@@ -137,7 +143,10 @@ class Session:
         """Makes a branch; if ``fresh``, it has its own random draws."""
         if len(self.grown.branches) >= MOST_BRANCHES:
             raise Refused("full", f"a session can have {MOST_BRANCHES} branches; drop one")
-        draw = secrets.randbelow(MOST_SEED) if fresh else None
+        if fresh:
+            draw = secrets.randbelow(MOST_SEED)
+        else:
+            draw = None
         return self.grown.fork(number, frame, draw)
 
     def drop(self, number: int) -> None:
@@ -184,7 +193,8 @@ class Session:
             node.moment = await self._advance(before, node.action, node.decoding)
 
     async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> Moment:
-        moment, loop = node.moment, asyncio.get_running_loop()
+        moment = node.moment
+        loop = asyncio.get_running_loop()
         self._memories.forget(node)
         node.moment = self._lighten(moment)
 

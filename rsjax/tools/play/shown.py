@@ -54,7 +54,9 @@ async def send_depth(session: Session, side: Side, place: Place, node: Node) -> 
 def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
     depth = session.engine.branching(session.has_depth).depth(node.moment)
     near_far = session.run.trained.assets.normalization.depth_range
-    return None if depth is None or near_far is None else frames.depth_picture("depth", place, depth, *near_far)
+    if depth is None or near_far is None:
+        return None
+    return frames.depth_picture("depth", place, depth, *near_far)
 
 
 def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mean: float | None) -> None:
@@ -82,4 +84,6 @@ async def send_points(session: Session, side: Side, place: Place, nodes: list[No
 def mean_psnr(nodes: list[Node]) -> float | None:
     """Returns the mean PSNR over the frames after the first that have one; None if none has."""
     known = [node.truth.psnr for node in nodes[1:] if node.truth is not None and node.truth.psnr is not None]
-    return float(np.mean(known)) if known else None
+    if known:
+        return float(np.mean(known))
+    return None

@@ -49,7 +49,8 @@ class Sources:
         Raises:
             Refused: the source is missing, or has no action for this frame.
         """
-        kind, frame = choice(source, "kind", KINDS), len(branch.nodes)
+        kind = choice(source, "kind", KINDS)
+        frame = len(branch.nodes)
         if reason := reasons(self.run)[kind]:
             raise Refused("no_source", reason)
         if kind == "clip":
@@ -114,7 +115,8 @@ def check_policy(run: PlayRun) -> None:
     if run.policy is None:
         return
     clips = run.data.config.clips
-    own, wanted = (run.policy.model.image_size, run.policy.action_dim), (clips.image_size, clips.action_dim)
+    own = (run.policy.model.image_size, run.policy.action_dim)
+    wanted = (clips.image_size, clips.action_dim)
     if own != wanted:
         raise UserError(
             f"--policy: the policy sees {own[0]} pixels and answers with {own[1]} numbers; the run has {wanted[0]} "

@@ -65,7 +65,8 @@ class Tree:
 
     def __init__(self, first: Node, draw: int) -> None:
         self.branches = {0: Branch(0, None, None, draw, [first])}
-        self.frames, self._next = 1, 1
+        self.frames = 1
+        self._next = 1
 
     def branch(self, number: int) -> Branch:
         """Returns a branch; raises :class:`Refused` if there is none with this number."""
@@ -90,7 +91,10 @@ class Tree:
         """Makes a branch that shares frames 0 … ``frame`` with another, and its draw too if ``draw`` is None."""
         self.node(number, frame)
         parent = self.branches[number]
-        kept = parent.draw if draw is None else draw
+        if draw is None:
+            kept = parent.draw
+        else:
+            kept = draw
         made = Branch(self._next, number, frame, kept, parent.nodes[: frame + 1])
         self.branches[made.number] = made
         self._next += 1

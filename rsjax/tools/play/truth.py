@@ -35,7 +35,8 @@ class Truths:
     """
 
     def __init__(self, make: Callable[[], Simulate] | None, most: int = MOST) -> None:
-        self.make, self._free = make, most
+        self.make = make
+        self._free = most
 
     @classmethod
     def of(cls, config: SimConfig | None) -> "Truths":
@@ -64,8 +65,10 @@ class Follower:
     """
 
     def __init__(self, truths: Truths, origin: dict[str, Any], task: str) -> None:
-        self._make, self._truths = truths.take(), truths
-        self._seed, self._task = clip_seed(origin), task
+        self._make = truths.take()
+        self._truths = truths
+        self._seed = clip_seed(origin)
+        self._task = task
         self._pool = ThreadPoolExecutor(1, "play-truth")  # the process ends with the thread that started it
         self._helper: Helper[Job, Rendered | None] | None = None
         self._applied: list[Node] = []
@@ -99,11 +102,15 @@ class Follower:
     def _filled(self, helper: Helper[Job, Rendered | None], nodes: list[Node]) -> list[int]:
         done = len(self._applied)
         if not done or len(nodes) < done or any(a is not b for a, b in zip(self._applied, nodes, strict=False)):
-            done, self._applied = 0, []
+            done = 0
+            self._applied = []
         filled = []
         for number in range(done, len(nodes)):
             node = nodes[number]
-            seed = self._seed if number == 0 else None
+            if number == 0:
+                seed = self._seed
+            else:
+                seed = None
             made = helper(Job(self._task, seed, node.action, node.truth is None), SECONDS)
             self._applied.append(node)
             if made is not None:
@@ -118,4 +125,6 @@ class Follower:
 
 def _psnr(one: UInt8[np.ndarray, "H W 3"], other: UInt8[np.ndarray, "H W 3"]) -> float | None:
     error = np.mean((one.astype(np.float64) - other) ** 2)
-    return None if error == 0 else round(float(10 * np.log10(PEAK**2 / error)), 3)
+    if error == 0:
+        return None
+    return round(float(10 * np.log10(PEAK**2 / error)), 3)

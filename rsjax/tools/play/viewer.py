@@ -30,7 +30,10 @@ class Viewer:
     """
 
     def __init__(self, session: Session, side: Side, files: Files, truths: Truths) -> None:
-        self.session, self.side, self.files, self._truths = session, side, files, truths
+        self.session = session
+        self.side = side
+        self.files = files
+        self._truths = truths
         self._follower: Follower | None = None
         self._wanted: tuple[int, int] | None = None  # the branch and frame that the simulator shall reach
         self._chase: object | None = None  # identifies the task that does this; a new start gets a new one
@@ -46,7 +49,9 @@ class Viewer:
     @property
     def no_truth(self) -> str:
         """Why no simulator can run beside sessions; "" if one can."""
-        return "" if self._truths.make else "the clips are of no simulator that is here"
+        if self._truths.make:
+            return ""
+        return "the clips are of no simulator that is here"
 
     def begun(self) -> None:
         """Forgets what belonged to the previous tree."""
@@ -75,7 +80,8 @@ class Viewer:
         """Sends a new frame, and starts to compute what else the page watches."""
         session = self.session
         nodes = session.grown.branch(number).nodes
-        place, node = Place(number, frame, answered), nodes[frame]
+        place = Place(number, frame, answered)
+        node = nodes[frame]
         shown.send_rgb(session, place, node)
         if "uncertainty" in session.watched:
             shown.send_uncertainty(session, place, node)
@@ -88,7 +94,8 @@ class Viewer:
 
     async def again(self, place: Place, nodes: list[Node], kinds: list[str]) -> None:
         """Sends the wanted kinds of pictures of an older frame, the last of these nodes."""
-        session, node = self.session, nodes[-1]
+        session = self.session
+        node = nodes[-1]
         if session.out is not None:
             await session.out.room()
         if "rgb" in kinds:
@@ -120,10 +127,14 @@ class Viewer:
         session = self.session
         try:
             while self._wanted is not None:
-                (number, frame), self._wanted = self._wanted, None
+                (number, frame) = self._wanted
+                self._wanted = None
                 nodes = session.grown.branch(number).nodes[: frame + 1]
                 if self._follower is None:
-                    task = str(clip["task"]) if session.run.simulator and session.run.simulator.train_tasks else ""
+                    if session.run.simulator and session.run.simulator.train_tasks:
+                        task = str(clip["task"])
+                    else:
+                        task = ""
                     self._follower = Follower(self._truths, clip["provenance"], task)
                 filled = await self._follower.follow(nodes)
                 if self._chase is not chase:  # these frames are of an earlier start
@@ -142,7 +153,9 @@ class Viewer:
 
     def mean_bits(self, node: Node) -> float | None:
         """Returns the mean entropy of a frame's tokens in bits."""
-        return None if node.moment.entropy is None else round(float(node.moment.entropy.mean() / np.log(2)), 4)
+        if node.moment.entropy is None:
+            return None
+        return round(float(node.moment.entropy.mean() / np.log(2)), 4)
 
     def _later(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)

@@ -72,7 +72,8 @@ class PolicyConfig:
     def fitted(self, controls: int) -> "PolicyConfig":
         """Returns the same settings, with plans and their executed part rounded up to whole frames of ``controls``."""
         size = math.lcm(controls, 2 ** (len(self.channels) - 1))
-        horizon, execute = -(-self.horizon // size) * size, -(-self.execute // controls) * controls
+        horizon = -(-self.horizon // size) * size
+        execute = -(-self.execute // controls) * controls
         return replace(self, horizon=horizon, execute=execute)
 
 

@@ -93,7 +93,10 @@ def load_demos(store: Store, splits: Sequence[str], only: Only = "success", seed
             if not labelled or clip["success"][-1]:
                 records.append({"rgb": clip["rgb"], "actions": clip["actions"]})
     if not records:
-        which = "ends in success" if labelled else "can be read"
+        if labelled:
+            which = "ends in success"
+        else:
+            which = "can be read"
         raise UserError(
             f"{store.path}: none of its clips ({', '.join(splits)}) {which}; there is nothing to learn from"
         )
@@ -112,4 +115,6 @@ def chooses(store: Store, only: Only) -> bool:
 def controls_of(clip: Record, manifest: dict[str, Any]) -> int:
     """Returns the number of controls in a clip's action: the simulator's control steps, or 1 for other recordings."""
     steps = clip["provenance"].get("control_steps") or (manifest.get("config") or {}).get("control_steps")
-    return int(steps) if isinstance(steps, int) and steps > 0 and clip["actions"].shape[1] % steps == 0 else 1
+    if isinstance(steps, int) and steps > 0 and clip["actions"].shape[1] % steps == 0:
+        return int(steps)
+    return 1

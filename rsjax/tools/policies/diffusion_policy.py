@@ -137,7 +137,8 @@ class Windows:
     range: Range
 
     def __call__(self, demo: Record, rng: np.random.Generator) -> Arrays:
-        cfg, model = self.model.config, self.model
+        cfg = self.model.config
+        model = self.model
         now = int(rng.integers(len(demo["rgb"]) - 1))
         seen = np.maximum(np.arange(now - cfg.observations + 1, now + 1), 0)
         top, left = rng.integers(model.image_size - model.cropped + 1, size=2)

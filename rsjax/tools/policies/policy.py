@@ -72,7 +72,8 @@ def load_policy(directory: Path) -> Policy:
         raise UserError(f"{path}: missing, so {directory} holds no policy; experiments.policy_learning trains some")
     try:
         values = read_json(path, cure="train the policy again")
-        config, span = from_dict(PolicyConfig, values["config"]), from_dict(Range, values["range"])
+        config = from_dict(PolicyConfig, values["config"])
+        span = from_dict(Range, values["range"])
         model = DiffusionPolicy(config, *(int(values[name]) for name in ("image_size", "controls", "width")))
     except (ConfigError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: no policy of this version of rsjax ({error}); train it again") from error
@@ -88,7 +89,8 @@ class Actor:
     def __init__(self, policy: Policy, seed: int) -> None:
         # No training settings, so that policies trained for different numbers of steps share one compiled program.
         self._model = replace(policy.model, config=replace(policy.model.config, train=LoopConfig()))
-        self._policy, self._key = policy, jax.random.key(seed)
+        self._policy = policy
+        self._key = jax.random.key(seed)
         self._seen: list[np.ndarray] = []
         self._plan: np.ndarray | None = None
         self._done = 0  # frames so far

@@ -8,18 +8,18 @@ from typing import Any
 import jax
 import numpy as np
 
+from rsjax.artifact import make_once
 from rsjax.config import LoopConfig, content_key
 from rsjax.data.loader import Loader, batches
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
-from rsjax.files import making, read_json, write_json
 from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy, Range, Windows
-from rsjax.tools.policies.policy import Policy, load_policy
+from rsjax.tools.policies.policy import FILE, Policy, load_policy
 from rsjax.training.loop import Monitor, fit
 
-MARK = "training.json"
+OTHERS = "holds a policy of other settings or data; choose another directory or delete it"
 
 
 def train_policy(
@@ -50,16 +50,19 @@ def train_policy(
     """
     config = config.fitted(demos.controls)
     model = DiffusionPolicy(config, demos.image_size, demos.controls, demos.width)
-    span = start.range if start else demos.range
     loop = replace(config.train, seed=seed)
-    before = start.key if start else False
-    key = content_key(replace(config, train=loop), *map(_content, demos.records[:1]), len(demos), str(span), before)
-    mark = {"key": key, "data": fingerprint(([(each["rgb"], each["actions"]) for each in demos.records],))}
-    with making(directory, wait=False):
-        _check(directory, mark)
+    span = demos.range
+    before = ""
+    if start:
+        span = start.range
+        before = start.key
+    data = fingerprint(([(each["rgb"], each["actions"]) for each in demos.records],))
+    key = content_key(replace(config, train=loop), demos.controls, str(span), before, data)
+    finished = (directory / FILE).exists()
+    with make_once(directory, key, refuse=OTHERS, again=not finished):
         places = {stop: directory / f"at-{stop}" for stop in sorted(set(stops)) if stop < loop.steps}
-        missing = {stop: place for stop, place in places.items() if not (place / "policy.json").exists()}
-        if (directory / "policy.json").exists():
+        missing = {stop: place for stop, place in places.items() if not (place / FILE).exists()}
+        if finished:
             if missing:
                 raise _other_stops(directory, min(missing))
             return load_policy(directory)
@@ -102,15 +105,3 @@ def _other_stops(directory: Path, stop: int) -> UserError:
 
 def _batch(arrays: dict[str, Any]) -> dict[str, Any]:
     return {name: arrays[name] for name in ("frames", "controls", "index")}
-
-
-def _content(record: dict[str, Any]) -> str:
-    return f"{record['rgb'].sum(dtype=int)} {record['actions'].sum():.6f}"
-
-
-def _check(directory: Path, wanted: dict[str, str]) -> None:
-    mark = directory / MARK
-    if not mark.exists():
-        write_json(mark, wanted)
-    elif wanted | read_json(mark, cure=f"delete {directory}") != wanted:  # an older mark has no "data"
-        raise UserError(f"{directory}: holds a policy of other settings or data; choose another directory or delete it")

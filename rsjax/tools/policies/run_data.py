@@ -41,7 +41,9 @@ class RunData:
     @cached_property
     def config(self) -> Config:
         config = load_config(self.run)
-        return relocated(config, self.moved) if self.moved else config
+        if self.moved:
+            return relocated(config, self.moved)
+        return config
 
     @cached_property
     def clips(self) -> Store:
@@ -132,7 +134,9 @@ def sized_policy(size: str, steps: int) -> PolicyConfig:
         ConfigError: there is no such size.
     """
     config = policy_preset(size)
-    return replace(config, train=replace(config.train, steps=steps)) if steps else config
+    if steps:
+        return replace(config, train=replace(config.train, steps=steps))
+    return config
 
 
 def named(runs: Sequence[Path]) -> dict[str, Path]:

@@ -39,7 +39,8 @@ class Conv(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "B H C"]) -> Float[Array, "B H2 C2"]:
         pad = self.pad or ((self.kernel - 1) // 2, self.kernel // 2)
-        wide, length = jnp.pad(x, ((0, 0), pad, (0, 0))), x.shape[1]
+        wide = jnp.pad(x, ((0, 0), pad, (0, 0)))
+        length = x.shape[1]
         around = [wide[:, place : place + length : self.stride] for place in range(self.kernel)]
         return nn.Dense(self.channels)(jnp.concatenate(around, -1))
 
@@ -89,7 +90,8 @@ class UNet(nn.Module):
     def __call__(
         self, x: Float[Array, "B H D"], step: Int[Array, " B"], features: Float[Array, "B F"]
     ) -> Float[Array, "B H D"]:
-        cfg, width = self.config, x.shape[-1]
+        cfg = self.config
+        width = x.shape[-1]
         embedded = step_embedding(step, cfg.step_embedding)
         embedded = nn.Dense(cfg.step_embedding)(mish(nn.Dense(4 * cfg.step_embedding)(embedded)))
         condition = jnp.concatenate([embedded, features], -1)

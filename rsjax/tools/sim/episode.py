@@ -81,17 +81,20 @@ class Simulators:
     """The simulators of all tasks, of which one is open at a time. Call :meth:`close` when done."""
 
     def __init__(self, config: SimConfig) -> None:
-        self._config, self._task = config, ""
+        self._config = config
+        self._task = ""
         self._sim: Simulator | None = None
 
     def __call__(self, task: str) -> Simulator:
         """Returns the simulator of a task and closes that of any other task."""
         if self._sim is None or task != self._task:
             self.close()
-            cfg = self._config
-            lifts = cfg.env == "lift"
-            sim = lift.LiftSim if lifts else lambda *view: metaworld.MetaworldSim(task, *view)
-            self._sim, self._task = sim(cfg.camera, cfg.image_size), task
+            config = self._config
+            if config.env == "lift":
+                self._sim = lift.LiftSim(config.camera, config.image_size)
+            else:
+                self._sim = metaworld.MetaworldSim(task, config.camera, config.image_size)
+            self._task = task
         return self._sim
 
     def close(self) -> None:
@@ -120,12 +123,18 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
     """
     episode = plan.episode
     rng = np.random.default_rng([config.seed, episode])
-    looks = draw_variation(plan.change, np.random.default_rng([config.seed, episode, 2])) if plan.change else SEEN
+    if plan.change:
+        looks = draw_variation(plan.change, np.random.default_rng([config.seed, episode, 2]))
+    else:
+        looks = SEEN
     sim.reset(int(rng.integers(2**32)), looks)
     act, manner = _expert(sim, rng)
     if plan.replay:
         act = _replayed(plan.replay, CONTROLS[config.env], np.random.default_rng([config.seed, episode, 4]))
-    views, shots, success, places = [], [], [], []
+    views = []
+    shots = []
+    success = []
+    places = []
     actions = np.zeros((config.frames, config.control_steps, CONTROLS[config.env]), np.float32)
     for frame in range(config.frames):
         for step in range(config.control_steps if frame else 0):
@@ -144,8 +153,14 @@ def run_episode(sim: Simulator, config: SimConfig, plan: EpisodePlan) -> Clip:
         "objects": _in_the_image(shots[0].camera, places, sim.object_width),
         "versions": {name: importlib.metadata.version(name) for name in _packages(config)},
     }
-    simple = plan.task in SIMPLE if plan.task else manner.mode in lift_expert.SIMPLE
-    provenance["difficulty"] = "simple" if simple else "difficult"
+    if plan.task:
+        simple = plan.task in SIMPLE
+    else:
+        simple = manner.mode in lift_expert.SIMPLE
+    if simple:
+        provenance["difficulty"] = "simple"
+    else:
+        provenance["difficulty"] = "difficult"
     if plan.replay:
         provenance["replay"] = {"jitter": plan.replay.jitter}
     if plan.change:
@@ -169,7 +184,9 @@ def clip_seed(provenance: dict[str, Any]) -> int:
 
 def source_name(config: SimConfig) -> str:
     """Returns the name of the simulator and its robot."""
-    return "robosuite/Lift/Panda" if config.env == "lift" else "metaworld/Sawyer"
+    if config.env == "lift":
+        return "robosuite/Lift/Panda"
+    return "metaworld/Sawyer"
 
 
 def _packages(config: SimConfig) -> tuple[str, ...]:

@@ -14,7 +14,8 @@ from rsjax.tools.sim.lift import State
 MODES = {"lift": 0.55, "drop": 0.16, "near_miss": 0.16, "explore": 0.13}  # mode → probability
 SIMPLE = ("lift",)  # modes that a curriculum begins with; the others are difficult
 TABLE_HEIGHT = 0.8  # metres
-OPEN, CLOSE = -1.0, 1.0
+OPEN = -1.0
+CLOSE = 1.0
 NOISE_MEMORY = 0.8  # correlation of the action noise from one control step to the next
 
 
@@ -52,7 +53,8 @@ def draw_manner(rng: np.random.Generator) -> Manner:
     mode = str(rng.choice(list(MODES), p=list(MODES.values())))
     offset = rng.normal(0, 0.004, 3) - np.array([0, 0, 0.004])
     if mode == "near_miss":
-        beside, angle = rng.uniform(0.03, 0.06), rng.uniform(0, 2 * np.pi)
+        beside = rng.uniform(0.03, 0.06)
+        angle = rng.uniform(0, 2 * np.pi)
         if rng.random() < 0.7:
             offset += beside * np.array([np.cos(angle), np.sin(angle), 0])
         else:  # closes above the cube
@@ -83,8 +85,11 @@ class Expert:
     TURN_GAIN = 1.5  # action per radian
 
     def __init__(self, manner: Manner, rng: np.random.Generator) -> None:
-        self._manner, self._rng = manner, rng
-        self._phase, self._phase_step, self._step = "hover", 0, 0
+        self._manner = manner
+        self._rng = rng
+        self._phase = "hover"
+        self._phase_step = 0
+        self._step = 0
         self._noise = np.zeros(6)
         self._goal = np.zeros(3)
         self._finger = OPEN
@@ -111,7 +116,8 @@ class Expert:
         return np.clip(action, -1, 1)
 
     def _enter(self, phase: str) -> None:
-        self._phase, self._phase_step = phase, 0
+        self._phase = phase
+        self._phase_step = 0
 
     def _pick(self, state: State) -> tuple[Float[np.ndarray, " 3"], float]:
         """Returns target and finger action by phase: hover, descend, grasp, carry, release."""
@@ -140,7 +146,10 @@ class Expert:
             self._until = self._step + int(self._rng.integers(6, 18))
             low = (-0.15, -0.2, TABLE_HEIGHT + 0.015)
             self._goal = self._rng.uniform(low, (0.12, 0.2, TABLE_HEIGHT + 0.25))
-            self._finger = OPEN if self._rng.random() < 0.6 else CLOSE
+            if self._rng.random() < 0.6:
+                self._finger = OPEN
+            else:
+                self._finger = CLOSE
         return self._goal, self._finger
 
 

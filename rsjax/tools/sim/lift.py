@@ -94,7 +94,8 @@ class LiftSim(MujocoSim):
                 ignore_done=True,
                 hard_reset=False,
             )
-        self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
+        self._model = self._env.sim.model._model
+        self._data = self._env.sim.data._data
         _compute_once(self._env.sim)
         self._camera_id = choose_camera(self._model, camera, NEAR)
         self._cube_id = self._model.body(CUBE_BODY).id
@@ -168,7 +169,10 @@ def _compute_once(sim: Any) -> None:
     """
     import mujoco
 
-    model, data, reset, known = sim.model._model, sim.data._data, sim.reset, [b""]
+    model = sim.model._model
+    data = sim.data._data
+    reset = sim.reset
+    known = [b""]
 
     def forward() -> None:
         state = np.concatenate([[data.time], data.qpos, data.qvel]).tobytes()
@@ -184,7 +188,9 @@ def _compute_once(sim: Any) -> None:
         known[0] = b""
         reset()
 
-    sim.forward, sim.step, sim.reset = forward, step, reset_all
+    sim.forward = forward
+    sim.step = step
+    sim.reset = reset_all
 
 
 @contextmanager

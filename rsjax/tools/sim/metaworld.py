@@ -67,14 +67,18 @@ class MetaworldSim(MujocoSim):
     def __init__(self, task: str, camera: str = "near", image_size: int = 64) -> None:
         environments, policies = load_metaworld()
         self.task = task
-        self._env, self.policy = environments[f"{task}-v3"](), policies[f"{task}-v3"]()
+        self._env = environments[f"{task}-v3"]()
+        self.policy = policies[f"{task}-v3"]()
         self._env.max_path_length = STEPS
-        self._env._set_task_called, self._env.seeded_rand_vec = True, True
+        self._env._set_task_called = True
+        self._env.seeded_rand_vec = True
         self._env._partially_observable = False  # the experts look for the goal in the observation,
         del self._env.sawyer_observation_space  # which is clipped to this space
-        self._model, self._data = self._env.model, self._env.data
+        self._model = self._env.model
+        self._data = self._env.data
         self._camera_id = choose_camera(self._model, camera, NEAR)
-        roots, arm = self._model.body_rootid, self._model.body_rootid[self._model.body("hand").id]
+        roots = self._model.body_rootid
+        arm = self._model.body_rootid[self._model.body("hand").id]
         self.object_bodies: Int32[np.ndarray, " N"] = np.flatnonzero(self.movable & (roots != arm)).astype(np.int32)
         self._scenery = Scenery(self._model, self._camera_id, self.object_bodies.tolist(), CENTRE)
         self._renderer = Renderer(self._model, self._camera_id, image_size, hidden=())
@@ -137,7 +141,9 @@ class Manner:
 def draw_manner(rng: np.random.Generator) -> Manner:
     """Draws an episode's manner, its mode with the probabilities of ``MODES``."""
     mode = str(rng.choice(list(MODES), p=list(MODES.values())))
-    noise, delay, leave = float(rng.uniform(0.02, 0.15)), int(rng.integers(0, 8)), int(rng.integers(30, 80))
+    noise = float(rng.uniform(0.02, 0.15))
+    delay = int(rng.integers(0, 8))
+    leave = int(rng.integers(30, 80))
     return Manner(mode, noise, delay, {"expert": -1, "explore": 0}.get(mode, leave))
 
 
@@ -151,13 +157,21 @@ class Expert:
     """
 
     def __init__(self, policy: Any, manner: Manner, rng: np.random.Generator) -> None:
-        self._policy, self.manner, self._rng = policy, manner, rng
-        self._noise, self._goal = np.zeros(3), np.zeros(3)
-        self._finger, self._step, self._until = -1.0, 0, 0
+        self._policy = policy
+        self.manner = manner
+        self._rng = rng
+        self._noise = np.zeros(3)
+        self._goal = np.zeros(3)
+        self._finger = -1.0
+        self._step = 0
+        self._until = 0
 
     def act(self, state: Float[np.ndarray, " 39"]) -> Float[np.ndarray, " 4"]:
         """Returns the next action."""
-        action = self._wander(state) if 0 <= self.manner.leave <= self._step else self._expert(state)
+        if 0 <= self.manner.leave <= self._step:
+            action = self._wander(state)
+        else:
+            action = self._expert(state)
         if self._step < self.manner.delay:
             action[:3] = 0
         fresh = np.sqrt(1 - NOISE_MEMORY**2) * self.manner.noise * self._rng.standard_normal(3)

@@ -128,7 +128,8 @@ class Playback:
         Raises:
             PlaybackError: the state has the wrong length for the model, or a number in it is not finite.
         """
-        positions, wanted = self._model.nq, 1 + self._model.nq + self._model.nv
+        positions = self._model.nq
+        wanted = 1 + self._model.nq + self._model.nv
         if len(state) != wanted or not np.isfinite(state).all():
             raise PlaybackError(f"a state has {len(state)} numbers, the model takes {wanted} finite ones")
         self._data.qpos[:] = state[1 : 1 + positions]

@@ -86,7 +86,10 @@ class Renderer:
     def __init__(self, model: Any, camera_id: int, size: int, hidden: tuple[int, ...] = (0,)) -> None:
         import mujoco
 
-        self._mj, self._model, self._size, self._fine = mujoco, model, size, size * SUPERSAMPLING
+        self._mj = mujoco
+        self._model = model
+        self._size = size
+        self._fine = size * SUPERSAMPLING
         model.vis.quality.shadowsize = 0
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = self._fine
@@ -140,7 +143,8 @@ class Renderer:
 
     def segment(self, data: Any) -> Int32[np.ndarray, "S S"]:
         """Returns the body id at each pixel's centre; 0 (the world) where there is nothing."""
-        mujoco, flags = self._mj, self._scene.flags
+        mujoco = self._mj
+        flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
         try:
             rgb, _ = self._draw(data)

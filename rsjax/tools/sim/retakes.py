@@ -65,7 +65,11 @@ def _config(clips: Store, workers: int) -> SimConfig:
 
 def _plan(config: SimConfig, split: str, record: Record) -> EpisodePlan:
     """Returns the plan of a clip's second take, with the same change of appearance if the clip has one."""
-    origin, task = record["provenance"], record["task"] if config.env == "metaworld" else ""
+    origin = record["provenance"]
+    if config.env == "metaworld":
+        task = record["task"]
+    else:
+        task = ""
     change = origin.get("unseen", {}).get("what")
     replay = Replay(record["actions"], JITTER)
     return EpisodePlan(f"{split}-{origin['episode']:06d}", origin["episode"], task, change, replay)

@@ -14,10 +14,14 @@ from jaxtyping import Float
 from rsjax.config import require
 
 Change = Literal["camera", "color"]
-YAW, PITCH = (10.0, 25.0), (-4.0, 8.0)  # ranges in degrees: to either side about the vertical, and upwards
+# ranges in degrees: to either side about the vertical, and upwards
+YAW = (10.0, 25.0)
+PITCH = (-4.0, 8.0)
 TURN = (0.25, 0.75)  # range of the change of hue, as a share of the hue circle
 DEFAULT_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's; a geom of this colour is drawn in its material's
-SATURATION, VALUE = 0.6, 0.5  # minima of a changed colour, so that grey objects get a hue too
+# minima of a changed colour, so that grey objects get a hue too
+SATURATION = 0.6
+VALUE = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,10 @@ def draw_variation(change: Change, rng: np.random.Generator) -> Variation:
     """Draws a change of the camera's position or of the objects' colours."""
     if change == "color":
         return Variation(turn=float(rng.uniform(*TURN)))
-    side = 1 if rng.random() < 0.5 else -1
+    if rng.random() < 0.5:
+        side = 1
+    else:
+        side = -1
     return Variation(yaw=side * float(rng.uniform(*YAW)), pitch=float(rng.uniform(*PITCH)))
 
 
@@ -58,10 +65,14 @@ class Scenery:
     """
 
     def __init__(self, model: Any, camera_id: int, bodies: Sequence[int], centre: Sequence[float]) -> None:
-        self._model, self._camera, self._centre = model, camera_id, np.array(centre)
-        self._position, self._quaternion = model.cam_pos[camera_id].copy(), model.cam_quat[camera_id].copy()
+        self._model = model
+        self._camera = camera_id
+        self._centre = np.array(centre)
+        self._position = model.cam_pos[camera_id].copy()
+        self._quaternion = model.cam_quat[camera_id].copy()
         self._geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
-        self._materials, self._colors = model.geom_matid.copy(), model.geom_rgba.copy()
+        self._materials = model.geom_matid.copy()
+        self._colors = model.geom_rgba.copy()
 
     def apply(self, variation: Variation) -> None:
         """Gives the model the appearance of a variation, whatever its appearance was before.
@@ -72,13 +83,16 @@ class Scenery:
             ConfigError: the camera has to move but is mounted on the arm.
         """
         model = self._model
-        model.cam_pos[self._camera], model.cam_quat[self._camera] = self._position, self._quaternion
-        model.geom_matid[:], model.geom_rgba[:] = self._materials, self._colors
+        model.cam_pos[self._camera] = self._position
+        model.cam_quat[self._camera] = self._quaternion
+        model.geom_matid[:] = self._materials
+        model.geom_rgba[:] = self._colors
         if variation.yaw or variation.pitch:
             self._move_camera(variation)
         for geom in self._geoms if variation.turn else ():
             color = self._color(geom)
-            model.geom_matid[geom], model.geom_rgba[geom] = -1, (*_turned(color[:3], variation.turn), color[3])
+            model.geom_matid[geom] = -1
+            model.geom_rgba[geom] = (*_turned(color[:3], variation.turn), color[3])
 
     def _move_camera(self, variation: Variation) -> None:
         require(
@@ -92,21 +106,28 @@ class Scenery:
         right, _, backward = axes.reshape(3, 3).T
         pivot = self._position - backward * ((self._position - self._centre) @ backward)
         turn = _rotation(np.array([0, 0, 1.0]), variation.yaw) @ _rotation(right, -variation.pitch)
-        rotation, quaternion = turn @ axes.reshape(3, 3), np.zeros(4)
+        rotation = turn @ axes.reshape(3, 3)
+        quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, rotation.ravel())
         self._model.cam_pos[self._camera] = pivot + turn @ (self._position - pivot)
         self._model.cam_quat[self._camera] = quaternion
 
     def _color(self, geom: Any) -> Float[np.ndarray, " 4"]:
         """Returns a geom's colour and opacity, 0 … 1; the mean colour if it has a texture."""
-        model, material, own = self._model, self._materials[geom], np.array(self._colors[geom], np.float64)
+        model = self._model
+        material = self._materials[geom]
+        own = np.array(self._colors[geom], np.float64)
         if material < 0:
             return own
-        color = np.array(model.mat_rgba[material], np.float64) if (own == DEFAULT_COLOR).all() else own
+        if (own == DEFAULT_COLOR).all():
+            color = np.array(model.mat_rgba[material], np.float64)
+        else:
+            color = own
         texture = max(model.mat_texid[material])
         if texture < 0:
             return color
-        start, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+        start = model.tex_adr[texture]
+        channels = model.tex_nchannel[texture]
         pixels = model.tex_data[start : start + model.tex_height[texture] * model.tex_width[texture] * channels]
         return np.append(color[:3] * pixels.reshape(-1, channels)[:, :3].mean(0) / 255, color[3])
 
@@ -119,7 +140,8 @@ def aim(model: Any, camera_id: int, position: Sequence[float], target: Sequence[
     right = np.cross([0, 0, 1], backward)
     axes = np.stack([right, np.cross(backward, right), backward], -1)
     mujoco.mju_mat2Quat(model.cam_quat[camera_id], (axes / np.linalg.norm(axes, axis=0)).ravel())
-    model.cam_pos[camera_id], model.cam_fovy[camera_id] = position, fovy
+    model.cam_pos[camera_id] = position
+    model.cam_fovy[camera_id] = fovy
 
 
 def _turned(color: Float[np.ndarray, " 3"], turn: float) -> tuple[float, float, float]:

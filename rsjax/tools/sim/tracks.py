@@ -58,11 +58,13 @@ def object_pixels(
         count: N₀.
         rng: generator of the choice.
     """
-    size, flat = bodies.shape[0], bodies.ravel()
+    size = bodies.shape[0]
+    flat = bodies.ravel()
     chosen = _grid(size, count // 2)
     free = np.setdiff1d(np.arange(flat.size), chosen)
     there = np.isin(flat[free], objects)
-    on_objects, on_arm = free[there], free[movable[flat[free]] & ~there]
+    on_objects = free[there]
+    on_arm = free[movable[flat[free]] & ~there]
     for pool, most in ((on_objects, (count - chosen.size) // 2), (on_arm, count)):
         take = min(most, count - chosen.size, pool.size)
         chosen = np.concatenate([chosen, rng.choice(pool, take, replace=False)])
@@ -72,7 +74,10 @@ def object_pixels(
 def _grid(size: int, most: int) -> Int[np.ndarray, " N"]:
     """Returns the flat indices of the largest square grid of at most ``most`` pixels."""
     side = min(int(np.sqrt(most)), size)
-    ticks = ((np.arange(side) + 0.5) * size / side).astype(int) if side else np.zeros(0, int)
+    if side:
+        ticks = ((np.arange(side) + 0.5) * size / side).astype(int)
+    else:
+        ticks = np.zeros(0, int)
     return (ticks[:, None] * size + ticks[None, :]).ravel()
 
 
@@ -106,10 +111,12 @@ def track(
     """
     rows, columns = pixels.T
     xy = (pixels[:, ::-1] + 0.5) / depth.shape[0]
-    first, body = snapshots[0], bodies[rows, columns]
+    first = snapshots[0]
+    body = bodies[rows, columns]
     world = first.camera.unproject(xy, depth[rows, columns].astype(np.float64))
     local = np.einsum("nij,ni->nj", first.rotations[body], world - first.positions[body])
-    tracks, visible = [], []
+    tracks = []
+    visible = []
     for shot in snapshots:
         world = shot.positions[body] + np.einsum("nij,nj->ni", shot.rotations[body], local)
         xy, z = shot.camera.project(world)

@@ -61,7 +61,8 @@ def _plans(config: SimConfig, split: str, episodes: int) -> tuple[EpisodePlan, .
         first = config.episodes - config.test_episodes
         seen = range(first, first + episodes)
         return tuple(EpisodePlan(f"{split}-{i:06d}", i, task_of(config, i), CHANGES[split]) for i in seen)
-    tasks, new = config.held_out_tasks, range(config.episodes, config.episodes + episodes)
+    tasks = config.held_out_tasks
+    new = range(config.episodes, config.episodes + episodes)
     return tuple(EpisodePlan(f"{split}-{i:06d}", i, tasks[i % len(tasks)]) for i in new)
 
 

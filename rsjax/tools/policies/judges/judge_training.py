@@ -62,9 +62,16 @@ def judge_of(run: Path | str | TrainedModel, judge: Judge | Path | str | None, s
         UserError: the directory has no judge, its file is damaged, or it takes frames of another size.
     """
     if judge == "run":
-        folder = None if isinstance(run, TrainedModel) else Path(run) / FOLDER
-        return load_judge(folder, side) if folder is not None and folder.exists() else None
-    return load_judge(Path(judge), side) if isinstance(judge, Path | str) else judge
+        if isinstance(run, TrainedModel):
+            folder = None
+        else:
+            folder = Path(run) / FOLDER
+        if folder is not None and folder.exists():
+            return load_judge(folder, side)
+        return None
+    if isinstance(judge, Path | str):
+        return load_judge(Path(judge), side)
+    return judge
 
 
 def make_judge(
@@ -75,8 +82,12 @@ def make_judge(
     Raises:
         UserError: the run or its clips are missing, or its clips do not show both success and failure.
     """
-    settings, trained = settings or JudgeSettings(), load(run)
-    config = relocated(trained.config, store) if store else trained.config
+    settings = settings or JudgeSettings()
+    trained = load(run)
+    if store:
+        config = relocated(trained.config, store)
+    else:
+        config = trained.config
     clips = Run(config, run, data_dir).open_clips()
     learned, fitted = _training(trained, clips, settings)
     judge = train_judge(learned, fitted, settings.steps, settings.seed)
@@ -90,8 +101,11 @@ def make_judge(
 
 def validation(trained: TrainedModel, judge: Judge, clips: Sequence[Record]) -> dict[str, Any]:
     """Validates a judge on clips as they are, as the tokenizer reconstructs them, and as the model generates them."""
-    held, first = Clips.stacked(clips, range(len(clips))), trained.config.prompt_frames
-    raw, video, made = Footage(held.rgb, held.success), held.video, []
+    held = Clips.stacked(clips, range(len(clips)))
+    first = trained.config.prompt_frames
+    raw = Footage(held.rgb, held.success)
+    video = held.video
+    made = []
     result = {"clips": len(clips), "raw": validate(judge, raw, first, spoil=True)}
     if (seen := _reconstructed(trained, raw.rgb)) is not None:
         result["reconstructed"] = validate(judge, Footage(seen, raw.success), first)
@@ -115,9 +129,18 @@ def _training(trained: TrainedModel, clips: Store, settings: JudgeSettings) -> t
         raise UserError(f"{clips.path}: {len(records)} readable training clips; a judge needs 2 at least")
     raw = Footage(*(np.stack([clip[name] for clip in records]) for name in ("rgb", "success")))
     seen = _reconstructed(trained, raw.rgb[: settings.reconstructed])
-    rgb = raw.rgb if seen is None else np.concatenate([raw.rgb, seen])
-    success = raw.success if seen is None else np.concatenate([raw.success, raw.success[: len(seen)]])
-    held = np.arange(len(rgb)) % len(raw.rgb) % FITTED == FITTED - 1 if len(raw.rgb) >= FITTED else None
+    if seen is None:
+        rgb = raw.rgb
+    else:
+        rgb = np.concatenate([raw.rgb, seen])
+    if seen is None:
+        success = raw.success
+    else:
+        success = np.concatenate([raw.success, raw.success[: len(seen)]])
+    if len(raw.rgb) >= FITTED:
+        held = np.arange(len(rgb)) % len(raw.rgb) % FITTED == FITTED - 1
+    else:
+        held = None
     if held is None:  # so few clips serve both purposes
         return Footage(rgb, success), Footage(rgb, success)
     return Footage(rgb[~held], success[~held]), Footage(rgb[held], success[held])
@@ -128,4 +151,6 @@ def _reconstructed(trained: TrainedModel, rgb: np.ndarray) -> np.ndarray | None:
     if not len(rgb):
         return None
     video = trained.model.reconstruct(trained.assets, Video(rgb))
-    return None if video is None else video.rgb
+    if video is None:
+        return None
+    return video.rgb

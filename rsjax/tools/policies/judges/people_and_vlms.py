@@ -72,7 +72,10 @@ class HumanJudge:
         for number, row in enumerate(rows, 2):
             name, label = (str(row[key] or "").strip() for key in ("video", "label"))
             if label.lower() not in LABELS:
-                hint = f"is {label!r}{did_you_mean(label.lower(), LABELS)}" if label else "is empty"
+                if label:
+                    hint = f"is {label!r}{did_you_mean(label.lower(), LABELS)}"
+                else:
+                    hint = "is empty"
                 raise UserError(f"{sheet}: line {number}: the label {hint} (labels: {', '.join(LABELS)})")
             if labels.setdefault(name, LABELS.index(label.lower())) != LABELS.index(label.lower()):
                 raise UserError(f"{sheet}: line {number}: video {name} has another label above; keep one of them")
@@ -151,4 +154,6 @@ class LanguageJudge:
 def answer_label(answer: str) -> int:
     """Returns the index of the label that the first word of an answer means; "uninterpretable" for unknown words."""
     words = "".join(c if c.isalpha() else " " for c in answer.lower()).split()
-    return ANSWERS.get(words[0], UNINTERPRETABLE) if words else UNINTERPRETABLE
+    if words:
+        return ANSWERS.get(words[0], UNINTERPRETABLE)
+    return UNINTERPRETABLE

@@ -72,7 +72,8 @@ class TrainedJudge:
         return content_key("judge", fingerprint((self.params,)), self.temperature)
 
     def __call__(self, frames: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B 3"]:
-        history, parts = last_frames(frames), []
+        history = last_frames(frames)
+        parts = []
         for start in range(0, len(history), CHUNK):
             parts.append(np.asarray(_probabilities(self.params, self.temperature, history[start : start + CHUNK])))
         return np.concatenate(parts)
@@ -92,10 +93,12 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
     Raises:
         UserError: there is no judge, its file is damaged, or it does not take frames of that size.
     """
-    path, report = folder / FILE, folder / VALIDATION
+    path = folder / FILE
+    report = folder / VALIDATION
     try:
         record = decode(path.read_bytes())
-        temperature, trained_on = float(record.pop("temperature")), int(record.pop("side"))
+        temperature = float(record.pop("temperature"))
+        trained_on = int(record.pop("side"))
     except FileNotFoundError as error:
         raise UserError(f"{path}: no judge there; train one with python -m experiments.judge RUN") from error
     except (OSError, ValueError, KeyError) as error:
@@ -107,9 +110,14 @@ def load_judge(folder: Path, side: int | None = None) -> TrainedJudge:
         )
     params = unflatten_dict({tuple(name.split("/")): x for name, x in record.items()})
     judge = TrainedJudge(params, temperature, trained_on)
-    found = read_json(report, cure="train the judge again") if report.exists() else None
+    if report.exists():
+        found = read_json(report, cure="train the judge again")
+    else:
+        found = None
     # An interrupted training may have left the validation of an earlier judge. Older validations do not name the judge.
-    return replace(judge, validation=found) if found and found.get("judge", judge.key) == judge.key else judge
+    if found and found.get("judge", judge.key) == judge.key:
+        return replace(judge, validation=found)
+    return judge
 
 
 @dataclass(frozen=True)
@@ -147,10 +155,12 @@ def train_judge(footage: Footage, held: Footage, steps: int, seed: int = 0) -> T
             f"the simulator calls {footage.success.mean():.0%} of {footage.success.size} training frames a success; a "
             f"judge needs clips of both success and failure"
         )
-    rng, height = np.random.default_rng(seed), footage.rgb.shape[2]
+    rng = np.random.default_rng(seed)
+    height = footage.rgb.shape[2]
     params = Network().init(jax.random.key(seed), np.zeros((1, HISTORY, height, height, 3), np.uint8))["params"]
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, steps))
-    state, step = optimizer.init(params), _make_step(optimizer)
+    state = optimizer.init(params)
+    step = _make_step(optimizer)
     with Progress("judge", steps, "steps") as progress:
         for number in range(steps):
             params, state = step(params, state, *_batch(footage, found, rng))
@@ -169,8 +179,11 @@ def spoilt(
         others: histories of other videos, which may be put on top.
     """
     edge = frames.shape[2] // 8
-    size, lead = 8 * edge, frames.shape[:2]
-    inner, shuffled, blurred = frames[:, :, :size, :size], frames.copy(), frames.astype(float)
+    size = 8 * edge
+    lead = frames.shape[:2]
+    inner = frames[:, :, :size, :size]
+    shuffled = frames.copy()
+    blurred = frames.astype(float)
     blocks = inner.reshape(*lead, 8, edge, 8, edge, 3).swapaxes(3, 4)
     mixed_up = blocks.reshape(*lead, 64, edge, edge, 3)[:, :, rng.permutation(64)]
     shuffled[:, :, :size, :size] = mixed_up.reshape(blocks.shape).swapaxes(3, 4).reshape(inner.shape)

@@ -28,7 +28,8 @@ def validate(judge: Judge, footage: Footage, first: int = 1, spoil: bool = False
     """
     videos, frames = (each.ravel() for each in np.indices(footage.success.shape)[:, :, first:])
     truth = np.where(footage.success[videos, frames], SUCCESS, FAIL)
-    rng, probabilities = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    probabilities = []
     labels = []
     for start in range(0, len(videos), AT_ONCE):
         rows = slice(start, start + AT_ONCE)
@@ -49,7 +50,8 @@ def scores(probabilities: Float[np.ndarray, "N 3"], truth: Int[np.ndarray, " N"]
     mean squared error of the probabilities. Frames of one clip resemble each other, so the intervals, which count
     frames as independent, are narrower than they should be.
     """
-    chosen, sure = probabilities.argmax(-1), probabilities.max(-1)
+    chosen = probabilities.argmax(-1)
+    sure = probabilities.max(-1)
     right = chosen == truth
     matrix = np.zeros((len(LABELS), len(LABELS)), int)
     np.add.at(matrix, (truth, chosen), 1)
@@ -91,7 +93,8 @@ def markdown(judge: dict[str, Any] | None) -> list[str]:
     lines += [f"| video | {' | '.join(LABELS)} | right | calibration error |", "|---|---|---|---|---|---|"]
     for kind, part in judge.items():
         rows = [" / ".join(map(str, row)) if any(row) else "–" for row in part["confusion"]]
-        right, error = f"{100 * part['right'][0]:.1f} %", f"{part['calibration_error']:.3f}"
+        right = f"{100 * part['right'][0]:.1f} %"
+        error = f"{part['calibration_error']:.3f}"
         lines.append(f"| {kind} | {' | '.join(rows)} | {right} | {error} |")
     return lines
 

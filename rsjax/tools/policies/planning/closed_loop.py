@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from rich.table import Table
 
+from rsjax.artifact import make_once
 from rsjax.config import content_key
 from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import wilson
-from rsjax.files import content_hash, parse_json, write_file, write_json
+from rsjax.files import content_hash, write_file, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import judge_key
@@ -86,7 +87,8 @@ class PlanningActor:
     """
 
     def __init__(self, planner: Planner, width: int, depth: bool) -> None:
-        self._planner, self._depth = planner, depth
+        self._planner = planner
+        self._depth = depth
         self._frames: list[Observation] = []
         self._actions = [np.zeros(width, np.float32)]
         self.seconds: list[float] = []
@@ -94,10 +96,17 @@ class PlanningActor:
     def __call__(self, observation: Observation) -> Float32[np.ndarray, "1 A"]:
         began = time.monotonic()
         self._frames.append({name: frames[0] for name, frames in observation.items()})
-        kept = 1 if len(self._frames) < MEMORY else MEMORY  # two shapes, so that two programs are compiled
+        # two shapes, so that two programs are compiled
+        if len(self._frames) < MEMORY:
+            kept = 1
+        else:
+            kept = MEMORY
         frames = self._frames[-kept:]
         # An episode that began with a picture has no depth, whatever the model generates.
-        depth = np.stack([each["depth"] for each in frames]) if self._depth and "depth" in frames[-1] else None
+        if self._depth and "depth" in frames[-1]:
+            depth = np.stack([each["depth"] for each in frames])
+        else:
+            depth = None
         seen = Seen(np.stack([each["rgb"] for each in frames]), depth, np.stack(self._actions[-kept:]))
         action = self._planner(seen).astype(np.float32)
         self._actions.append(action)
@@ -115,7 +124,9 @@ def score_of(trained: TrainedModel, run: Path, settings: PlanSettings, goal: UIn
         return judged(load_judge(run / FOLDER, len(goal)))
     if settings.energy == "tokens":
         return token_distance(trained, goal)
-    return pixel_distance(goal) if settings.energy == "pixels" else lpips_distance(Path(settings.lpips_weights), goal)
+    if settings.energy == "pixels":
+        return pixel_distance(goal)
+    return lpips_distance(Path(settings.lpips_weights), goal)
 
 
 def actors(
@@ -124,7 +135,8 @@ def actors(
     """Returns the ways to act by name: random, expert, the given others, and the planner with each method."""
     config = trained.config
     depth = config.model.uses_depth and trained.assets.normalization.depth_range is not None
-    high, controls = np.ones(config.clips.action_dim), config.sim.control_steps
+    high = np.ones(config.clips.action_dim)
+    controls = config.sim.control_steps
 
     def random(seed: int, goal: np.ndarray) -> Actor:
         rng = np.random.default_rng(seed)
@@ -192,25 +204,36 @@ def compare(
     others = {name: policy_actor(name, policy, trained) for name, policy in policies.items()}
     ways = actors(trained, run, settings, others)
     score_of(trained, run, settings, np.zeros((config.sim.image_size, config.sim.image_size, 3), np.uint8))  # may raise
-    judge = load_judge(run / FOLDER) if settings.energy == "judge" else None
-    lpips = content_hash(Path(settings.lpips_weights)) if settings.energy == "lpips" else ""
+    judge = None
+    validation = None
+    lpips = ""
+    if settings.energy == "judge":
+        judge = load_judge(run / FOLDER)
+        validation = judge.validation
+    elif settings.energy == "lpips":
+        lpips = content_hash(Path(settings.lpips_weights))
     used = model_key(trained), judge_key(judge), *(policy.key for policy in policies.values())
     key = content_key("plan", replace(settings, lpips_weights=lpips), config.sim, tuple(ways), used)
-    place, validation = folder(run, key), judge.validation if judge else None
-    done = _kept(place / "result.json", key)
+    place = folder(run, key)
     total = settings.episodes * len(ways)
-    with Progress("episodes", total, "episodes") as progress:
+    with make_once(place, key, refuse=None) as work, Progress("episodes", total, "episodes") as progress:
+        done = work.metadata.get("episodes", [])
         for number in range(settings.episodes):
-            seed, goal = FIRST_SEED + number, None
+            seed = FIRST_SEED + number
+            goal = None
             for name, make in ways.items():
                 if not any(row["way"] == name and row["seed"] == seed for row in done):
-                    goal = _goal(simulator, seed, settings.max_steps) if goal is None else goal
-                    video = place / f"{name.replace('/', '-')}-{number:02d}.mp4" if number < VIDEOS else None
+                    if goal is None:
+                        goal = _goal(simulator, seed, settings.max_steps)
+                    video = None
+                    if number < VIDEOS:
+                        video = place / f"{name.replace('/', '-')}-{number:02d}.mp4"
                     done.append(_row(simulator, name, make(seed, goal), seed, video, settings.max_steps))
-                    write_json(place / "result.json", _summary(done, settings, key, validation))
+                    work.save(episodes=done)
                 progress.update(len(done))
-    result = _summary(done, settings, key, validation)
-    write_file(place / "results.md", _markdown(result).encode())
+        result = _summary(done, settings, key, validation)
+        write_json(place / "result.json", result)
+        write_file(place / "results.md", _markdown(result).encode())
     return result
 
 
@@ -232,7 +255,10 @@ def table(result: dict[str, Any]) -> Table:
 def _markdown(result: dict[str, Any]) -> str:
     rows = [list(HEADINGS), ["---"] * len(HEADINGS), *_cells(result)]
     lines = [_title(result), "", *(f"| {' | '.join(row)} |" for row in rows)]
-    judge = markdown(result["judge"]) if result["settings"]["energy"] == "judge" else []
+    if result["settings"]["energy"] == "judge":
+        judge = markdown(result["judge"])
+    else:
+        judge = []
     return "\n".join([*lines, *judge, ""])
 
 
@@ -244,7 +270,10 @@ def _title(result: dict[str, Any]) -> str:
 def _cells(result: dict[str, Any]) -> list[list[str]]:
     rows = []
     for name, way in result["ways"].items():
-        seconds = "–" if way["seconds_per_decision"] is None else f"{way['seconds_per_decision']:.2f}"
+        if way["seconds_per_decision"] is None:
+            seconds = "–"
+        else:
+            seconds = f"{way['seconds_per_decision']:.2f}"
         interval = f"{way['success_low']:.0%} – {way['success_high']:.0%}"
         numbers = [f"{way['success']:.0%}", interval, f"{way['steps']:.1f}", seconds, str(way["clipped"])]
         rows.append([name, *numbers])
@@ -296,12 +325,3 @@ def _summary(
         "ways": ways,
         "episodes": rows,
     }
-
-
-def _kept(path: Path, key: str) -> list[dict[str, Any]]:
-    """Returns the finished episodes of an interrupted comparison; none if it had other settings."""
-    try:
-        saved = parse_json(path.read_bytes())
-    except (OSError, ValueError):
-        return []
-    return list(saved.get("episodes", [])) if saved.get("key") == key else []

@@ -47,7 +47,8 @@ def imagined(model: TrainedModel, score: Score) -> Energy:
     def energy(seen: Seen, candidates: Float[np.ndarray, "N H A"]) -> Float[np.ndarray, " N"]:
         before = np.repeat(seen.actions[None], len(candidates), axis=0)
         prompt = Video(seen.rgb[None], None if seen.depth is None else seen.depth[None])
-        actions, last = np.concatenate([before, candidates], axis=1), min(HISTORY, candidates.shape[1])
+        actions = np.concatenate([before, candidates], axis=1)
+        last = min(HISTORY, candidates.shape[1])
         return score(model.model.plan(model.params, model.assets, prompt, actions, depth=False, last=last).rgb)
 
     return energy
@@ -65,7 +66,8 @@ def token_distance(model: TrainedModel, goal: UInt8[np.ndarray, "S S 3"]) -> Sco
     Raises:
         UserError: the model has no tokens.
     """
-    wanted, bits = model.encode(goal[None])["rgb"], model.config.tokenizer.code_bits
+    wanted = model.encode(goal[None])["rgb"]
+    bits = model.config.tokenizer.code_bits
 
     def score(video: UInt8[np.ndarray, "N F S S 3"]) -> Float[np.ndarray, " N"]:
         found = model.encode(video[:, -1:])["rgb"]
@@ -80,7 +82,8 @@ def lpips_distance(weights: Path, goal: UInt8[np.ndarray, "S S 3"]) -> Score:
     Raises:
         UserError: the file of weights is missing or damaged, or the frames are too small for its network.
     """
-    params, side = load_lpips(weights), len(goal)
+    params = load_lpips(weights)
+    side = len(goal)
     if side < min_size(params):
         raise UserError(f"{weights}: frames have {side} pixels; this network needs {min_size(params)}")
     return lambda video: np.asarray(distances(params, np.broadcast_to(goal, video[:, -1].shape), video[:, -1]))

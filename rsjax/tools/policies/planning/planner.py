@@ -101,22 +101,27 @@ def search(
         UserError: the energies have the wrong shape, or one is NaN or -inf.
     """
     deviation = np.broadcast_to(config.spread * (high - low) / 2, mean.shape)
-    best, lowest, history = mean, np.inf, []
+    best = mean
+    lowest = np.inf
+    history = []
     for _ in range(config.rounds):
         drawn = mean + deviation * _noise(config, len(low), rng)
-        drawn[0], drawn[1] = mean, best
+        drawn[0] = mean
+        drawn[1] = best
         drawn = np.clip(drawn, low, high)
         energies = _checked(energy(frames, drawn.astype(np.float32)), len(drawn))
         first = int(energies.argmin())
         if energies[first] < lowest:
-            best, lowest = drawn[first], float(energies[first])
+            best = drawn[first]
+            lowest = float(energies[first])
         history.append(lowest)
         finite = np.isfinite(energies)
         if not finite.any():
             continue  # nothing to move towards
         if config.method == "cem":
             elites = drawn[np.argsort(energies, kind="stable")[: min(config.elites, finite.sum())]]
-            mean, deviation = elites.mean(0), elites.std(0) + 0.05 * (high - low) / 2
+            mean = elites.mean(0)
+            deviation = elites.std(0) + 0.05 * (high - low) / 2
         else:
             scale = config.temperature * max(float(energies[finite].std()), 1e-12)
             weights = np.exp(-(energies - energies[first]) / scale)
@@ -147,7 +152,8 @@ class Planner:
             len(low) % config.hold == 0,
             f"planner.hold is {config.hold}; it must divide the {len(low)} numbers of an action",
         )
-        self._energy, self._config = energy, config
+        self._energy = energy
+        self._config = config
         self._low, self._high = (np.asarray(each)[: len(low) // config.hold] for each in (low, high))
         self.reset()
 
@@ -163,7 +169,10 @@ class Planner:
             frames: the first argument of the energy.
         """
         middle = np.tile((self._low + self._high) / 2, (self._config.horizon, 1))
-        mean = middle if self.plan is None else np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
+        if self.plan is None:
+            mean = middle
+        else:
+            mean = np.concatenate([self.plan.actions[1:], self.plan.actions[-1:]])
         limits = (self._low, self._high)
         self.plan = search(self._held, frames, mean, *limits, self._config, self._rng)
         return np.tile(self.plan.actions[0], self._config.hold)

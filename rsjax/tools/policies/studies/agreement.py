@@ -42,7 +42,8 @@ def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"],
     Raises:
         ValueError: there are fewer than 2 policies, or the two arrays differ in length.
     """
-    x, y = np.asarray(true, np.float64), np.asarray(predicted, np.float64)
+    x = np.asarray(true, np.float64)
+    y = np.asarray(predicted, np.float64)
     if x.shape != y.shape or x.ndim != 1 or len(x) < 2:
         raise ValueError(f"agreement needs the same two policies or more in both, not {x.shape} and {y.shape}")
     r = correlation(x, y)
@@ -59,14 +60,19 @@ def agreement(true: Float[np.ndarray, " P"], predicted: Float[np.ndarray, " P"],
 
 def _r2(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"], of: Float[np.ndarray, " P"]) -> float:
     total = float(np.sum((of - of.mean()) ** 2))
-    return 1 - float(np.sum((y - x) ** 2)) / total if total > 1e-12 else float("nan")
+    if total > 1e-12:
+        return 1 - float(np.sum((y - x) ** 2)) / total
+    return float("nan")
 
 
 def correlation(x: Float[np.ndarray, " P"], y: Float[np.ndarray, " P"]) -> float:
     """Returns Pearson's r; NaN if x or y does not vary."""
-    a, b = x - x.mean(), y - y.mean()
+    a = x - x.mean()
+    b = y - y.mean()
     size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
-    return float(np.clip(np.sum(a * b) / size, -1, 1)) if size > 1e-12 else float("nan")
+    if size > 1e-12:
+        return float(np.clip(np.sum(a * b) / size, -1, 1))
+    return float("nan")
 
 
 def fisher(r: float, count: int, level: float = 0.95) -> Estimate:

@@ -19,7 +19,8 @@ def success_curves(series: Mapping[str, Sequence[tuple[float, Estimate]]], label
     axes = figure.subplots()
     for number, (name, points) in enumerate(series.items()):
         ordered = sorted(points, key=lambda point: point[0])
-        x, shares = np.array([point[0] for point in ordered]), [point[1] for point in ordered]
+        x = np.array([point[0] for point in ordered])
+        shares = [point[1] for point in ordered]
         axes.errorbar(
             x, _values(shares), yerr=_bars(shares), label=name, marker="o", capsize=3, color=COLORS[number % 5]
         )

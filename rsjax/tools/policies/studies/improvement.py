@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.artifact import make_once
 from rsjax.config import content_key
 from rsjax.data.codec import Record, decode, encode
 from rsjax.errors import UserError
@@ -88,15 +89,19 @@ def improve(
         stage(
             number, settings.rounds, f"round {number}", f"{settings.imagined} imagined episodes, {settings.steps} steps"
         )
-        made, counts = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}")
+        made, counts = imagine(arms["imagined"], starts, model, settings, number, out / f"round-{number}" / "episodes")
         row: dict[str, Any] = {"round": number, "episodes": settings.imagined, "kept": len(made), "demos": len(demos)}
         row |= {"uninterpretable": counts["uninterpretable"], "clipped": {"imagining": counts["clipped"]}}
         for arm, old in arms.items():
-            learns = mixed(demos, made, settings.share, number) if arm == "imagined" and made else demos
+            if arm == "imagined" and made:
+                learns = mixed(demos, made, settings.share, number)
+            else:
+                learns = demos
             folder = out / f"round-{number}" / arm
             arms[arm] = train_policy(config, learns, folder, name=f"round {number} {arm}", seed=number, start=old)
-            tried = try_policy(arms[arm], simulator, trials.seeds, trials, folder, f"round {number} {arm}")
-            row[arm], row["clipped"][arm] = tried.success, tried.clipped
+            tried = try_policy(arms[arm], simulator, trials.seeds, trials, folder / "trials", f"round {number} {arm}")
+            row[arm] = tried.success
+            row["clipped"][arm] = tried.clipped
         if not made:
             note("the judge called no imagined episode a success: this round learns from the old demonstrations")
         rows.append(row)
@@ -123,7 +128,7 @@ def _tuning(config: PolicyConfig, settings: Improvement) -> PolicyConfig:
 def imagine(
     policy: Policy, starts: Sequence[FirstFrame], model: World, settings: Improvement, number: int, folder: Path
 ) -> tuple[list[Record], dict[str, int]]:
-    """Imagines the episodes of a round; keeps each group in a file whose name is a hash of everything it depends on.
+    """Imagines the episodes of a round, except those that an interrupted call left in ``folder``.
 
     Returns:
         The episodes that the judge calls successes, as demonstrations; and over all episodes, how many end in a frame
@@ -132,38 +137,33 @@ def imagine(
     begins = (number - 1) * settings.imagined
     # A start that is used again gets different draws.
     chosen = [replace(starts[place % len(starts)], draw=place) for place in range(begins, begins + settings.imagined)]
+    first_frames = fingerprint([(start.rgb, start.depth, start.draw) for start in chosen])
+    key = content_key("imagined", policy.key, model.key, model.count, settings.max_steps, first_frames)
     made: list[Record] = []
-    counts = {"uninterpretable": 0, "clipped": 0}
-    folder.mkdir(parents=True, exist_ok=True)
-    files = _files(policy, chosen, model, settings, folder)
-    if others := len({*folder.glob("imagined-*.clips")} - {*files}):
-        note(f"{folder}: {others} files of imagined episodes are of another policy, model, judge or start; not used")
-    with Progress(f"round {number}: imagining", len(chosen), "episodes") as progress:
-        for first, file in zip(range(0, len(chosen), model.count), files, strict=True):
+    uninterpretable = 0
+    clipped = 0
+    with (
+        make_once(folder, key, refuse=None),
+        Progress(f"round {number}: imagining", len(chosen), "episodes") as progress,
+    ):
+        for first in range(0, len(chosen), model.count):
             group = chosen[first : first + model.count]
+            file = folder / f"{first:05d}.clips"
             if not file.exists():
-                actor = policy.actor(begins + first)
-                episodes = run_episodes(model, actor, group, settings.max_steps)
+                episodes = run_episodes(model, policy.actor(begins + first), group, settings.max_steps)
                 good = [{"rgb": one.rgb, "actions": one.actions} for one in episodes if one.success.any()]
-                done = {name: int(sum(getattr(one, name) for one in episodes)) for name in counts}
-                write_file(file, encode({"clips": [encode(one) for one in good], **done}))
+                content = {
+                    "clips": [encode(one) for one in good],
+                    "uninterpretable": sum(one.uninterpretable for one in episodes),
+                    "clipped": sum(one.clipped for one in episodes),
+                }
+                write_file(file, encode(content))
             kept = decode(file.read_bytes())
             made += [decode(payload) for payload in kept["clips"]]
-            counts = {name: count + kept[name] for name, count in counts.items()}
+            uninterpretable += kept["uninterpretable"]
+            clipped += kept["clipped"]
             progress.update(first + len(group), kept=len(made))
-    return made, counts
-
-
-def _files(
-    policy: Policy, chosen: Sequence[FirstFrame], model: World, settings: Improvement, folder: Path
-) -> list[Path]:
-    """Returns the file of each group of imagined episodes."""
-    files = []
-    for first in range(0, len(chosen), model.count):
-        starts = fingerprint(([(start.rgb, start.depth, start.draw) for start in chosen[first : first + model.count]],))
-        key = content_key("imagined", policy.key, model.key, model.count, settings.max_steps, first, starts)
-        files.append(folder / f"imagined-{first:05d}-{key[:8]}.clips")
-    return files
+    return made, {"uninterpretable": uninterpretable, "clipped": clipped}
 
 
 def mixed(demos: Demos, made: Sequence[Record], share: float, seed: int) -> Demos:
@@ -197,7 +197,8 @@ def table(results: dict[str, Any]) -> str:
     lines.append(f"| 0 | | | | before | {percent(share)} | {interval_text(share)} |")
     for row in results["rounds"]:
         for arm in ("imagined", "control"):
-            share, counts = _share(row[arm]), " | | "
+            share = _share(row[arm])
+            counts = " | | "
             if arm == "imagined":
                 counts = (
                     f"{row['episodes']} | {row['kept']} | {percent(wilson(row['uninterpretable'], row['episodes']))}"

@@ -114,7 +114,10 @@ def compared(run: str, true: Mapping[str, Result], imagined: Mapping[str, Result
     }
     same = np.mean([np.equal(each["simulator"], each["world_model"]) for each in policies.values()])
     spoilt = np.mean([each["uninterpretable"] for each in policies.values()])
-    found = _defined(asdict(agreement(x, y))) if len(true) > 1 else {}
+    if len(true) > 1:
+        found = _defined(asdict(agreement(x, y)))
+    else:
+        found = {}
     return {"run": run, "policies": policies, "same_outcome": float(same), "uninterpretable": float(spoilt), **found}
 
 
@@ -143,8 +146,14 @@ def _title(row: Mapping[str, Any]) -> str:
     if "pearson" not in row:
         return ""
     value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
-    r = "no variation" if value is None else f"r = {value:.2f}"
-    bounds = "" if low is None or high is None else f" [{low:.2f}, {high:.2f}]"
+    if value is None:
+        r = "no variation"
+    else:
+        r = f"r = {value:.2f}"
+    if low is None or high is None:
+        bounds = ""
+    else:
+        bounds = f" [{low:.2f}, {high:.2f}]"
     return f"{r}{bounds}, MMRV {row['mmrv']:.2f}, bias {row['bias']:+.2f}"
 
 
@@ -155,7 +164,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         if "pearson" in row:
             value, low, high = (row["pearson"][name] for name in ("value", "low", "high"))
-            bounds = "" if low is None or high is None else f"{low:.2f} … {high:.2f}"
+            if low is None or high is None:
+                bounds = ""
+            else:
+                bounds = f"{low:.2f} … {high:.2f}"
             numbers = [value, *(row[name] for name in NUMBERS)]
             r, *others = ["–" if number is None else f"{number:.3f}" for number in numbers]
             cells = [row["run"], r, "no variation" if value is None else bounds, *others, f"{row['bias']:+.3f}"]
@@ -170,10 +182,17 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     for number, row in enumerate(rows):
         for world in ("simulator", "world_model") if not number else ("world_model",):
-            place = "the simulator" if world == "simulator" else row["run"]
+            if world == "simulator":
+                place = "the simulator"
+            else:
+                place = row["run"]
             for name, each in row["policies"].items():
-                share, spoilt = wilson(sum(each[world]), len(each[world])), each["uninterpretable"]
-                unclear = percent(wilson(sum(spoilt), len(spoilt))) if world == "world_model" else ""
+                share = wilson(sum(each[world]), len(each[world]))
+                spoilt = each["uninterpretable"]
+                if world == "world_model":
+                    unclear = percent(wilson(sum(spoilt), len(spoilt)))
+                else:
+                    unclear = ""
                 cells = [name, place, percent(share), interval_text(share), unclear, str(each["clipped"][world])]
                 lines.append(f"| {' | '.join(cells)} |")
     for number, row in enumerate(rows):

@@ -59,7 +59,8 @@ class Learning:
         Raises:
             UserError: a name is unknown.
         """
-        counts, most = sorted(set(self.counts)), max(self.counts)
+        counts = sorted(set(self.counts))
+        most = max(self.counts)
         cells = [Cell(f"synthetic-{count}", 0, count) for count in counts]
         cells += [Cell(f"real-{count}", count, 0) for count in counts]
         cells += [Cell(f"real-{most}-repeated", most, 0, 2), Cell(f"real-{most}-synthetic-{most}", most, most, 2)]
@@ -84,12 +85,14 @@ def learn(
     Raises:
         UserError: there are too few demonstrations, or ``out`` holds others.
     """
-    cells, rows = settings.chosen(), []
+    cells = settings.chosen()
+    rows = []
     for cell in cells:  # raises before hours of training if there are too few
         _demos(cell, real, synthetic)
     for number, cell in enumerate(cells, 1):
         stage(number, len(cells), cell.name, f"{cell.real} real and {cell.synthetic} synthetic demonstrations")
-        success, clipped = [], []
+        success = []
+        clipped = []
         for seed in range(settings.seeds):
             folder = out / f"{cell.name}-seed{seed}"
             loop = replace(config.train, steps=config.train.steps * cell.steps)
@@ -97,7 +100,7 @@ def learn(
             policy = train_policy(
                 replace(config, train=loop), _demos(cell, real, synthetic), folder, seed=seed, name=name
             )
-            tried = try_policy(policy, world, trials.seeds, trials, folder, name)
+            tried = try_policy(policy, world, trials.seeds, trials, folder / "trials", name)
             success.append(tried.success)
             clipped.append(tried.clipped)
         rows.append(asdict(cell) | {"success": success, "clipped": clipped})
@@ -110,7 +113,9 @@ def learn(
 
 def _demos(cell: Cell, real: Demos, synthetic: Demos) -> Demos:
     parts = [source.first(count) for source, count in ((real, cell.real), (synthetic, cell.synthetic)) if count]
-    return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+    if len(parts) == 1:
+        return parts[0]
+    return parts[0] + parts[1]
 
 
 def pooled(row: dict[str, Any]) -> Estimate:
@@ -135,7 +140,10 @@ def claims(rows: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     for claim, one, other, margin in wanted:
         if one != other and one in success and other in success:
             interval = share_difference(success[one], success[other])
-            holds = verdict(interval, "higher", margin) if can_lose(success[other], -margin) else "cannot tell"
+            if can_lose(success[other], -margin):
+                holds = verdict(interval, "higher", margin)
+            else:
+                holds = "cannot tell"
             found.append(
                 {"claim": claim, "compares": [one, other], **asdict(interval), "margin": margin, "verdict": holds}
             )
@@ -146,13 +154,17 @@ def table(rows: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> st
     """Returns the results in Markdown."""
     lines = ["| policy | demonstrations | success | 95 % | episodes |", "|---|---|---|---|---|"]
     for row in rows:
-        share, count = pooled(row), np.size(row["success"])
+        share = pooled(row)
+        count = np.size(row["success"])
         parts = [f"{row[kind]} {kind}" for kind in ("real", "synthetic") if row[kind]]
         lines.append(f"| {row['name']} | {' + '.join(parts)} | {percent(share)} | {interval_text(share)} | {count} |")
     lines += ["", "| claim | difference | 95 % | |", "|---|---|---|---|"] if found else []
     for claim in found:
         gap = Estimate(claim["value"], claim["low"], claim["high"])
-        margin = f" (margin {100 * claim['margin']:g})" if claim["margin"] else ""
+        if claim["margin"]:
+            margin = f" (margin {100 * claim['margin']:g})"
+        else:
+            margin = ""
         lines.append(f"| {claim['claim']}{margin} | {percent(gap)} | {interval_text(gap)} | {claim['verdict']} |")
     return "\n".join([*lines, ""])
 
@@ -162,13 +174,20 @@ def percent(share: Estimate) -> str:
 
 
 def interval_text(share: Estimate) -> str:
-    return "" if share.low is None or share.high is None else f"{100 * share.low:.0f} … {100 * share.high:.0f} %"
+    if share.low is None or share.high is None:
+        return ""
+    return f"{100 * share.low:.0f} … {100 * share.high:.0f} %"
 
 
 def _series(rows: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float, Estimate]]]:
     series: dict[str, list[tuple[float, Estimate]]] = {}
     for row in rows:
-        kind = "both" if row["real"] and row["synthetic"] else "repeated" if row["steps"] > 1 else ""
+        if row["real"] and row["synthetic"]:
+            kind = "both"
+        elif row["steps"] > 1:
+            kind = "repeated"
+        else:
+            kind = ""
         kind = kind or ("real" if row["real"] else "synthetic")
         series.setdefault(kind, []).append((row["real"] + row["synthetic"], pooled(row)))
     return series

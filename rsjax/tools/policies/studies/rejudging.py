@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from rsjax.artifact import make_once
 from rsjax.config import content_key
 from rsjax.errors import UserError
-from rsjax.files import read_json, write_json
+from rsjax.files import read_json
 from rsjax.progress import Progress
 from rsjax.tools.policies.judges.judge import FAIL, SUCCESS, UNINTERPRETABLE, Judge
 from rsjax.tools.policies.judges.people_and_vlms import SHEET, HumanJudge, LanguageJudge, video_name, write_blinded
@@ -69,9 +70,11 @@ def rejudge(out: Path, judge: Judge, name: str) -> Path:
     Raises:
         UserError: ``out`` has no finished comparison, or the judge cannot judge one of its videos.
     """
-    results, folder = _results(out), out / f"judged-{name}"
-    rollouts, true = _rollouts(out, results), _true(results)
-    verdicts = _verdicts(rollouts, judge, folder / "verdicts.json")
+    results = _results(out)
+    folder = out / f"judged-{name}"
+    rollouts = _rollouts(out, results)
+    true = _true(results)
+    verdicts = _verdicts(rollouts, judge, folder, name)
     truth = np.concatenate([np.where(each.success, SUCCESS, FAIL) for each in true.values()])
     checked = scores(np.concatenate([verdicts["simulator"][policy] for policy in true]), truth)
     rows = []
@@ -95,8 +98,6 @@ def _results(out: Path) -> dict[str, Any]:
     results: dict[str, Any] = read_json(
         file, cure="compare policies first: python -m experiments.policy_evaluation RUN"
     )
-    if any("clipped" not in policy for row in results["runs"] for policy in row["policies"].values()):
-        raise UserError(f"{file}: is of an older version of rsjax; compare the policies again in another --out")
     return results
 
 
@@ -107,7 +108,8 @@ def _true(results: Mapping[str, Any]) -> dict[str, Result]:
 
 def _rollouts(out: Path, results: Mapping[str, Any]) -> dict[str, Rollouts]:
     """Returns the videos of the simulator and of each run."""
-    worlds, policies = ["simulator", *(row["run"] for row in results["runs"])], results["runs"][0]["policies"]
+    worlds = ["simulator", *(row["run"] for row in results["runs"])]
+    policies = results["runs"][0]["policies"]
     count = int(results["trials"]["episodes"])
     return {
         world: {name: [_video(out / world / name / f"episode-{i:02d}.npz") for i in range(count)] for name in policies}
@@ -117,31 +119,31 @@ def _rollouts(out: Path, results: Mapping[str, Any]) -> dict[str, Rollouts]:
 
 def _video(file: Path) -> UInt8[np.ndarray, "T S S 3"]:
     if not file.exists():
-        raise UserError(
-            f"{file}: missing, as of an older version of rsjax; compare the policies again in another --out"
-        )
+        raise UserError(f"{file}: missing; compare the policies again in another --out")
     with np.load(file) as arrays:
         return np.asarray(arrays["rgb"])
 
 
 def _verdicts(
-    rollouts: Mapping[str, Rollouts], judge: Judge, file: Path
+    rollouts: Mapping[str, Rollouts], judge: Judge, folder: Path, name: str
 ) -> dict[str, dict[str, Float[np.ndarray, "N 3"]]]:
     """Returns the judge's probabilities for every video; equal videos are judged once."""
-    known: dict[str, list[float]] = read_json(file, cure=f"delete {file}") if file.exists() else {}
     names = {
         world: {policy: [video_name(video) for video in videos] for policy, videos in policies.items()}
         for world, policies in rollouts.items()
     }
     videos = {video_name(video): video for world in rollouts.values() for some in world.values() for video in some}
-    with Progress("judging", len(videos), "videos", len(known)) as progress:
-        for number, (name, video) in enumerate(videos.items(), 1):
-            if name not in known:
-                known[name] = judge(video[None])[0].tolist()
-            if number % EVERY == 0 or number == len(videos):
-                write_json(file, known)
-            progress.update(number)
+    # Again, because the comparison may have more runs by now; verdicts on known videos are kept.
+    with make_once(folder, content_key("judged", name), refuse=None, again=True) as work:
+        known: dict[str, list[float]] = work.metadata.get("verdicts", {})
+        with Progress("judging", len(videos), "videos", len(known)) as progress:
+            for number, (video_id, video) in enumerate(videos.items(), 1):
+                if video_id not in known:
+                    known[video_id] = judge(video[None])[0].tolist()
+                if number % EVERY == 0 or number == len(videos):
+                    work.save(verdicts=known)
+                progress.update(number)
     return {
-        world: {policy: np.array([known[name] for name in some]) for policy, some in policies.items()}
+        world: {policy: np.array([known[video_id] for video_id in some]) for policy, some in policies.items()}
         for world, policies in names.items()
     }

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from rsjax.artifact import make_once
 from rsjax.config import content_key
 from rsjax.data.build import write_clips
 from rsjax.data.clips import Clips, frame_rate, keeps_rate, readable
@@ -19,7 +20,7 @@ from rsjax.data.codec import Record, decode, encode
 from rsjax.data.store import MANIFEST, Store
 from rsjax.errors import UserError
 from rsjax.evaluation.results import fingerprint
-from rsjax.files import disk_guard, making, read_json, write_atomically, write_json
+from rsjax.files import disk_guard, read_json, write_atomically, write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
 from rsjax.tools.policies.demos import Only, chooses, controls_of
@@ -28,7 +29,7 @@ from rsjax.tools.policies.judges.validation import summary
 from rsjax.tools.policies.worlds.actions import ActionRange, check_takes_actions
 from rsjax.tools.policies.worlds.model_world import model_key
 
-MARK = "synthesis.json"
+SUMMARY = "synthesis.json"
 CLIPS = "clips"  # the store's folder
 VERSIONS: tuple[Literal["v3.0", "v2.1"], ...] = ("v3.0", "v2.1")
 
@@ -92,38 +93,32 @@ def synthesize(
         UserError: the data set has no suitable clip, does not fit the model, or ``out`` holds other clips.
     """
     inputs = (model_key(trained), judge_key(judge), fingerprint(((limits.low, limits.high),)))
-    settings = {name: value for name, value in asdict(options).items() if name != "fps" or value}  # older keys lack fps
-    key = content_key(4, *inputs, str(store.manifest.get("key")), str(settings))
-    if (mark := _finished(out, key)) is not None:
-        return mark
-    partial = out / "partial"
-    with disk_guard(out), making(out, wait=False):
-        if not (partial / key).exists():
-            shutil.rmtree(partial, ignore_errors=True)
-            (partial / key).mkdir(parents=True)
-        _generate(trained, store, partial / key, options, limits, judge, report)
-        clips = write_clips(out / CLIPS, _records(partial / key, options.demos), test_share=0.0)
+    key = content_key(4, *inputs, str(store.manifest.get("key")), str(asdict(options)))
+    finished = _finished(out, key)
+    if finished is not None:
+        return finished
+    with disk_guard(out), make_once(out / "partial", key, refuse=None, temporary=True) as work:
+        _generate(trained, store, work.folder, options, limits, judge, report)
+        clips = write_clips(out / CLIPS, _records(work.folder, options.demos), test_share=0.0)
         for version in VERSIONS:
             place = out / f"lerobot-{version}"
             shutil.rmtree(place, ignore_errors=True)  # left by an attempt that did not finish
             export_lerobot(clips, place, LeRobotOptions(version))
-        mark = {"key": key, **asdict(options), **_summary(clips, judge)}
-        write_json(out / MARK, mark)
-        shutil.rmtree(partial)
-    return mark
+        content = {"key": key, **asdict(options), **_summary(clips, judge)}
+        write_json(out / SUMMARY, content)
+    return content
 
 
 def _finished(out: Path, key: str) -> dict[str, Any] | None:
     """Returns the result of a finished call, or None; raises UserError if that call had other inputs."""
-    if not (out / MARK).exists():
+    if not (out / SUMMARY).exists():
         return None
-    mark = read_json(out / MARK, cure=f"delete {out}")
-    if mark.get("key") != key:
+    content = read_json(out / SUMMARY, cure=f"delete {out}")
+    if content.get("key") != key:
         raise UserError(
-            f"{out}: holds demonstrations of other settings, another model or judge, or an older version of rsjax; "
-            f"choose another --out, or delete it"
+            f"{out}: holds demonstrations of other settings, another model or judge; choose another --out, or delete it"
         )
-    return mark
+    return content
 
 
 def _generate(
@@ -136,7 +131,8 @@ def _generate(
     report: Callable[[int, int], None],
 ) -> None:
     """Writes each demonstration to its own file, unless that exists."""
-    source, chosen = store.source(options.split), choose_clips(store, options)
+    source = store.source(options.split)
+    chosen = choose_clips(store, options)
     spread = np.asarray(trained.assets.normalization.action_std)
     _check_fits(source[chosen[0]], store, trained, options)
     for first in range(0, options.demos, options.batch):
@@ -158,7 +154,8 @@ def _generate(
 def _check_fits(clip: Record, store: Store, trained: TrainedModel, options: Synthesis) -> None:
     """Raises UserError unless the model takes clips like this one, and they contain what the exports need."""
     check_takes_actions(trained.config.model)
-    size, width = trained.config.clips.image_size, len(trained.assets.normalization.action_std)
+    size = trained.config.clips.image_size
+    width = len(trained.assets.normalization.action_std)
     if clip["actions"].shape[1] != width:
         raise UserError(f"{store.path}: actions of {clip['actions'].shape[1]} numbers, the model takes {width}")
     if clip["rgb"].shape[1:3] != (size, size):
@@ -185,7 +182,10 @@ def _generated(
     actions = np.stack([actions for actions, _ in noisy])
     index = np.array(numbers)[rows] + options.seed % 2**11 * 2**20
     video = trained.model.generate(trained.params, trained.assets, prompt[rows], actions[rows], index=index)
-    found = None if judge is None else labels(video.rgb[: len(clips)], judge)
+    if judge is None:
+        found = None
+    else:
+        found = labels(video.rgb[: len(clips)], judge)
     for row, (clip, number, (taken, clipped)) in enumerate(zip(clips, numbers, noisy, strict=True)):
         made = {
             "rgb": np.asarray(video.rgb[row]),

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.artifact import make_once
 from rsjax.config import SimConfig, content_key
 from rsjax.errors import UserError
 from rsjax.evaluation.statistics import Estimate, wilson
-from rsjax.files import making, read_json, write_file, write_json
+from rsjax.files import write_file
 from rsjax.progress import Progress
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.worlds.model_world import FirstFrame
@@ -21,6 +22,10 @@ from rsjax.tools.policies.worlds.world import FIRST_SEED, World, run_episodes
 from rsjax.tools.studies.report.video import write_mp4
 
 FPS = 5.0  # of the videos
+OTHERS = (
+    "holds trials of other episodes or steps, or of another policy, simulator, world model or judge; choose another "
+    "--out, or delete it"
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ def try_policy(
     """Runs a policy from each start, except those whose result is in ``folder`` already.
 
     Args:
-        folder: the folder of ``success.json``, which grows as episodes end, and of a few videos.
+        folder: the folder of the results, which grow as episodes end, and of a few videos.
         name: for the progress line.
         save_frames: whether to save the frames of each episode as ``episode-NN.npz``, for other judges.
 
@@ -90,41 +95,27 @@ def try_policy(
         UserError: the result in ``folder`` is from other trials, another policy, or another world or judge.
         FileError: another process runs trials in ``folder``.
     """
-    file = folder / "success.json"
-    with making(folder, wait=False):
-        kept = _kept(file, [len(starts), trials.max_steps, trials.together], content_key(policy.key, world.key))
-        done = len(kept["success"])
-        with Progress(f"{name}: trials", len(starts), "episodes", done) as progress:
+    key = content_key("trials", len(starts), trials.max_steps, trials.together, policy.key, world.key)
+    with make_once(folder, key, refuse=OTHERS) as work:
+        success = work.metadata.setdefault("success", [])
+        uninterpretable = work.metadata.setdefault("uninterpretable", [])
+        clipped = work.metadata.get("clipped", 0)
+        with Progress(f"{name}: trials", len(starts), "episodes", len(success)) as progress:
             # An episode's draws depend on its group, so a resumed series continues at a multiple of ``together``.
-            for first in range(done, len(starts), world.count):
+            for first in range(len(success), len(starts), world.count):
                 group = starts[first : first + world.count]
-                for number, episode in enumerate(
-                    run_episodes(world, policy.actor(first), group, trials.max_steps), first
-                ):
-                    kept["success"].append(bool(episode.success.any()))
-                    kept["uninterpretable"].append(episode.uninterpretable)
-                    kept["clipped"] += episode.clipped
+                episodes = run_episodes(world, policy.actor(first), group, trials.max_steps)
+                for number, episode in enumerate(episodes, first):
+                    success.append(bool(episode.success.any()))
+                    uninterpretable.append(episode.uninterpretable)
+                    clipped += episode.clipped
                     if number < trials.videos:
                         write_mp4(folder / f"episode-{number:02d}.mp4", episode.rgb, FPS, 4)
                     if save_frames:
                         save_arrays(folder / f"episode-{number:02d}.npz", rgb=episode.rgb)
-                write_json(file, kept)
-                progress.update(len(kept["success"]), success=sum(kept["success"]))
-    return Result(kept["success"], kept["clipped"], kept["uninterpretable"])
-
-
-def _kept(file: Path, settings: list[int], key: str) -> dict[str, Any]:
-    """Returns the content of the file of results so far, or an empty one's content if there is no file."""
-    kept = {"success": [], "clipped": 0, "uninterpretable": [], "trials": settings, "key": key}
-    if file.exists():
-        kept = read_json(file, cure=f"delete {file}")
-    if kept.get("trials") != settings:
-        raise UserError(f"{file}: is of (episodes, steps, together) {kept.get('trials')}, not {settings}; delete it")
-    if kept.get("key") != key:
-        raise UserError(
-            f"{file}: is of another policy, simulator, world model or judge; choose another --out, or delete it"
-        )
-    return kept
+                work.save(success=success, uninterpretable=uninterpretable, clipped=clipped)
+                progress.update(len(success), success=sum(success))
+    return Result(success, clipped, uninterpretable)
 
 
 def open_lift(config: SimConfig, trials: Trials) -> AbstractContextManager[SimulatorWorld]:
@@ -138,7 +129,8 @@ def first_frames(world: World, seeds: Sequence[int], file: Path) -> list[FirstFr
         with np.load(file) as arrays:
             if arrays["seeds"].tolist() == list(seeds) and "key" in arrays and str(arrays["key"]) == world.key:
                 return _frames(arrays["rgb"], arrays["depth"])
-    rgb, depth = [], []
+    rgb = []
+    depth = []
     for first in range(0, len(seeds), world.count):
         observation = world.reset(seeds[first : first + world.count]).observation
         rgb.append(observation["rgb"])

@@ -67,7 +67,10 @@ class ActionRange:
         Raises:
             ActionError: the shape or type is wrong, a value is not finite, or, with "refuse", a value is out of range.
         """
-        shape = self.low.shape if count is None else (count, *self.low.shape)
+        if count is None:
+            shape = self.low.shape
+        else:
+            shape = (count, *self.low.shape)
         try:
             numbers = np.asarray(actions, np.float32)
         except (TypeError, ValueError) as error:
@@ -110,5 +113,8 @@ def action_range(config: Config, normalization: Normalization) -> ActionRange:
         low = (mean - SPREAD * std).astype(np.float32)
         high = (mean + SPREAD * std).astype(np.float32)
         return ActionRange(low, high, "in the recording's units, as the clips' actions")
-    unit = LIFT_UNIT if config.sim.env == "lift" else "controls of the simulator, from -1 to 1"
+    if config.sim.env == "lift":
+        unit = LIFT_UNIT
+    else:
+        unit = "controls of the simulator, from -1 to 1"
     return ActionRange(np.full(width, -1, np.float32), np.full(width, 1, np.float32), unit)

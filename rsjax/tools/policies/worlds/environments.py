@@ -76,7 +76,10 @@ class _Model:
         size = config.clips.image_size
         depth_range = trained.assets.normalization.depth_range
         has_depth = config.model.uses_depth and depth_range is not None
-        store = Path(settings.store) if settings.store else None
+        if settings.store:
+            store = Path(settings.store)
+        else:
+            store = None
         judge = judge_of(run, settings.judge, size)
         self.world = ModelWorld(trained, count, judge, whole_videos=False)
         self.starts = Starts(config, folder, Path(settings.data_dir), store, settings.split, has_depth)
@@ -180,7 +183,9 @@ class WorldModelEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Returns the current frame; None without a render mode."""
-        return self._frame if self.render_mode else None
+        if self.render_mode:
+            return self._frame
+        return None
 
     def _seen(self, state: WorldState) -> tuple[Observation, dict[str, Any]]:
         observation = {name: frames[0] for name, frames in state.observation.items()}
@@ -350,7 +355,10 @@ class LiftEnv(gymnasium.Env[Any, Any]):
         If there is no seed, one is drawn from the generator that the last seed started.
         """
         super().reset(seed=seed)
-        start = int(self.np_random.integers(2**32)) if seed is None else seed
+        if seed is None:
+            start = int(self.np_random.integers(2**32))
+        else:
+            start = seed
         state = self._world.reset([start])
         self._steps = 0
         self._clipped = 0
@@ -387,7 +395,9 @@ class LiftEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> UInt8[np.ndarray, "S S 3"] | None:  # type: ignore[override]
         """Returns the current frame; None without a render mode."""
-        return self._frame if self.render_mode else None
+        if self.render_mode:
+            return self._frame
+        return None
 
     def close(self) -> None:
         """Frees the renderer and the simulation."""

@@ -49,13 +49,19 @@ class Starts:
             StartError: the clips are missing.
         """
         try:
-            config = relocated(self.config, self.store) if self.store else self.config
+            if self.store:
+                config = relocated(self.config, self.store)
+            else:
+                config = self.config
             store = Run(config, self.run, self.data_dir).open_clips()
             if self.split not in store.splits:
                 raise StoreError(f"{store.path}: has no split {self.split!r} ({', '.join(store.splits)})")
             return store.source(self.split)
         except UserError as error:
-            frame = '"rgb": …, "depth": …' if self.depth else '"rgb": …'
+            if self.depth:
+                frame = '"rgb": …, "depth": …'
+            else:
+                frame = '"rgb": …'
             raise StartError(
                 f"{error}; without the run's clips, reset needs a first frame of its own: options={{{frame}}}; or name "
                 f"them with data_dir or store"
@@ -80,7 +86,10 @@ class Starts:
         else:
             number, clip = self._clip(rng, options.get("clip"))
             rgb = clip["rgb"][0]
-            depth = clip["depth"][0] if self.depth else None
+            if self.depth:
+                depth = clip["depth"][0]
+            else:
+                depth = None
         drawn = rng.integers(2**31)  # also where the options say otherwise, so that later choices are the same
         return FirstFrame(rgb, depth, int(options.get("draw", drawn)), number)
 

@@ -102,16 +102,11 @@ def test_what_another_judge_model_or_policy_made_is_not_taken_for_ones_own(tmp_p
     compare(policies, simulated(5), {"run": lambda: imagined(5)}, TRIALS, tmp_path)
     for world in (imagined(5, judge=blind), imagined(5, pace=0.5)):
         with pytest.raises(
-            UserError, match=r"run/a/success.json: is of another policy, simulator, world model or judge"
+            UserError, match=r"run/a: holds trials of .* another policy, simulator, world model or judge"
         ):
             compare(policies, simulated(5), {"run": lambda world=world: world}, TRIALS, tmp_path)  # type: ignore[misc]
-    with pytest.raises(UserError, match=r"simulator/b/success.json: is of another policy"):
+    with pytest.raises(UserError, match=r"simulator/b: holds trials of"):
         compare({**policies, "b": ToyPolicy(0.9)}, simulated(5), {}, TRIALS, tmp_path)  # type: ignore[dict-item]
-    file = tmp_path / "simulator" / "a" / "success.json"
-    file.write_text(json.dumps({"success": [], "clipped": 0, "trials": [10, 4, 5]}))
-    with pytest.raises(UserError, match=r"world model or judge; choose another --out, or delete it"):
-        compare(policies, simulated(5), {}, TRIALS, tmp_path)
-
     results = compare(policies, simulated(5), {"run": lambda: imagined(5, judge=blind)}, TRIALS, tmp_path / "new")
     (row,) = results["runs"]
     assert row["uninterpretable"] == 1 and not any(row["policies"]["a"]["world_model"])
@@ -179,7 +174,7 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     count = len(draws)
     assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
     other: Any = imagined(5, pace=0.5)  # a model of other weights imagines anew
-    made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1")
+    made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1" / "episodes")
     assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(other._imagination.draws) == 2
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rsjax.errors import UserError
-from rsjax.files import write_json
 from rsjax.tools.policies.judges.judge import LABELS
 from rsjax.tools.policies.judges.people_and_vlms import video_name
 from rsjax.tools.policies.studies.policy_evaluation import compare
@@ -44,7 +43,7 @@ def test_a_sheet_of_labels_decides_on_the_rollouts_that_were_kept(tmp_path: Path
     with pytest.raises(UserError, match="has no label of 1 of 1 videos"):
         rejudged(out, sheet, labels)
     next(out.glob("run/slow/episode-03.npz")).unlink()
-    with pytest.raises(UserError, match=r"episode-03.npz: missing, .* compare the policies again in another --out"):
+    with pytest.raises(UserError, match=r"episode-03.npz: missing; compare the policies again in another --out"):
         rejudged(out, sheet, labels)
 
 
@@ -59,7 +58,4 @@ def test_judges_that_do_not_exist_are_named(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"it is human:SHEET.csv, a sheet that --blind wrote, or vlm:DIRECTORY"):
             named_judge(words)
     with pytest.raises(UserError, match="compare policies first"):
-        blind(tmp_path, tmp_path / "blind")
-    write_json(tmp_path / "results.json", {"runs": [{"policies": {"a": {"simulator": [True]}}}]})
-    with pytest.raises(UserError, match="is of an older version"):
         blind(tmp_path, tmp_path / "blind")

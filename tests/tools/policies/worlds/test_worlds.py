@@ -159,7 +159,7 @@ def test_trials_that_are_interrupted_go_on(tmp_path: Path) -> None:
     assert result.success == [False, True, False, True, True]
     assert result.share.value == 0.6 and result.share.low is not None and result.share.low < 0.6
     assert [path.name for path in tmp_path.glob("*.mp4")] == ["episode-00.mp4"]
-    with pytest.raises(UserError, match=r"is of \(episodes, steps, together\) \[5, 4, 2\], not \[5, 9, 2\]"):
+    with pytest.raises(UserError, match="holds trials of other episodes or steps"):
         try_policy(ToyPolicy(1.0), simulated(2), starts, Trials(5, 9, 2), tmp_path, "toy")  # type: ignore[arg-type]
 
 
