@@ -1,14 +1,20 @@
 """Evaluates a world model: generates videos from the first frames of held-out clips and scores all registered metrics.
 
+Reading order: :func:`evaluate` generates the videos (:mod:`rsjax.evaluation.generation`), pairs them with the recorded
+ones as scenes (:func:`make_scenes`), scores every metric of the registry (:func:`score_all`, :func:`frame_curves`),
+and summarises the clips' scores (:func:`summarised`).
+
 Axes: B clips, T frames, H×W pixels, A action dimensions, R draws of random actions.
 """
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -16,52 +22,29 @@ from rsjax.clip import Video
 from rsjax.config import EvalConfig
 from rsjax.config.data import ClipShape
 from rsjax.data.clips import Clips, readable, spread
-from rsjax.data.codec import Record, decode, encode
+from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError
 from rsjax.devices import replicate
-from rsjax.evaluation.depth_estimator import DepthEstimator
-from rsjax.evaluation.frame_curves import Curves, frame_curves
+from rsjax.errors import UserError
+from rsjax.evaluation.depth_estimator import DepthEstimator, estimate_depth
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced
+from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.metrics import delta_psnr, fvd
 from rsjax.evaluation.protocols import Protocol, check, of_run
-from rsjax.evaluation.registry import PerClip, Scene
-from rsjax.evaluation.scenes import locating, make_scenes, scored_frames
-from rsjax.evaluation.scoring import Scored, mean_curves, mean_scores, sample_scores, score_all, summarised, with_best
-from rsjax.evaluation.shown import extremes, shown_arrays
-from rsjax.files import write_atomically
-from rsjax.models.base import Assets
+from rsjax.evaluation.registry import Located, Metric, PerClip, PerFrame, Places, Scene, Unavailable, metrics
+from rsjax.evaluation.results import Curves, Evaluation
+from rsjax.evaluation.shown import kept_frames, shown_arrays
+from rsjax.evaluation.statistics import bootstrap
+from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
 from rsjax.tokenizers.lpips import load_lpips
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
-KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
+LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
+PIXELS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")  # metrics that are also reduced to the best of several samples
+CURVE_RESAMPLES = 2000  # bootstrap resamples of the clips at each frame
 
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The result of an evaluation.
-
-    Attributes:
-        metrics: scores by name.
-        reasons: why a registered metric has no score, by name.
-        shown: arrays of the clips in the report, with a leading axis over clips.
-        per_clip: the score of each scored clip, by the names in ``metrics``, in the order of the split, without clips
-            that have no score; the mean over repetitions if there are several.
-        curves: means over the clips at each predicted frame, as in curves.json.
-        repetitions: the scores of each repetition.
-        clips: the scored clips: ``number`` in the split, ``episode`` if known, ``sha256`` of frames and actions.
-        kept: frames of some of the scored clips: ``rows``, the rows of these clips; ``truth``, ``prediction``, and
-            ``reconstruction`` by the tokenizer if the model has one, each (n, T, H, W, 3).
-    """
-
-    metrics: dict[str, float]
-    reasons: dict[str, str]
-    shown: dict[str, np.ndarray]
-    per_clip: dict[str, list[float]] = field(default_factory=dict)
-    curves: Curves = field(default_factory=dict)
-    repetitions: list[dict[str, float]] = field(default_factory=list)
-    clips: list[dict[str, Any]] = field(default_factory=list)
-    kept: dict[str, np.ndarray] = field(default_factory=dict)
+Locate = Callable[[Video, bool], Located]
 
 
 def check_files(settings: EvalConfig) -> None:
@@ -70,9 +53,10 @@ def check_files(settings: EvalConfig) -> None:
     Raises:
         UserError: a file is missing, damaged or of another network.
     """
-    for path, net in ((settings.lpips_alex_weights, "alexnet"), (settings.lpips_vgg_weights, "vgg16")):
-        if path:
-            load_lpips(path, net)
+    if settings.lpips_alex_weights:
+        load_lpips(settings.lpips_alex_weights, "alexnet")
+    if settings.lpips_vgg_weights:
+        load_lpips(settings.lpips_vgg_weights, "vgg16")
     if settings.fvd_weights:
         fvd.check_i3d(settings.fvd_weights)
 
@@ -107,7 +91,8 @@ class HeldOut:
                 frames or actions is not the model's.
             UserError: the clips are shorter or smaller than the protocol needs.
         """
-        source, where = store.source(split), f"the {split} split of {store.path}"
+        source = store.source(split)
+        where = f"the {split} split of {store.path}"
         numbers = spread(source, protocol.clips)
         if len(numbers) < 2:
             raise StoreError(f"{where} has {len(numbers)} clips; an evaluation takes two at least: name another split")
@@ -125,14 +110,11 @@ class HeldOut:
 
     def ids(self) -> list[dict[str, Any]]:
         """Returns what identifies each clip: its number in the split, its episode, and a hash of frames and actions."""
-        return [
-            {"number": int(number), "episode": record["provenance"].get("episode"), "sha256": _hash(record)}
-            for number, record in zip(self.clips.index, self.records, strict=True)
-        ]
-
-
-def _hash(record: Record) -> str:
-    return hashlib.sha256(record["rgb"].tobytes() + record["actions"].tobytes()).hexdigest()[:16]
+        ids = []
+        for number, record in zip(self.clips.index, self.records, strict=True):
+            content = hashlib.sha256(record["rgb"].tobytes() + record["actions"].tobytes()).hexdigest()[:16]
+            ids.append({"number": int(number), "episode": record["provenance"].get("episode"), "sha256": content})
+        return ids
 
 
 def evaluate(
@@ -150,7 +132,7 @@ def evaluate(
         protocol: the protocol to evaluate by; None: that of the run's own configuration.
         held_out: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
-        estimator: estimates depth from frames; None: no such scores.
+        estimator: estimates depth from frames; None: no scores of estimated depth.
 
     Raises:
         StoreError: a test clip is damaged.
@@ -159,114 +141,381 @@ def evaluate(
     settings = trained.config.eval
     check_files(settings)
     if held_out is None:
-        wanted = protocol or of_run(trained.config)
-        held_out = HeldOut.read(store, "test", wanted, trained.config.clips)
+        held_out = HeldOut.read(store, "test", protocol or of_run(trained.config), trained.config.clips)
+    protocol = held_out.protocol
+    clips = held_out.clips
     generation = plan(trained, store, held_out, folder)
     generation.make()
-    repetitions, first = _repetitions(generation, store, held_out, estimator)
-    scored = mean_scores([scored for scored, _ in repetitions])
-    scores = summarised(scored)
-    scores["clips"] = float(len(held_out.clips.rgb))
-    if (share := held_out.store.manifest.get("success_share")) is not None:
-        scores["success_share"] = float(share)
-    return Evaluation(
-        scores,
-        scored.reasons,
-        shown_arrays(held_out.clips, first, scored.per_clip()["psnr"], settings.report_clips),
-        {name: values.tolist() for name, values in scored.per_clip().items()},
-        mean_curves([curves for _, curves in repetitions]),
-        [summarised(each, interval=False) for each, _ in repetitions],
-        held_out.ids(),
-        _kept(first, scored.per_clip()["psnr_repeat_first"]),
-    )
 
-
-def _repetitions(
-    generation: Generation, store: Store, held_out: HeldOut, estimator: DepthEstimator | None
-) -> tuple[list[tuple[Scored, Curves]], dict[str, Scene]]:
-    """Returns the scores of each repetition, and the scenes of the first one."""
-    trained, clips, protocol = generation.trained, held_out.clips, held_out.protocol
-    takes_actions = trained.config.model.takes_actions
-    locate = locating(trained, store, held_out.records, clips.rgb.shape[1] - 1)
-    taught, takes = teacher_forced(trained, protocol, clips), held_out.retakes
-    repetitions: list[tuple[Scored, Curves]] = []
-    first: dict[str, Scene] = {}
+    locate = locating(generation.trained, store, held_out.records, clips.rgb.shape[1] - 1)
+    predicted_tokens = teacher_forced(generation.trained, protocol, clips)
+    repetitions: list[Scored] = []
+    curves: list[Curves] = []
     for run in range(protocol.repetitions):
-        scenes = make_scenes(trained, protocol, clips, generation.videos(run), estimator, locate, taught, takes)
-        scored = with_best(score_all(scenes, protocol, takes_actions), scenes[""], generation.samples(run), protocol)
-        repetitions.append((scored, frame_curves(scenes)))
-        first = first or scenes
-    return repetitions, first
+        scenes = make_scenes(
+            generation.trained,
+            protocol,
+            clips,
+            generation.videos(run),
+            estimator,
+            locate,
+            predicted_tokens,
+            held_out.retakes,
+        )
+        scored = score_all(scenes, protocol, trained.config.model.takes_actions)
+        repetitions.append(with_best(scored, scenes[""], generation.samples(run), protocol))
+        curves.append(frame_curves(scenes))
+        if run == 0:
+            first = scenes
+
+    scored = mean_scores(repetitions)
+    per_clip = scored.per_clip()
+    scores = summarised(scored)
+    scores["clips"] = float(len(clips.rgb))
+    success_share = held_out.store.manifest.get("success_share")
+    if success_share is not None:
+        scores["success_share"] = float(success_share)
+    return Evaluation(
+        metrics=scores,
+        reasons=scored.reasons,
+        shown=shown_arrays(clips, first, per_clip["psnr"], settings.report_clips),
+        per_clip={name: values.tolist() for name, values in per_clip.items()},
+        curves=mean_curves(curves),
+        repetitions=[summarised(each, interval=False) for each in repetitions],
+        clips=held_out.ids(),
+        kept=kept_frames(first, per_clip["psnr_repeat_first"]),
+    )
 
 
 def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | None = None) -> Generation:
     """Returns the generation of all videos of an evaluation; several processes can each make a share of them."""
-    trained = replace(trained, params=replicate(trained.params), assets=_assets(trained.assets))
-    clips, protocol = held_out.clips, held_out.protocol
-    truth = scored_frames(trained, protocol, clips) if protocol.samples > 1 else clips.video
+    assets = trained.assets
+    if assets.tokenizer is not None:
+        assets = replace(assets, tokenizer=replicate(assets.tokenizer))
+    trained = replace(trained, params=replicate(trained.params), assets=assets)
+    protocol = held_out.protocol
+    clips = held_out.clips
+    draws = {OWN: clips.actions[None]}
+    if protocol.action_draws and trained.config.model.takes_actions:
+        draws |= _random_actions(clips.actions, protocol.action_draws, store)
+    if protocol.samples > 1:
+        truth = scored_frames(trained, protocol, clips)
+    else:
+        truth = clips.video
     return Generation(
         trained,
         protocol,
         clips,
-        _draws(clips.actions, protocol.action_draws * trained.config.model.takes_actions, store),
+        draws,
         len(held_out.store.source(held_out.split)),
         lambda rows, video: sample_scores(truth[rows], video, protocol, trained.config.eval),
         folder,
     )
 
 
-def _assets(assets: Assets) -> Assets:
-    return assets if assets.tokenizer is None else replace(assets, tokenizer=replicate(assets.tokenizer))
-
-
-def _draws(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dict[str, np.ndarray]:
-    """Returns, by kind, the actions under which videos are generated, each (R, B, T, A)."""
-    if not draws:
-        return {OWN: actions[None]}
+def _random_actions(actions: Float[np.ndarray, "B T A"], draws: int, store: Store) -> dict[str, np.ndarray]:
+    """Returns, by kind, actions that are not the clips' own, each (R, B, T, A)."""
     train = store.source("train")
-    low, high = delta_psnr.action_range(
-        np.stack([clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))])
-    )
+    recorded = [clip["actions"] for _, clip in readable(train, spread(train, RANGE_CLIPS))]
+    low, high = delta_psnr.action_range(np.stack(recorded))
     return {
-        OWN: actions[None],
         "other": actions[delta_psnr.other_clips(len(actions), draws, seed=0)],
         "uniform": delta_psnr.uniform_actions(actions, low, high, draws, seed=0),
     }
 
 
-def _kept(scenes: dict[str, Scene], still: PerClip) -> dict[str, np.ndarray]:
-    """Returns the frames of some clips: clips spread evenly, and those with the most and the least motion.
+# What metrics compare: recorded videos with the prediction and both baselines, at the protocol's resolution.
 
-    The choice is the same for all models.
+
+def make_scenes(
+    trained: TrainedModel,
+    protocol: Protocol,
+    clips: Clips,
+    videos: Mapping[str, Sequence[Video]],
+    estimator: DepthEstimator | None,
+    locate: Locate | None,
+    predicted_tokens: TeacherForced | None = None,
+    retakes: Video | None = None,
+) -> dict[str, Scene]:
+    """Returns the scenes by the suffix that names their scores: "" for the prediction, and one for each baseline.
 
     Args:
-        still: PSNR of the last prompt frame repeated, which does not depend on the model.
+        videos: by kind of actions, one for each draw; the first under the clips' own actions is the prediction.
+        predicted_tokens: how well the model predicts tokens from true frames.
+        retakes: second recordings of the clips' scenes.
     """
-    truth = scenes[""].truth.rgb
-    rows = np.union1d(spread(truth, KEPT_CLIPS), np.concatenate(extremes(still)))
-    arrays = {"rows": rows, "truth": truth[rows], "prediction": scenes[""].prediction.rgb[rows]}
-    if "_tokenizer" in scenes:
-        arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
-    return arrays
+    reconstruction = trained.model.reconstruct(trained.assets, clips.video)
+    shown = {"": videos[OWN][0], "_repeat_first": _repeat_first(clips.metric_video, protocol.prompt_frames)}
+    if reconstruction is not None:
+        shown["_tokenizer"] = reconstruction
+    truth = scored_frames(trained, protocol, clips, reconstruction)
+    compared = {suffix: scaled(video, protocol.resolution) for suffix, video in shown.items()}
+    estimated = {}
+    if estimator is not None:
+        estimated = estimate_depth(estimator, truth.rgb, {suffix: video.rgb for suffix, video in compared.items()})
+    if retakes is not None:
+        retakes = scaled(retakes, protocol.resolution)
+    truth_cache: dict[Any, Any] = {}
+    scenes = {}
+    for suffix, video in compared.items():
+        scenes[suffix] = Scene(
+            truth,
+            video,
+            protocol.prompt_frames,
+            estimated=estimated.get(suffix),
+            second_take=retakes,
+            settings=trained.config.eval,
+            truth_cache=truth_cache,
+        )
+        if locate is not None:
+            scenes[suffix] = replace(scenes[suffix], located=locate(shown[suffix], suffix == ""))
+    alternatives = {
+        kind: [scaled(video, protocol.resolution) for video in draws] for kind, draws in videos.items() if kind != OWN
+    }
+    scenes[""] = replace(scenes[""], alternatives=alternatives, teacher_forced=predicted_tokens)
+    return scenes
 
 
-def save(path: Path, result: Evaluation) -> None:
-    """Writes a result atomically."""
-    values = {name: getattr(result, name) for name in ("metrics", "reasons", "per_clip", "curves")}
-    write_atomically(path, encode(values | result.shown))
-
-
-def load(path: Path) -> Evaluation:
-    """Reads a result written by :func:`save`.
+def scored_frames(
+    trained: TrainedModel, protocol: Protocol, clips: Clips, reconstruction: Video | None = None
+) -> Video:
+    """Returns what predictions are compared with: recorded frames or their reconstruction, with recorded depth.
 
     Raises:
-        StoreError: the file is damaged.
+        UserError: the protocol compares with reconstructions, and the model has no tokenizer.
     """
-    try:
-        record = decode(path.read_bytes())
-    except ValueError as error:
-        raise StoreError(f"{path}: damaged ({error}); delete it and run again") from error
-    metrics, reasons = record.pop("metrics"), record.pop("reasons")
-    # Files of earlier versions have neither of the following two.
-    per_clip, curves = record.pop("per_clip", {}), record.pop("curves", {})
-    return Evaluation(metrics, reasons, record, per_clip, curves)
+    truth = clips.metric_video
+    if protocol.reference == "reconstruction":
+        if reconstruction is None:
+            reconstruction = trained.model.reconstruct(trained.assets, clips.video)
+        if reconstruction is None:
+            raise UserError(
+                f"protocol {protocol.name} compares with the tokenizer's reconstruction, and a model of family "
+                f"{trained.config.model.family!r} has no tokenizer; choose another protocol"
+            )
+        truth = Video(reconstruction.rgb, truth.depth)
+    return scaled(truth, protocol.resolution)
+
+
+def locating(trained: TrainedModel, store: Store, records: Sequence[Record], last: int) -> Locate | None:
+    """Trains a localiser and returns a function that pairs its reading of a video's last frames with the truth.
+
+    Returns None if the clips do not record where cube and gripper are.
+
+    Args:
+        store: the store of the run; the localiser learns from its training clips.
+        records: the scored clips.
+        last: the index of the last frame that is scored.
+    """
+    recorded = recorded_places(records)
+    if recorded is None:
+        return None
+    train = store.source("train")
+    clips = [clip for _, clip in readable(train, spread(train, LOCALISER_CLIPS))]
+    if recorded_places(clips) is None:
+        return None
+    places, width = recorded
+    truth = Places(places.xy[:, last], places.lifted[:, last])
+    localiser = train_localiser(clips, trained.config.eval.localiser_steps)
+    on_truth = localiser(np.stack([record["rgb"][last] for record in records]))
+
+    def locate(video: Video, own: bool) -> Located:
+        return Located(truth, width, on_truth if own else None, localiser(video.rgb[:, -1]))
+
+    return locate
+
+
+def _repeat_first(video: Video, prompt_frames: int) -> Video:
+    """Returns a video that repeats the last prompt frame: the baseline without motion."""
+    last = video.frames(prompt_frames - 1, prompt_frames)
+    frames = video.rgb.shape[1]
+    if last.depth is None:
+        return Video(np.repeat(last.rgb, frames, 1))
+    return Video(np.repeat(last.rgb, frames, 1), np.repeat(last.depth, frames, 1))
+
+
+def scaled(video: Video, side: int) -> Video:
+    """Returns a video resized to ``side`` pixels per side: RGB by area means, depth by nearest neighbour."""
+    if video.rgb.shape[2] == side:
+        return video
+    lead = video.rgb.shape[:2]
+    rgb = [cv2.resize(frame, (side, side), interpolation=cv2.INTER_AREA) for frame in np.concatenate(video.rgb)]
+    if video.depth is None:
+        return Video(np.stack(rgb).reshape(*lead, side, side, 3))
+    depth = [cv2.resize(frame, (side, side), interpolation=cv2.INTER_NEAREST) for frame in np.concatenate(video.depth)]
+    return Video(np.stack(rgb).reshape(*lead, side, side, 3), np.stack(depth).reshape(*lead, side, side))
+
+
+# The scores of all metrics: over clips, over repetitions, and for the best of several samples.
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The clips' scores, and the reasons for missing scores.
+
+    Attributes:
+        values: metric → name in metrics.json → each clip's score, or one score of the whole set as an array without
+            axes; for the prediction and for both baselines.
+        reasons: why a registered metric has no score, by name.
+        best: scores of the best of several samples, by name.
+    """
+
+    values: Mapping[str, Mapping[str, PerClip]]
+    reasons: dict[str, str]
+    best: Mapping[str, PerClip]
+
+    def per_clip(self) -> dict[str, PerClip]:
+        """Returns the clips' scores by name, without scores of the whole set."""
+        scores: dict[str, PerClip] = {}
+        for values in self.values.values():
+            scores |= values
+        scores |= self.best
+        return {name: each for name, each in scores.items() if each.ndim}
+
+
+def score_all(scenes: Mapping[str, Scene], protocol: Protocol, takes_actions: bool = True) -> Scored:
+    """Scores the prediction and both baselines with all registered metrics.
+
+    Args:
+        takes_actions: False for a model without actions, which metrics that need other actions cannot score.
+    """
+    values = {}
+    reasons = {}
+    for metric in metrics().values():
+        try:
+            if metric.needs and not takes_actions:
+                raise Unavailable("the model takes no actions")
+            values[metric.name] = _score(metric, scenes, protocol)
+        except Unavailable as reason:
+            reasons[metric.name] = str(reason)
+    return Scored(values, reasons, {})
+
+
+def _score(metric: Metric, scenes: Mapping[str, Scene], protocol: Protocol) -> dict[str, PerClip]:
+    """Returns a metric's scores of the prediction and of both baselines, by name.
+
+    Raises:
+        Unavailable: the prediction cannot be scored. A baseline that cannot be scored is left out.
+    """
+    if not scenes[""].alternatives.keys() >= set(metric.needs):
+        raise Unavailable(f"protocol {protocol.name} generates no videos under other actions")
+    scores = _named(metric, scenes[""], "")
+    if metric.needs:  # the first frame repeated ignores actions
+        still = f"{metric.name}_repeat_first"
+        return scores | {still + name.removeprefix(metric.name): np.zeros_like(each) for name, each in scores.items()}
+    for suffix in filter(None, scenes):
+        with suppress(Unavailable):
+            scores |= _named(metric, scenes[suffix], suffix)
+    return scores
+
+
+def _named(metric: Metric, scene: Scene, suffix: str) -> dict[str, PerClip]:
+    assert metric.function is not None
+    scored = metric.function(scene)
+    parts = scored if isinstance(scored, dict) else {"": scored}
+    return {f"{metric.name}{suffix}{part}": np.asarray(per_clip) for part, per_clip in parts.items()}
+
+
+def sample_scores(truth: Video, video: Video, protocol: Protocol, settings: EvalConfig) -> dict[str, PerClip]:
+    """Scores one sample of each clip with the pixel metrics, over all frames: prompt frames as the model sees them."""
+    scene = Scene(truth, scaled(video, protocol.resolution), 0, settings=settings)
+    scores = {}
+    for name in PIXELS:
+        with suppress(Unavailable):
+            scores[name] = _named(metrics()[name], scene, "")[name]
+    return scores
+
+
+def with_best(scored: Scored, scene: Scene, samples: Sequence[Mapping[str, PerClip]], protocol: Protocol) -> Scored:
+    """Adds the best score over all samples for each pixel metric; adds nothing if there is only one sample.
+
+    ``NAME_best100_incl_ctx`` takes each clip's best sample separately for each metric, over all frames, as iVideoGPT
+    does; ``NAME_n1_pred_only`` is the first sample's score over the predicted frames only.
+
+    Args:
+        scene: with the first sample as its prediction.
+        samples: the scores of the further samples.
+    """
+    if not samples:
+        return scored
+    first = sample_scores(scene.truth, scene.prediction, protocol, scene.settings)
+    best = {}
+    for name, values in first.items():
+        reduce = np.max if metrics()[name].better == "higher" else np.min
+        everything = np.stack([values, *(sample[name] for sample in samples)])
+        best[f"{name}_best{len(everything)}_incl_ctx"] = reduce(everything, axis=0)
+        best[f"{name}_n1_pred_only"] = scored.values[name][name]
+    return Scored(scored.values, scored.reasons, best)
+
+
+def mean_scores(repetitions: Sequence[Scored]) -> Scored:
+    """Returns each clip's mean scores over repetitions with different random draws."""
+    if len(repetitions) == 1:
+        return repetitions[0]
+
+    def mean(maps: Sequence[Mapping[str, PerClip]]) -> dict[str, PerClip]:
+        return {name: np.mean([each[name] for each in maps], axis=0) for name in maps[0]}
+
+    values = {name: mean([each.values[name] for each in repetitions]) for name in repetitions[0].values}
+    return Scored(values, repetitions[0].reasons, mean([each.best for each in repetitions]))
+
+
+def summarised(scored: Scored, interval: bool = True) -> dict[str, float]:
+    """Returns each score's mean or median over clips by name, and its interval as ``NAME_low`` and ``NAME_high``."""
+    flat: dict[str, float] = {}
+    for metric in (metrics()[name] for name in scored.values):
+        for name, values in scored.values[metric.name].items():
+            if not values.ndim:  # one number for all clips
+                flat[name] = float(values)
+                continue
+            estimate = bootstrap(values, statistic=metric.statistic)
+            flat |= estimate.flat(name) if metric.interval and interval else {name: estimate.value}
+    for name, values in scored.best.items():
+        estimate = bootstrap(values)
+        flat |= estimate.flat(name) if interval else {name: estimate.value}
+    return flat
+
+
+# Curves over the predicted frames: the mean over clips at each frame, with a bootstrap band.
+
+
+def frame_curves(scenes: Mapping[str, Scene]) -> Curves:
+    """Returns the curves of all metrics that score single frames, for every scene; ``scenes`` is keyed by suffix."""
+    prompt = scenes[""].prompt_frames
+    frames = scenes[""].truth.rgb.shape[1]
+    curves: Curves = {"frame": list(range(prompt + 1, frames + 1))}
+    for metric in metrics().values():
+        if metric.per_frame is None:
+            continue
+        for suffix, scene in scenes.items():
+            if not scene.alternatives.keys() >= set(metric.needs):
+                continue  # a baseline has no videos under other actions
+            with suppress(Unavailable):
+                curves |= _curve(f"{metric.name}{suffix}", metric, scene.shared(metric.per_frame))
+    return curves
+
+
+def _curve(name: str, metric: Metric, per_frame: PerFrame) -> Curves:
+    """Returns a curve and both edges of its band; at each frame, clips without a score do not count."""
+    curve: Curves = {name: [], f"{name}_low": [], f"{name}_high": []}
+    for values in np.asarray(per_frame).T:
+        known = values[np.isfinite(values)]
+        at: dict[str, float] = {}
+        if known.size:
+            at = bootstrap(known, resamples=CURVE_RESAMPLES, statistic=metric.statistic).flat(name)
+        for key, points in curve.items():
+            points.append(at.get(key))
+    return curve
+
+
+def mean_curves(repetitions: Sequence[Curves]) -> Curves:
+    """Returns the mean of curves over repetitions, point by point; a band's edges are the means of the edges."""
+    if len(repetitions) == 1:
+        return repetitions[0]
+    mean: Curves = {}
+    for name in repetitions[0]:
+        mean[name] = []
+        for points in zip(*(curves[name] for curves in repetitions), strict=True):
+            known = [point for point in points if point is not None]
+            mean[name].append(float(np.mean(known)) if known else None)
+    return mean

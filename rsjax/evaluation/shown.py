@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from rsjax.data.clips import Clips
+from rsjax.data.clips import Clips, spread
 from rsjax.evaluation.registry import PerClip, Scene
 
 EXTREMES = 3  # clips at either end of the ranking that comparisons show
+KEPT_CLIPS = 24  # clips whose frames are kept for comparisons, spread evenly; those of :func:`extremes` are added
 
 
 def choose_clips(
@@ -30,8 +31,11 @@ def choose_clips(
     nearest = [i for i in np.argsort(np.abs(psnr - np.median(psnr)), kind="stable") if i not in worst]
     queues = [[i for i in nearest if success[i] == outcome] for outcome in (True, False)]
     typical = [queue.pop(0) for _ in nearest for queue in queues if queue][: count - len(worst)]
-    rows, ranks = np.empty(count, int), np.zeros(count, int)
-    rows[::2], rows[1::2], ranks[1::2] = typical, worst, np.arange(1, len(worst) + 1)
+    rows = np.empty(count, int)
+    rows[::2] = typical
+    rows[1::2] = worst
+    ranks = np.zeros(count, int)
+    ranks[1::2] = np.arange(1, len(worst) + 1)
     return rows, ranks
 
 
@@ -43,30 +47,50 @@ def extremes(
     Args:
         count: how many of each; fewer if they would overlap.
     """
-    order, count = np.argsort(scores, kind="stable"), min(count, len(scores) // 2)
+    order = np.argsort(scores, kind="stable")
+    count = min(count, len(scores) // 2)
     return order[:count], order[::-1][:count]
 
 
 def shown_arrays(clips: Clips, scenes: Mapping[str, Scene], psnr: PerClip, count: int) -> dict[str, np.ndarray]:
     """Returns arrays of the clips in the report, in the order of :func:`choose_clips`."""
-    ends, own, others = clips.success[:, -1], scenes[""].prediction, scenes[""].alternatives.get("other")
-    rows, ranks = choose_clips(psnr, ends, count)
+    success = clips.success[:, -1]
+    prediction = scenes[""].prediction
+    rows, ranks = choose_clips(psnr, success, count)
     arrays: dict[str, Any] = {
         "clip": clips.index[rows],
         "task": np.array(clips.task)[rows],
         "psnr": psnr[rows],
         "rank": ranks,
         "truth": clips.rgb[rows],
-        "prediction": own.rgb[rows],
+        "prediction": prediction.rgb[rows],
         "has_depth": clips.has_depth[rows],
         "metric": clips.metric[rows],
         "true_depth": clips.depth[rows],
         "tracks": clips.tracks[rows],
         "visible": clips.visible[rows],
-        "success": ends[rows],
+        "success": success[rows],
     }
-    if others:
-        arrays["other_actions"] = others[0].rgb[rows]
+    if "other" in scenes[""].alternatives:
+        arrays["other_actions"] = scenes[""].alternatives["other"][0].rgb[rows]
     if "_tokenizer" in scenes:
         arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
-    return arrays | ({} if own.depth is None else {"predicted_depth": own.depth[rows]})
+    if prediction.depth is not None:
+        arrays["predicted_depth"] = prediction.depth[rows]
+    return arrays
+
+
+def kept_frames(scenes: Mapping[str, Scene], still: PerClip) -> dict[str, np.ndarray]:
+    """Returns the frames of some clips: clips spread evenly, and those with the most and the least motion.
+
+    The choice is the same for all models.
+
+    Args:
+        still: PSNR of the last prompt frame repeated, which does not depend on the model.
+    """
+    truth = scenes[""].truth.rgb
+    rows = np.union1d(spread(truth, KEPT_CLIPS), np.concatenate(extremes(still)))
+    arrays = {"rows": rows, "truth": truth[rows], "prediction": scenes[""].prediction.rgb[rows]}
+    if "_tokenizer" in scenes:
+        arrays["reconstruction"] = scenes["_tokenizer"].prediction.rgb[rows]
+    return arrays

@@ -7,16 +7,17 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import EvalConfig, SampleConfig
-from rsjax.data.codec import Record, encode
+from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.evaluate import Evaluation, HeldOut, evaluate
+from rsjax.evaluation.evaluate import HeldOut, evaluate
 from rsjax.evaluation.generation import Batch, Generation, rolled_out
 from rsjax.evaluation.metrics.delta_psnr import other_clips
 from rsjax.evaluation.metrics.psnr import psnr as pixels
 from rsjax.evaluation.protocols import PAPER, find, of_run
 from rsjax.evaluation.registry import metrics
+from rsjax.evaluation.results import Evaluation, load_evaluation, save_evaluation
 from rsjax.evaluation.shown import choose_clips
 from rsjax.models.trained import TrainedModel
 from tests.tools.pipeline import toy
@@ -144,23 +145,15 @@ def test_scores_of_single_clips_and_frames_have_the_scores_as_their_means(result
 
 def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, tmp_path: Path) -> None:
     path = tmp_path / "result.msgpack"
-    evaluation.save(path, result)
-    again = evaluation.load(path)
+    save_evaluation(path, result)
+    again = load_evaluation(path)
     for name in ("metrics", "reasons", "per_clip", "curves"):
         assert getattr(again, name) == getattr(result, name)
     for name, array in result.shown.items():
         np.testing.assert_array_equal(again.shown[name], array)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(StoreError, match=r"result.msgpack: damaged \(its checksum is wrong\); delete it"):
-        evaluation.load(path)
-
-
-def test_a_result_without_curves_is_read(tmp_path: Path) -> None:
-    """Earlier versions wrote neither curves nor the scores of single clips."""
-    (tmp_path / "old").write_bytes(encode({"metrics": {"psnr": 20.0}, "reasons": {}, "clip": np.arange(2)}))
-    old = evaluation.load(tmp_path / "old")
-    assert (old.metrics, old.per_clip, old.curves) == ({"psnr": 20.0}, {}, {})
-    assert old.shown.keys() == {"clip"}
+        load_evaluation(path)
 
 
 def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
@@ -179,7 +172,7 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
         return generate(self, batch)
 
     monkeypatch.setattr(Generation, "_generate", counted)
-    monkeypatch.setattr(evaluation, "KEPT_CLIPS", 2)
+    monkeypatch.setattr("rsjax.evaluation.shown.KEPT_CLIPS", 2)
     # A second take that is the first one sets the limits 1, 1, 1 and 0.
     again = evaluate(trained, clips, held_out=replace(held_out, retakes=held_out.clips.video), folder=tmp_path)
     assert [batch.name for batch in made] == [files[4].name]

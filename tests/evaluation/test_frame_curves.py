@@ -7,7 +7,7 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.evaluation import registry
-from rsjax.evaluation.frame_curves import frame_curves
+from rsjax.evaluation.evaluate import frame_curves
 from rsjax.evaluation.registry import Scene, Unavailable, metric
 from rsjax.evaluation.statistics import bootstrap
 
@@ -19,7 +19,7 @@ VALUES[:, 2] = np.nan
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """The registry is empty during each test."""
-    monkeypatch.setattr("rsjax.evaluation.frame_curves.metrics", lambda: registry._METRICS)
+    monkeypatch.setattr("rsjax.evaluation.evaluate.metrics", lambda: registry._METRICS)
     monkeypatch.setattr(registry, "_METRICS", {})
 
 

@@ -16,10 +16,10 @@ from rsjax.config import Config, EvalConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, open_store
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.evaluate import HeldOut
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
-from rsjax.evaluation.results import NAME, fingerprint, read_result, result_of, write_result
+from rsjax.evaluation.results import NAME, Evaluation, fingerprint, read_result, result_of, write_result
 from rsjax.files import FileError, disk_guard, lock, safe_id
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel

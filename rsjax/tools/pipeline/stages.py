@@ -7,7 +7,7 @@ from rsjax.config import Config, LoopConfig
 from rsjax.data.curriculum import check_stages
 from rsjax.data.normalization import Normalization
 from rsjax.data.quarantine import NAME as QUARANTINE
-from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_autoencoder, create_model
 from rsjax.models.load_run import load_tokenizer
@@ -190,4 +190,4 @@ def train_world_model(run: Run, resume: bool) -> None:
 def evaluate(run: Run) -> None:
     """Stage 5: computes the scores, and the arrays of the report."""
     with disk_guard(run.directory):
-        evaluation.save(run.output("evaluation"), evaluate_own(run))
+        save_evaluation(run.output("evaluation"), evaluate_own(run))

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from rsjax.config import Config, to_dict
-from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.results import Evaluation, load_evaluation
 from rsjax.files import write_json
 from rsjax.models.roboscape.keypoints import motion_magnitude
 from rsjax.tools.pipeline.provenance import read_starts
@@ -23,7 +23,7 @@ def write_summary(run: Run, command: str) -> None:
     Args:
         command: the command that repeats the run.
     """
-    result = evaluation.load(run.output("evaluation"))
+    result = load_evaluation(run.output("evaluation"))
     seconds = {stage: run.mark(stage)["seconds"] for stage in STAGES[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
@@ -46,7 +46,7 @@ def write_summary(run: Run, command: str) -> None:
     write_json(run.directory / "curves.json", result.curves)
 
 
-def _figure(result: evaluation.Evaluation, row: int, config: Config) -> ClipFigure:
+def _figure(result: Evaluation, row: int, config: Config) -> ClipFigure:
     shown = result.shown
     names = ["truth", "prediction", "reconstruction", "other_actions"]
     names += ["true_depth", "predicted_depth"] if shown["has_depth"][row] else []

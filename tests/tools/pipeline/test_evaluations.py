@@ -17,9 +17,9 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator
-from rsjax.evaluation.evaluate import Evaluation, HeldOut
+from rsjax.evaluation.evaluate import HeldOut
 from rsjax.evaluation.protocols import Protocol, find
-from rsjax.evaluation.results import read_frames, read_result
+from rsjax.evaluation.results import Evaluation, read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.runtime import HUGE_PAGES

@@ -13,9 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from rsjax.errors import UserError
-from rsjax.evaluation.frame_curves import Curves
 from rsjax.evaluation.registry import Footnotes, Metric
-from rsjax.evaluation.results import read_frames
+from rsjax.evaluation.results import Curves, read_frames
 from rsjax.evaluation.shown import extremes
 from rsjax.files import write_file
 from rsjax.progress import note

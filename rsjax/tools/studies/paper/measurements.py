@@ -12,8 +12,8 @@ from typing import Any
 
 from rsjax.config import Config, require
 from rsjax.errors import UserError
-from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.registry import Unavailable
+from rsjax.evaluation.results import load_evaluation
 from rsjax.files import FileError, read_json, write_json
 from rsjax.progress import note
 from rsjax.tools.pipeline.run import Run
@@ -86,7 +86,7 @@ def read_scores(run: Run, name: str) -> tuple[Scores, str]:
     """
     try:
         if not name:
-            return evaluation.load(run.output("evaluation")).per_clip, ""
+            return load_evaluation(run.output("evaluation")).per_clip, ""
         saved = read_json(_path(run, name))
     except (UserError, OSError) as error:
         return {}, f"no {name or 'evaluation'} yet" if isinstance(error, (FileError, OSError)) else str(error)

@@ -8,8 +8,8 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from rsjax.evaluation.frame_curves import Curves
 from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
+from rsjax.evaluation.results import Curves
 from rsjax.files import write_file
 from rsjax.progress import duration
 from rsjax.tools.studies.report.curves import curves_svg

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from rsjax.evaluation.frame_curves import Curves
 from rsjax.evaluation.registry import Metric
+from rsjax.evaluation.results import Curves
 from rsjax.tools.studies.report.curves import INK, LINE, Chart, charts_svg
 
 # What is scored, by the suffix of a score's name.

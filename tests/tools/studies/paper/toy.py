@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rsjax.config import Config, RoboScapeConfig, presets
-from rsjax.evaluation import evaluate as evaluation
+from rsjax.evaluation.results import Evaluation, save_evaluation
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.paper import budget, report
@@ -58,8 +58,8 @@ def stub_stages(monkeypatch: pytest.MonkeyPatch, record: Path, gain: float = 0.5
         psnr = clips + gain * on + draw + noise * np.random.default_rng([seed, on, 1]).normal()
         per_clip = {"psnr": psnr.tolist(), "physics_iq_spatial": [0.5] * CLIPS}
         means = {name: float(np.mean(numbers)) for name, numbers in per_clip.items()}
-        result = evaluation.Evaluation(means, {"ssim": "a toy"}, {}, per_clip)
-        evaluation.save(run.output("evaluation"), result)
+        result = Evaluation(means, {"ssim": "a toy"}, {}, per_clip)
+        save_evaluation(run.output("evaluation"), result)
         (run.directory / "metrics.json").write_text(json.dumps(result.metrics | {"reasons": result.reasons}))
 
     monkeypatch.setattr(stages, "run_all", scored)
