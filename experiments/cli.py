@@ -14,7 +14,7 @@ from rsjax.command import main_errors as main_errors  # every command imports ma
 from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
 from rsjax.config.config_fields import config_fields
-from rsjax.config.curriculum import format_stage, parse_stage
+from rsjax.config.curriculum import read_curriculum, write_curriculum
 from rsjax.errors import did_you_mean
 
 Options = TypeVar("Options")
@@ -34,7 +34,7 @@ FIRST_FIELDS = {
     "model.use-depth": "Whether the model has a depth branch.",
     "model.action-encoder": "How the model reads actions.",
     "train.steps": "Training steps of the world model.",
-    "train.curriculum": "A curriculum, one word per stage: simple:2 difficult:3 (docs/training.md); no word: none.",
+    "train.curriculum": "A curriculum: a file with a JSON list of stages, or the list (docs/training.md); []: none.",
     "train.batch-size": "Clips of a batch, over all devices.",
     "train.optimizer.learning-rate": "Peak learning rate of the world model.",
     "train.seed": "Seed of the world model's training, 0 to 4294967295.",
@@ -57,16 +57,16 @@ REGISTRY = tyro.constructors.ConstructorRegistry()
 
 
 @REGISTRY.primitive_rule
-def _stage(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
-    """Reads a stage of a curriculum from one word, such as ``difficult:3``."""
-    if info.type is not CurriculumStageConfig:
+def _curriculum(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """Reads a curriculum from one word: a JSON list of stages, or the path of a file with one."""
+    if get_args(info.type) != (CurriculumStageConfig, ...):
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
-        metavar="STAGE",
-        instance_from_str=lambda words: parse_stage(words[0]),
-        is_instance=lambda value: isinstance(value, CurriculumStageConfig),
-        str_from_instance=lambda stage: [format_stage(stage)],
+        metavar="FILE.json",
+        instance_from_str=lambda words: read_curriculum(words[0]),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda stages: [write_curriculum(stages)],
     )
 
 
@@ -128,8 +128,8 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         loop, flag = getattr(config, name), f"--{name.replace('_', '-')}"
         require(
             not loop.curriculum or loop.steps == getattr(preset, name).steps,
-            f"{flag}.steps changes nothing, as the epochs of {flag}.curriculum determine the steps; {flag}.curriculum "
-            f"without a word trains on all clips for that many steps",
+            f"{flag}.steps changes nothing, as the epochs of {flag}.curriculum determine the steps; "
+            f"{flag}.curriculum [] trains on all clips for that many steps",
         )
     return config, parsed.options
 

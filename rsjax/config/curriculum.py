@@ -1,99 +1,64 @@
-"""Reads and writes one stage of a curriculum as a word of a command line: ``simple:2``, ``difficult:3``.
+"""Reads a curriculum from JSON: a list of stages.
 
-A stage is ``PARTS:EPOCHS`` or ``PARTS:EPOCHS:restart``; ``+`` joins its parts. A part is
-``DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][#CLIPS][@STORE]``: shell patterns joined by commas (``all`` matches
-everything), a weight, how many of the clips to use (the first ones), and the directory of another store. So
-``all/pick*,place*=2+difficult@runs/b/tokens/store:1.5`` draws two picking or placing clips of the run's own for each
-difficult clip of run b, and ``all/all/kitchen*:1`` the clips in kitchens. Names that contain one of ``: + @ = / , #``
-cannot be written this way; in Python, :class:`CurriculumStageConfig` takes them.
+The paper's is ``[{"difficulties": ["simple"], "epochs": 2}, {"difficulties": ["difficult"], "epochs": 3}]``. A stage
+has the fields of :class:`CurriculumStageConfig`; those of its only component may stand beside its epochs.
 """
 
-import math
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
 
-from rsjax.config.fields import ConfigError
+from rsjax.config.fields import ConfigError, from_dict, require
 from rsjax.config.train import ComponentConfig, CurriculumStageConfig
+from rsjax.files import read_json
 
-GRAMMAR = "DIFFICULTIES[/TASKS[/SCENES]][=WEIGHT][#CLIPS][@STORE][+…]:EPOCHS[:restart]"
-EXAMPLE = "simple:2 or difficult:3"
-_COLUMNS = (("difficulties", "difficulty"), ("tasks", "task"), ("scenes", "scene"))  # field, and one of its words
+COMPONENT_FIELDS = {field.name for field in dataclasses.fields(ComponentConfig)}
+EXAMPLE = '[{"difficulties": ["simple"], "epochs": 2}]'
 
 
-def parse_stage(text: str) -> CurriculumStageConfig:
-    """Returns the stage that a word describes.
+def read_curriculum(text: str) -> tuple[CurriculumStageConfig, ...]:
+    """Returns the stages of a JSON list, or of the JSON file at this path.
 
     Raises:
-        ConfigError: the word is malformed; the message says where, and how a stage is written.
+        ConfigError: the text is no list of stages; the message names the mistake.
+        rsjax.files.FileError: the file is missing or damaged.
     """
-    body = text.removesuffix(":restart")
-    parts, colon, epochs = body.rpartition(":")
-    if not colon:
-        raise _error(text, "its epochs are missing")
-    return CurriculumStageConfig(
-        components=tuple(_parse_part(text, part) for part in parts.split("+")),
-        epochs=_number(text, "epochs", epochs),
-        restart=body != text,
-    )
+    if text.lstrip().startswith("["):
+        try:
+            entries = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"curriculum {text:.80}: not JSON ({error}); write a list such as {EXAMPLE}") from error
+    else:
+        entries = read_json(Path(text), list, cure=f"name a file with a list of stages, such as {EXAMPLE}")
+    require(isinstance(entries, list), f"curriculum {text:.80}: not a list of stages, such as {EXAMPLE}")
+    return tuple(_stage(number, entry) for number, entry in enumerate(entries, 1))
 
 
-def format_stage(stage: CurriculumStageConfig) -> str:
-    """Returns the word that describes a stage; the inverse of :func:`parse_stage`."""
-    parts = "+".join(_format_part(part) for part in stage.components)
-    return f"{parts}:{_plain(stage.epochs)}{':restart' if stage.restart else ''}"
-
-
-def _parse_part(text: str, part: str) -> ComponentConfig:
-    body, at, store = part.partition("@")
-    if at and not store:
-        raise _error(text, "nothing follows its @")
-    body, number_sign, clips = body.partition("#")
-    labels, equals, weight = body.partition("=")
-    words = labels.split("/")
-    if len(words) > len(_COLUMNS):
-        raise _error(text, f"{'/'.join(words[len(_COLUMNS) :])!r} follows its scenes")
-    patterns = {field: _patterns(text, name, word) for (field, name), word in zip(_COLUMNS, words, strict=False)}
-    return ComponentConfig(
-        **patterns,
-        store=store,
-        weight=_number(text, "weight", weight) if equals else 1.0,
-        clips=_count(text, clips) if number_sign else 0,
-    )
-
-
-def _format_part(part: ComponentConfig) -> str:
-    words = [",".join(getattr(part, field)) for field, _ in _COLUMNS]
-    while len(words) > 1 and words[-1] == "*":
-        words.pop()
-    weight = "" if part.weight == 1 else f"={_plain(part.weight)}"
-    clips = f"#{part.clips}" if part.clips else ""
-    return f"{'/'.join(words)}{weight}{clips}{'@' if part.store else ''}{part.store}"
-
-
-def _patterns(text: str, name: str, joined: str) -> tuple[str, ...]:
-    patterns = tuple("*" if pattern == "all" else pattern for pattern in joined.split(","))
-    if "" in patterns:
-        raise _error(text, f"a {name} is empty; write all to match every {name}")
-    return patterns
-
-
-def _number(text: str, name: str, value: str) -> float:
+def _stage(number: int, entry: Any) -> CurriculumStageConfig:
     try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise _error(text, f"{name} {value!r} is not a number above 0")
-    return number
+        require(isinstance(entry, dict), f"not fields by name but {entry!r:.40}")
+        component = {name: entry[name] for name in entry if name in COMPONENT_FIELDS}
+        stage = {name: entry[name] for name in entry if name not in COMPONENT_FIELDS}
+        if component:
+            require("components" not in stage, f"{', '.join(component)} stand beside components; write them inside")
+            stage["components"] = [component]
+        return from_dict(CurriculumStageConfig, stage)
+    except ConfigError as error:
+        raise ConfigError(f"stage {number} of the curriculum: {error}") from error
 
 
-def _count(text: str, value: str) -> int:
-    if not (value.isascii() and value.isdecimal() and int(value)):
-        raise _error(text, f"{value!r} is no number of clips")
-    return int(value)
+def write_curriculum(stages: tuple[CurriculumStageConfig, ...]) -> str:
+    """Returns the JSON list of these stages, without fields at their defaults, for :func:`read_curriculum`."""
+    entries = []
+    for stage in stages:
+        components = [_changed(component) for component in stage.components]
+        entry = components[0] if len(components) == 1 else {"components": components}
+        entries.append(entry | {"epochs": stage.epochs} | ({"restart": True} if stage.restart else {}))
+    return json.dumps(entries)
 
 
-def _plain(value: float) -> str:
-    return repr(float(value)).removesuffix(".0")
-
-
-def _error(text: str, reason: str) -> ConfigError:
-    return ConfigError(f"stage {text!r}: {reason}; write {GRAMMAR}, such as {EXAMPLE}")
+def _changed(component: ComponentConfig) -> dict[str, Any]:
+    values = {field.name: getattr(component, field.name) for field in dataclasses.fields(ComponentConfig)}
+    default = ComponentConfig()
+    return {name: value for name, value in values.items() if value != getattr(default, name)}

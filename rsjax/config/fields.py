@@ -141,6 +141,9 @@ def _read(name: str, hint: Any, value: Any) -> Any:
     elif hint in _JSON_KINDS:
         text, allowed = _JSON_KINDS[hint]
         expect(type(value) in allowed, text)
+        if hint is float and isinstance(value, int):
+            expect(abs(value) < 2**63, "a number that fits in 64 bits")
+            return float(value)
     return value
 
 

@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 from rsjax.config import (
+    ComponentConfig,
     Config,
     ConfigError,
+    CurriculumStageConfig,
     Departures,
     EvalConfig,
     GenieConfig,
@@ -19,7 +21,6 @@ from rsjax.config import (
     TokenizerTrainConfig,
     TrainConfig,
 )
-from rsjax.config.curriculum import parse_stage
 from rsjax.config.metaworld import ML10, ML10_UNSEEN
 from rsjax.config.run import FULL_SIZE_EVAL
 from rsjax.errors import did_you_mean
@@ -187,7 +188,10 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
     Curriculum: the authors' 2 epochs of simple tasks, then 3 of difficult ones, for their own model. Steps without one:
     5 epochs of 6.5 million clips, at a batch of 256.
     """
-    curriculum = ("simple:2", "difficult:3") if isinstance(model, RoboScapeConfig) else ()
+    simple_then_difficult = (
+        CurriculumStageConfig((ComponentConfig(difficulties=("simple",)),), 2.0),
+        CurriculumStageConfig((ComponentConfig(difficulties=("difficult",)),), 3.0),
+    )
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
@@ -210,7 +214,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
         train=TrainConfig(
             steps=127_000,
-            curriculum=tuple(map(parse_stage, curriculum)),
+            curriculum=simple_then_difficult if isinstance(model, RoboScapeConfig) else (),
             batch_size=256,
             optimizer=OptimizerConfig(betas=(0.9, 0.999), schedule="linear", final_share=0.0),
         ),

@@ -95,8 +95,7 @@ class TrainConfig:
     # may be 0, which uses the weights unchanged. The content key covers the path, not the files.
     start_from: str = ""
     # A curriculum, stage after stage, whose epochs determine the number of steps (``steps`` is ignored; commands refuse
-    # a change of it). Empty: all clips of this run for ``steps`` steps. rsjax/config/curriculum.py says how a stage is
-    # written on the command line.
+    # a change of it). Empty: all clips of this run for ``steps`` steps. On the command line: a file of JSON.
     curriculum: tuple[CurriculumStageConfig, ...] = ()
     accumulate: int = runtime(1)  # parts of a batch computed one after another; raise it where memory runs out
 

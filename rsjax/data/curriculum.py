@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig, TrainConfig
-from rsjax.config.curriculum import format_stage
 from rsjax.data.loader import Loader
 from rsjax.data.order import Arrays, CurriculumStage, MixtureComponent, Readable, Transform, place_of
 from rsjax.data.quarantine import NAME, Quarantine
@@ -44,12 +43,13 @@ class LoaderFactory:
             return next(loader)
 
     def summary(self) -> list[str]:
-        """Returns a line for each stage of the config, with its number of clips and its steps."""
-        lines, first = [], 0
-        for config, stage in zip(self.loop.curriculum, self.stages, strict=False):
+        """Returns a line for each stage of the curriculum, with its number of clips and its steps."""
+        lines = []
+        first = 0
+        for number, stage in enumerate(self.stages[: len(self.loop.curriculum)], 1):
             last = first + stage.records // self.loop.batch_size
             clips = " + ".join(str(len(part)) for part in stage.components)
-            lines.append(f"stage {format_stage(config)}: {clips} clips, steps {first + 1} to {last}")
+            lines.append(f"stage {number} of the curriculum: {clips} clips, steps {first + 1} to {last}")
             first = last
         return lines
 
@@ -125,7 +125,7 @@ def choose(part: ComponentConfig, store: Store) -> np.ndarray | None:
         wanted = " and ".join(f"a {name} like {' or '.join(allowed)}" for name, allowed in patterns.items())
         raise StoreError(
             f"{store.path}: no {SPLIT} record has {wanted}; it has {listed}: change the stage's patterns "
-            f"(--train.curriculum all:5 reads everything), or label the clips when you ingest them "
+            f"(an entry without patterns reads everything), or label the clips when you ingest them "
             f"(--difficulty, --scene)"
         )
     return chosen[: part.clips or None]

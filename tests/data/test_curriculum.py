@@ -8,16 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import ComponentConfig, LoopConfig
-from rsjax.config.curriculum import parse_stage
+from rsjax.config import ComponentConfig, CurriculumStageConfig, LoopConfig
 from rsjax.data.codec import Record
 from rsjax.data.curriculum import check_stages, choose, plan
 from rsjax.data.order import Arrays
 from rsjax.data.store import Store, StoreError, open_store, write_store
+from tests.curricula import PAPER, mixed, stage
 from tests.data import toy
 from tests.data.toy import assert_same, jitter, take
 
 COUNT = 30
+EVERYTHING = stage()
+SIMPLE = stage("simple")
 MEANT = {"pick*": {"pick up", "pick out"}, "*": set(toy.TASKS)} | {task: {task} for task in toy.TASKS}
 
 
@@ -30,8 +32,8 @@ def transform(store: Store) -> Any:
     return jitter
 
 
-def loop(*stages: str, **fields: Any) -> LoopConfig:
-    return LoopConfig(batch_size=4, curriculum=tuple(map(parse_stage, stages)), **fields)
+def loop(*stages: CurriculumStageConfig, **fields: Any) -> LoopConfig:
+    return LoopConfig(batch_size=4, curriculum=stages, **fields)
 
 
 @given(st.sets(st.sampled_from(sorted(MEANT))), st.sets(st.sampled_from(toy.DIFFICULTIES)))
@@ -57,13 +59,13 @@ def test_a_number_of_clips_takes_the_first_that_pass(own: Store) -> None:
     assert all_of_them is not None and few is not None and few.tolist() == all_of_them[:3].tolist()
     enough = choose(ComponentConfig(clips=COUNT + 5), own)
     assert enough is not None and len(enough) == COUNT
-    assert plan(loop("all#8:3"), own, transform, own.path)[0].steps == 8 * 3 // 4
+    assert plan(loop(stage(epochs=3.0, clips=8)), own, transform, own.path)[0].steps == 8 * 3 // 4
 
 
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
     for check in (
-        lambda: check_stages(loop("hard/pick*:1"), own),
-        lambda: plan(loop("hard/pick*:1"), own, transform, own.path),
+        lambda: check_stages(loop(stage("hard", tasks=("pick*",))), own),
+        lambda: plan(loop(stage("hard", tasks=("pick*",))), own, transform, own.path),
     ):
         with pytest.raises(StoreError) as caught:
             check()
@@ -81,7 +83,7 @@ def test_a_stage_can_choose_scenes_where_the_store_names_them(own: Store, tmp_pa
         {},
         lambda r: {"scene": f"room {r['i'] % 3}"},
     )
-    (part,) = parse_stage("all/all/room 1,room 2:1").components
+    part = ComponentConfig(scenes=("room 1", "room 2"))
     chosen = choose(part, open_store(tmp_path / "scenes"))
     assert chosen is not None and chosen.tolist() == [1, 2, 4, 5, 7, 8]
     with pytest.raises(StoreError, match="its records name no scene, only task, difficulty; make it again"):
@@ -99,17 +101,18 @@ def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
 ) -> None:
     """Epochs in tenths, so that no rounding of floats may add a batch."""
     sizes = {"simple": 15, "all": 30, "difficult/pick*": 10}
-    words = [f"{part}:{tenths / 10}{':restart' if restart else ''}" for part, tenths, restart in stages]
+    parts = {"simple": SIMPLE, "all": EVERYTHING, "difficult/pick*": stage("difficult", tasks=("pick*",))}
+    entries = [replace(parts[part], epochs=tenths / 10, restart=restart) for part, tenths, restart in stages]
     steps = [-(-sizes[part] * tenths // (10 * batch_size)) for part, tenths, _ in stages]
     firsts = np.cumsum([0, *steps]).tolist()
-    planned, feed = plan(replace(loop(*words), batch_size=batch_size), own, transform, own.path)
+    planned, feed = plan(replace(loop(*entries), batch_size=batch_size), own, transform, own.path)
     assert planned.steps == sum(steps)
     assert planned.restarts == tuple(f for f, (_, _, restart) in zip(firsts, stages, strict=False) if restart and f)
     assert len(feed.summary()) == len(stages)
 
 
 def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_difficult_one_three_times(own: Store) -> None:
-    planned, feed = plan(replace(loop("simple:2", "difficult:3"), batch_size=5), own, transform, own.path)
+    planned, feed = plan(replace(loop(*PAPER), batch_size=5), own, transform, own.path)
     assert (planned.steps, planned.restarts) == (6 + 9, ())
     with feed(None) as loader:
         taken = take(loader, planned.steps)["i"]
@@ -117,15 +120,15 @@ def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_diffic
     np.testing.assert_array_equal(np.sort(taken[:6].ravel()), np.repeat(simple, 2))
     np.testing.assert_array_equal(np.sort(taken[6:].ravel()), np.repeat(difficult, 3))
     assert feed.summary() == [
-        "stage simple:2: 15 clips, steps 1 to 6",
-        "stage difficult:3: 15 clips, steps 7 to 15",
+        "stage 1 of the curriculum: 15 clips, steps 1 to 6",
+        "stage 2 of the curriculum: 15 clips, steps 7 to 15",
     ]
 
 
 def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
     plain, feed = plan(loop(steps=7), own, transform, own.path)
     assert plain == loop(steps=7) and feed.summary() == []
-    one, same = plan(loop("all:1"), own, transform, own.path)
+    one, same = plan(loop(EVERYTHING), own, transform, own.path)
     assert one.steps == 8
     with feed(None) as left, same(None) as right:
         assert_same(take(left, 10), take(right, 10))
@@ -134,7 +137,7 @@ def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
 @settings(max_examples=5)
 @given(st.integers(0, 20))
 def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store, number: int) -> None:
-    _, feed = plan(loop("simple+difficult=2:1", "all:1"), own, transform, own.path)
+    _, feed = plan(loop(mixed({"simple": 1.0, "difficult": 2.0}), EVERYTHING), own, transform, own.path)
     with feed(None) as loader:
         for _ in range(number):
             next(loader)
@@ -147,7 +150,9 @@ def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store,
 
 def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path) -> None:
     other = toy.store(tmp_path / "other", 6, first=100, tokenizer="a")
-    _, feed = plan(loop(f"simple=1+all=3@{other.path}:1"), own, transform, tmp_path)
+    simple = ComponentConfig(difficulties=("simple",))
+    parts = (simple, ComponentConfig(store=str(other.path), weight=3.0))
+    _, feed = plan(loop(CurriculumStageConfig(parts)), own, transform, tmp_path)
     with feed(None) as loader:
         for _ in range(5):
             arrays = next(loader)
@@ -159,16 +164,16 @@ def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path
 def test_stores_that_do_not_go_together_are_refused(own: Store, tmp_path: Path) -> None:
     toy.store(tmp_path / "other", 3, tokenizer="b")
     with pytest.raises(StoreError, match="its tokenizer is b, that of .* is a"):
-        plan(loop(f"all@{tmp_path}/other:1"), own, transform, tmp_path)
+        plan(loop(stage(store=f"{tmp_path}/other")), own, transform, tmp_path)
     toy.store(tmp_path / "same", 3, tokenizer="a")
 
     def longer(store: Store) -> Any:
         return jitter if store is own else stretched
 
     with pytest.raises(StoreError, match=r"its i is int64 \(2,\), that of .* is int64 \(\)"):
-        plan(loop(f"all@{tmp_path}/same:1"), own, longer, tmp_path)
+        plan(loop(stage(store=f"{tmp_path}/same")), own, longer, tmp_path)
     with pytest.raises(StoreError, match="nothing: not there"):
-        check_stages(loop(f"all@{tmp_path}/nothing:1"), own)
+        check_stages(loop(stage(store=f"{tmp_path}/nothing")), own)
 
 
 def stretched(record: Record, rng: np.random.Generator) -> Arrays:
@@ -178,22 +183,22 @@ def stretched(record: Record, rng: np.random.Generator) -> Arrays:
 def test_a_store_without_labels_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     write_store(tmp_path / "old", "numbers", {"train": map(toy.record, range(3))}, {})
     old = open_store(tmp_path / "old")
-    assert plan(loop("all:4"), old, transform, tmp_path)[0].steps == 3
-    check_stages(loop("simple:1"), old)  # its tokens may have them
+    assert plan(loop(stage(epochs=4.0)), old, transform, tmp_path)[0].steps == 3
+    check_stages(loop(SIMPLE), old)  # its tokens may have them
     with pytest.raises(StoreError, match="names no task and difficulty"):
-        plan(loop("simple:1"), old, transform, tmp_path)
+        plan(loop(SIMPLE), old, transform, tmp_path)
 
 
 def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Path) -> None:
     own = toy.store(tmp_path / "own", 10)
     toy.damage(own.path, 4)
-    _, feed = plan(loop("simple:1", "all:1", max_damaged=0.1), own, transform, tmp_path / "stage")
+    _, feed = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.1), own, transform, tmp_path / "stage")
     for _ in range(2):
         with feed(None) as loader:
             assert 4 not in take(loader, 6)["i"]
             assert loader.quarantined() == 1
     (line,) = (tmp_path / "stage" / "quarantine.jsonl").read_text().splitlines()
     assert json.loads(line)["record"] == 4
-    _, strict = plan(loop("simple:1", "all:1", max_damaged=0.0), own, transform, tmp_path / "stage")
+    _, strict = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, transform, tmp_path / "stage")
     with strict(None) as loader, pytest.raises(StoreError, match="1 of 10 records are damaged"):
         take(loader, 6)

@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsjax.config import Config
-from rsjax.config.curriculum import parse_stage
+from rsjax.config import Config, CurriculumStageConfig
 from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_store
 from rsjax.tokenizers.tokenize import fingerprint
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run, link
 from rsjax.tools.pipeline.setup import note_curriculum, world_model_setup
+from tests.curricula import stage
 from tests.tools.pipeline import toy
 from tests.tools.pipeline.damage import damage
 
 
-def with_stages(config: Config, *words: str) -> Config:
-    train = replace(config.train, batch_size=2, curriculum=tuple(map(parse_stage, words)))
+def with_stages(config: Config, *stages: CurriculumStageConfig) -> Config:
+    train = replace(config.train, batch_size=2, curriculum=stages)
     return replace(config, train=train)
 
 
@@ -44,11 +44,11 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
     (line,) = (run.directory / "tokens" / "quarantine.jsonl").read_text().splitlines()
     assert '"record": 1' in line
     with pytest.raises(StoreError, match="it has difficulty 'unknown' 2×"):
-        world_model_setup(replace(run, config=with_stages(run.config, "simple:2")))
-    setup = world_model_setup(replace(run, config=with_stages(run.config, "unknown/dri*:3")))
+        world_model_setup(replace(run, config=with_stages(run.config, stage("simple", 2.0))))
+    setup = world_model_setup(replace(run, config=with_stages(run.config, stage("unknown", 3.0, tasks=("dri*",)))))
     assert setup.loop.steps == 3
     note_curriculum(setup.loader)
-    assert "note: stage unknown/dri*:3: 2 clips, steps 1 to 3" in capsys.readouterr().out
+    assert "note: stage 1 of the curriculum: 2 clips, steps 1 to 3" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
 def test_tokens_of_another_store_are_normalized_as_the_runs_own(
     changes: dict[str, Any], noted: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = Run(with_stages(toy.config(), f"all@{tmp_path / 'other'}:1"), tmp_path / "run", tmp_path / "data")
+    run = Run(with_stages(toy.config(), stage(store=str(tmp_path / "other"))), tmp_path / "run", tmp_path / "data")
     small_store(tmp_path / "own", {})
     other = small_store(tmp_path / "other", changes)
     run.output("tokens").parent.mkdir(parents=True)
@@ -81,7 +81,7 @@ def small_store(path: Path, changes: dict[str, Any]) -> Store:
 def test_a_mistyped_stage_is_an_error_before_the_tokenizer_is_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = Run(with_stages(toy.config(), "hard:1"), tmp_path / "run", tmp_path / "data")
+    run = Run(with_stages(toy.config(), stage("hard")), tmp_path / "run", tmp_path / "data")
     write_store(
         run.clips, "clips", {"train": [encode_clip(toy.clip(0))]}, {}, lambda clip: {"task": "", "difficulty": "simple"}
     )

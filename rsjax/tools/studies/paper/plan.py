@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from rsjax.config import Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
+from rsjax.config import ComponentConfig, Config, ConfigError, CurriculumStageConfig, SimConfig, metaworld, presets
 from rsjax.config.config_fields import with_values
-from rsjax.config.curriculum import parse_stage
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.sim import expert
 from rsjax.tools.studies.ablation.grid import SEED, Value, cell_name
@@ -194,7 +193,7 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
     clips, drawn = config.sim.episodes - config.sim.test_episodes, config.train.steps * config.train.batch_size
     if arm.data < 1:
         some = max(1, round(arm.data * clips))
-        return (parse_stage(f"all#{some}:{drawn / some!r}"),)
+        return (CurriculumStageConfig((ComponentConfig(clips=some),), drawn / some),)
     if not arm.curriculum:
         return ()
     simple = _simple_share(config.sim)
@@ -203,9 +202,12 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
     read = {name: number * expected[name] for name, number in epochs.items()}
     factor = drawn / sum(read.values())
     if arm.mixed:
-        parts = "+".join(f"{name}={number!r}" for name, number in read.items())
-        return (parse_stage(f"{parts}:{drawn / clips!r}"),)
-    return tuple(parse_stage(f"{name}:{number * factor!r}") for name, number in epochs.items())
+        parts = tuple(ComponentConfig(difficulties=(name,), weight=number) for name, number in read.items())
+        return (CurriculumStageConfig(parts, drawn / clips),)
+    return tuple(
+        CurriculumStageConfig((ComponentConfig(difficulties=(name,)),), number * factor)
+        for name, number in epochs.items()
+    )
 
 
 def _simple_share(sim: SimConfig) -> float:
