@@ -53,7 +53,7 @@ LONGEST = ("reliability", "pipeline", "ablation", "models", "training")
 @pytest.fixture
 def bf16_units(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes processors without bf16 units compute products in bf16 as well."""
-    monkeypatch.setattr("rsjax.layers.matmul.has_bf16_units", lambda: True)
+    monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: True)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

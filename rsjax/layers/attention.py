@@ -12,12 +12,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.frame_attention import attend_in_frames
 from rsjax.layers.unstacked_params import block_part
 
-# From this many cells of a frame, or tokens of a sequence, bf16 products in attention save more time than their
-# transposes cost.
-LARGE_FRAME = 128
 FEW = 2  # frames per pass of a rollout
 
 
@@ -74,30 +70,6 @@ def attend_few(
         rows = slice(i, i + 1)
         outs.append(attend_parts(q[..., rows, :], [(part, mask[rows]) for part, mask in parts]))
     return jnp.concatenate(outs, axis=-2)
-
-
-def attend_cells(
-    q: Float[Array, "*N S h e"],
-    k: Float[Array, "*N S h e"],
-    v: Float[Array, "*N S h e"],
-    bf16: bool,
-    causal: bool = False,
-) -> Float[Array, "*N S h e"]:
-    """Returns :func:`attend` within each frame or sequence, by our fastest implementation on CPUs, jax's elsewhere.
-
-    Args:
-        bf16: whether products may round their operands to bf16.
-        causal: whether a query sees only its own key and those before it.
-    """
-    frames = [x.reshape(-1, *x.shape[-3:]) for x in (q, k, v)]
-    if bf16 and jax.default_backend() != "cpu":
-        halves = (x.astype(jnp.bfloat16) for x in frames)
-        out = jax.nn.dot_product_attention(*halves, is_causal=causal).astype(q.dtype)
-    elif bf16 and q.shape[-3] >= LARGE_FRAME:
-        out = attend_in_frames(frames[0], frames[1], frames[2], causal)
-    else:
-        out = attend(frames[0], frames[1], frames[2], jnp.tri(q.shape[-3], dtype=bool) if causal else None)
-    return out.reshape(q.shape)
 
 
 def rotate(x: Float[Array, "B T S h e"], positions: Int[Array, " T"]) -> Float[Array, "B T S h e"]:

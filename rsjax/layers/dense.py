@@ -4,7 +4,7 @@ import flax.linen as nn
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from rsjax.layers.matmul import matmul
+from rsjax.layers.platform import matmul
 
 # torch's default for linear layers, U(±1/√fan_in), as in the public code.
 TORCH_KERNEL = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -14,7 +14,7 @@ PRODUCT = "product"  # the name of linear layers' outputs in rematerialisation p
 class Dense(nn.Module):
     """A linear layer with float32 parameters; with ``bf16`` it multiplies in bf16 and accumulates in float32.
 
-    On a CPU without bf16 units it multiplies in float32 even then.
+    Where there are no bf16 units, it multiplies in float32 even then.
     """
 
     features: int
@@ -30,7 +30,9 @@ class Dense(nn.Module):
         else:
             out = x @ kernel
         out = checkpoint_name(out, PRODUCT)
-        return out + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else out
+        if self.use_bias:
+            return out + self.param("bias", nn.initializers.zeros, (self.features,))
+        return out
 
 
 def layer_norm(name: str | None) -> nn.LayerNorm:

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rsjax.layers.convolution import Dtype
-from rsjax.layers.convolution import convolve as convolve_bf16
 from rsjax.layers.group_norm import GroupNorm
+from rsjax.layers.platform import convolve as convolve_bf16
+from rsjax.layers.platform import on_cpu
 from rsjax.models.cogvideox.config import DECODED, ENCODED, CausalVAEConfig
 from rsjax.tokenizers.magvit2 import depth_to_space, space_to_depth
 from rsjax.tokenizers.vae_blocks import Downsample, Upsample
@@ -49,7 +50,7 @@ class CausalConv(nn.Module):
 def convolve(frames: Video, kernel: Float[Array, "3 3 3 C D"], dtype: Dtype) -> Video:
     """Returns the 3-D convolution, padded with zeros in space only, by the fastest implementation on this platform."""
     around = ((1, 1), (1, 1))
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         names = ("NTHWC", "THWIO", "NTHWC")
         frames, kernel = frames.astype(dtype), kernel.astype(dtype)
         made = jax.lax.conv_general_dilated(frames, kernel, (1, 1, 1), ((0, 0), *around), dimension_numbers=names)

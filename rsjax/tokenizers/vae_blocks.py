@@ -92,7 +92,7 @@ def encode(
         widths: channels of each level.
         out: channels of the result.
         attention: whether the middle has attention.
-        dtype: of the operands of 3×3 convolutions (:mod:`rsjax.layers.convolution`).
+        dtype: of the operands of 3×3 convolutions (:mod:`rsjax.layers.platform`).
         after: applied to the features after each level.
     """
     x = conv(widths[0], 3, dtype, "conv_in")(x)

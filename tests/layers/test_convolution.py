@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.layers import convolution
-from rsjax.layers.convolution import conv, conv_bf16, convolve
+from rsjax.layers.convolution import conv
+from rsjax.layers.cpu import convolution
+from rsjax.layers.cpu.convolution import conv_bf16
+from rsjax.layers.platform import convolve
 
 
 def rounded(x: Any) -> jax.Array:
@@ -103,7 +105,7 @@ def test_what_changes_the_size_or_has_an_even_kernel_stays_exact(
 
 def test_a_processor_without_bf16_units_convolves_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(convolution, "LEAST", 1)
-    monkeypatch.setattr(convolution, "bf16_pays", lambda: False)
+    monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: False)
     x = jax.random.normal(jax.random.key(0), (1, 6, 6, 4))
     exact, half = conv(5, 3, "float32"), conv(5, 3, "bfloat16")
     variables = exact.init(jax.random.key(1), x)

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.layers import attention, frame_attention
-from rsjax.layers.attention import attend, attend_cells
-from rsjax.layers.frame_attention import attend_in_frames
+from rsjax.layers.attention import attend
+from rsjax.layers.cpu import frame_attention
+from rsjax.layers.cpu.frame_attention import attend_in_frames
+from rsjax.layers.platform import attend_cells
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 
@@ -18,7 +19,7 @@ def test_output_and_gradients_are_plain_attention_s_to_rounding(
     monkeypatch: pytest.MonkeyPatch, causal: bool, long: int, bf16: bool, tolerance: float
 ) -> None:
     monkeypatch.setattr(frame_attention, "LONG", long)
-    monkeypatch.setattr(frame_attention, "bf16_pays", lambda: bf16)
+    monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: bf16)
     keys = jax.random.split(jax.random.key(0), 4)
     q, k, v, cotangent = (jax.random.normal(key, (3, 10, 2, 8)) for key in keys)  # N S h e
     found, pull = jax.vjp(jax.jit(lambda *x: attend_in_frames(*x, causal)), q, k, v)
@@ -84,6 +85,6 @@ def test_a_model_of_large_frames_learns_as_with_plain_attention(
         return sum((jnp.mean(jnp.sin(x)) for x in logits.values()), start=jnp.float32(0))
 
     plain = jax.grad(loss)(params)
-    monkeypatch.setattr(attention, "LARGE_FRAME", 1)
+    monkeypatch.setattr(frame_attention, "LARGE_FRAME", 1)
     for x, y in zip(jax.tree.leaves(jax.grad(loss)(params)), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(x, y, atol=0.03 * float(jnp.max(jnp.abs(y))) + 1e-6)

@@ -3,8 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.layers import matmul as products_of
-from rsjax.layers.matmul import matmul, matmul_bf16
+from rsjax.layers.platform import matmul, matmul_bf16
 
 
 def rounded(x: np.ndarray) -> np.ndarray:
@@ -34,7 +33,7 @@ def test_products_and_gradients_are_those_of_rounded_operands(widths: tuple[int,
 
 @pytest.mark.parametrize("units", [False, True])
 def test_a_processor_without_bf16_units_multiplies_in_float32(monkeypatch: pytest.MonkeyPatch, units: bool) -> None:
-    monkeypatch.setattr(products_of, "has_bf16_units", lambda: units)
+    monkeypatch.setattr("rsjax.runtime.has_bf16_units", lambda: units)
     rng = np.random.default_rng(0)
     x, w = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((7, 33), (33, 5)))
     np.testing.assert_array_equal(matmul(x, w), matmul_bf16(x, w) if units else x @ w)

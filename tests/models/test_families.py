@@ -14,7 +14,7 @@ import rsjax
 from rsjax.config import Config, ConfigError, LoopConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
-from rsjax.layers import convolution
+from rsjax.layers.cpu import convolution
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.describe import count, describe
 from rsjax.tools.pipeline import stages

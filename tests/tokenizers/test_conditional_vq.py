@@ -10,7 +10,7 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import ConfigError, TokenizerTrainConfig
-from rsjax.layers import convolution
+from rsjax.layers.cpu import convolution
 from rsjax.models.ivideogpt.autoencoder import ConditionalCodec, ConditionalVQTraining
 from rsjax.models.ivideogpt.config import ConditionalVQConfig
 from rsjax.tokenizers.conditional_vq import Codebook, ConditionalVQ

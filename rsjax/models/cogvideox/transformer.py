@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Key
 
 from rsjax.config.data import ClipShape
-from rsjax.layers.attention import attend_cells
 from rsjax.layers.dense import Dense
+from rsjax.layers.platform import attend_cells
 from rsjax.models.cogvideox.config import CogVideoXConfig, latent_frames
 from rsjax.models.diffusion.layers import PERIOD, TimeEmbedding, grid_positions, positions
 from rsjax.trainable import Params

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from rsjax.config import Config
-from rsjax.layers.attention import attend, attend_cells
+from rsjax.layers.attention import attend
 from rsjax.layers.dense import Dense
+from rsjax.layers.platform import attend_cells
 from rsjax.models.diffusion.layers import TIME_CHANNELS, TimeEmbedding, grid_positions, modulate, positions
 from rsjax.models.irasim.config import DiTConfig, IRASimConfig
 from rsjax.trainable import Params

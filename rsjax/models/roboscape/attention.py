@@ -9,8 +9,9 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rsjax.layers.attention import KeyValues, attend, attend_cells, attend_few, frames_held
+from rsjax.layers.attention import KeyValues, attend, attend_few, frames_held
 from rsjax.layers.dense import Dense, layer_norm
+from rsjax.layers.platform import attend_cells
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.rotary import rotated
 

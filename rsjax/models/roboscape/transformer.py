@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from rsjax.layers.attention import KeyValues, put_frames
-from rsjax.layers.dense import PRODUCT, Dense, layer_norm
-from rsjax.layers.gelu import gelu
+from rsjax.layers.dense import PRODUCT, Dense
+from rsjax.layers.platform import gelu
 from rsjax.layers.unstacked_params import together
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.attention import Attention
 from rsjax.models.roboscape.departures.action_dropout import with_null_action
-from rsjax.models.roboscape.departures.norms import added_norm
+from rsjax.models.roboscape.departures.norms import optional_norm
 from rsjax.models.roboscape.departures.read_previous import absent_cells, frame_before
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.tokenizers import lfq
@@ -74,12 +74,12 @@ class STBlock(nn.Module):
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
         cfg = self.config
         bf16 = cfg.compute_dtype == "bfloat16"
-        normed = x if cfg.qk_norm else layer_norm("norm1")(x)
+        normed = optional_norm(not cfg.qk_norm, "norm1", x)
         x = x + Attention(cfg, name="spatial_attn").spatial(normed)
-        normed = added_norm(cfg.departures.temporal_norm, "norm_temporal", x)
+        normed = optional_norm(cfg.departures.temporal_norm, "norm_temporal", x)
         out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
         x = x + out
-        normed = x if cfg.qk_norm else layer_norm("norm2")(x)
+        normed = optional_norm(not cfg.qk_norm, "norm2", x)
         inner = gelu(Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed))
         return x + Dense(cfg.width, bf16, name="fc2")(inner), cache
 
@@ -218,7 +218,7 @@ class Transformer(nn.Module):
 
     def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
-        x = added_norm(cfg.departures.final_norm, f"{branch}_norm_out", x)
+        x = optional_norm(cfg.departures.final_norm, f"{branch}_norm_out", x)
         if cfg.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"

@@ -21,10 +21,9 @@ import optax
 from jax.extend.core import jaxprs_in_params
 
 from rsjax.config import Config, TokenizerConfig
-from rsjax.layers.attention import attend, attend_cells
-from rsjax.layers.convolution import convolve
+from rsjax.layers.attention import attend
 from rsjax.layers.dense import Dense, layer_norm
-from rsjax.layers.gelu import gelu
+from rsjax.layers.platform import attend_cells, convolve, gelu
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops

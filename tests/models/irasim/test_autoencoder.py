@@ -10,7 +10,7 @@ import pytest
 
 from rsjax.clip import Video
 from rsjax.config import ConfigError
-from rsjax.layers import convolution
+from rsjax.layers.cpu import convolution
 from rsjax.models.base import create_autoencoder
 from rsjax.models.irasim.autoencoder import KLCodec, decode, init, posterior
 from rsjax.models.irasim.config import KLConfig

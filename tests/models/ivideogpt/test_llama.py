@@ -12,7 +12,7 @@ import pytest
 from rsjax.clip import Video
 from rsjax.config import ClipShape
 from rsjax.data.normalization import Normalization
-from rsjax.layers import attention
+from rsjax.layers.cpu import frame_attention
 from rsjax.models.base import Assets
 from rsjax.models.ivideogpt.config import IVideoGPTConfig, TopKConfig
 from rsjax.models.ivideogpt.llama import Architecture, LLaMA
@@ -79,7 +79,7 @@ def test_fast_attention_and_its_gradient_are_the_plain_ones(
         return jnp.mean(jnp.sin(LLaMA(arch).apply({"params": params}, SEQUENCE, ACTIONS)[0]))
 
     plain = jax.value_and_grad(loss)(params)
-    monkeypatch.setattr(attention, "LARGE_FRAME", 1)
+    monkeypatch.setattr(frame_attention, "LARGE_FRAME", 1)
     for x, y in zip(jax.tree.leaves(jax.value_and_grad(loss)(params)), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(x, y, atol=0.03 * float(jnp.max(jnp.abs(y))) + 1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 
 from rsjax.config import ConfigError, TokenizerConfig, presets
 from rsjax.config.config_fields import with_values
-from rsjax.layers import convolution
+from rsjax.layers.cpu import convolution
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.model import RoboScape

@@ -1,4 +1,4 @@
-"""Attention within frames, or within other sequences, with bf16 products and a hand-written gradient, fast on CPUs.
+"""Attention within frames, or within other sequences, with bf16 products and a hand-written gradient.
 
 A frame's scores are the largest arrays of a training step. They are not kept: the gradient recomputes them from
 queries, keys and each row's log-sum. Both passes treat frames one by one, so that a frame's scores stay in the
@@ -18,8 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.layers.matmul import bf16_pays, transposed_in_memory
+from rsjax import runtime
+from rsjax.layers.cpu.matmul import transposed_in_memory
 
+# From this many cells of a frame, or tokens of a sequence, bf16 products in attention save more time than their
+# transposes cost.
+LARGE_FRAME = 128
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
 BLOCKS, LONG = 4, 256  # blocks of queries in causal attention of at least so many cells
 SCORES = 2**24  # the most in all frames that run at the same time: 64 MiB
@@ -117,12 +121,16 @@ def _scores(q: Array, k: Array, causal: bool) -> Array:
 
 def _rounded(x: Array) -> Array:
     """Returns an operand of a product: in bf16 where that pays."""
-    return x.astype(jnp.bfloat16) if bf16_pays() else x
+    if runtime.has_bf16_units():
+        return x.astype(jnp.bfloat16)
+    return x
 
 
 def _turned(x: Array) -> Array:
     """Swaps the last two axes."""
-    return transposed_in_memory(x) if bf16_pays() else x.swapaxes(-1, -2)
+    if runtime.has_bf16_units():
+        return transposed_in_memory(x)
+    return x.swapaxes(-1, -2)
 
 
 def _head_major(x: Array) -> Array:

@@ -1,0 +1,28 @@
+"""Products with bf16 operands in the one form for which CPUs use their bf16 units: bf16 × bf16 → float32.
+
+XLA's CPU backend has fast kernels only if the last axis of the first operand is contracted. So the gradient of weights,
+which contracts the first axes of both operands, transposes one of them in memory.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, BFloat16, Float
+
+
+def product(x: Float[Array, "N K"], w: Float[Array, "..."], contract: int = 0) -> Float[Array, "N M"]:
+    """Returns x·w in float32, contracting axis ``contract`` of w."""
+    return jax.lax.dot_general(x, w, (((1,), (contract,)), ((), ())), preferred_element_type=jnp.float32)
+
+
+def weight_gradient(x: BFloat16[Array, "N K"], cotangent: BFloat16[Array, "N M"]) -> Float[Array, "K M"]:
+    """Returns xᵀ·cotangent; transposes the narrower operand in memory."""
+    if x.shape[1] <= cotangent.shape[1]:
+        return product(transposed_in_memory(x), cotangent)
+    # Without the barrier, XLA swaps the operands back to a form for which it has no bf16 kernel.
+    return jax.lax.optimization_barrier(product(transposed_in_memory(cotangent), x)).T
+
+
+def transposed_in_memory(x: Float[Array, "*N K M"]) -> Float[Array, "*N M K"]:
+    """Swaps the last two axes and moves the data; a plain transpose only changes the layout of the same memory."""
+    y = x.swapaxes(-1, -2)
+    return jax.lax.optimization_barrier(y.reshape(-1)).reshape(y.shape)
