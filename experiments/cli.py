@@ -1,6 +1,8 @@
 """Parses the arguments of every command."""
 
+import contextlib
 import dataclasses
+import io
 import os
 from collections.abc import Sequence
 from operator import attrgetter
@@ -8,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
-from tyro import _errors as parse_errors  # private; the alternative is to parse the box that tyro prints
 
 from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
 from rsjax.command import refuse_repeated
@@ -161,16 +162,16 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
     kinds = [(name, Annotated[(type(part), *markers[name])]) for name, part in parts.items()]  # type: ignore[misc]
     default: Any = dataclasses.make_dataclass("Command", kinds)(**parts)
 
-    def refuse(event: parse_errors.ParseErrorEvent) -> None:
-        flags = [name.replace("_", "-") for part in parts.values() for name in config_fields(part)]
-        if message := _message(event, flags):  # for an event without a message, tyro prints its own report
-            raise ConfigError(f"{message} (see {prog} --help)")
-
     settings: dict[str, Any] = {"args": argv, "default": default, "prog": prog, "description": description}
     settings |= {"registry": REGISTRY, "return_unknown_args": rest, "add_help": not rest}
+    report = io.StringIO()
     try:
-        with parse_errors.on_parse_error(refuse):
+        with contextlib.redirect_stderr(report):
             parsed: Any = tyro.cli(type(default), **settings)
+    except SystemExit as stop:
+        if not stop.code:  # after --help
+            raise
+        raise ConfigError(f"{_one_line(report.getvalue(), parts)} (see {prog} --help)") from None
     except BrokenPipeError:  # --help-all | head
         os._exit(0)
     parsed = parsed[0] if rest else parsed
@@ -179,26 +180,28 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
     return parsed
 
 
-def _message(event: parse_errors.ParseErrorEvent, flags: list[str]) -> str:
-    match event:
-        case parse_errors.UnrecognizedArgs(tokens=[token, *_]):
-            word = token.partition("=")[0].lstrip("-").replace("_", "-")
-            return f"unknown argument {token!r}{did_you_mean(word, flags, '--')}"
-        case parse_errors.MissingArgs(missing_arguments=missing):
-            return f"missing {', '.join(_name(item.arg) for item in missing)}"
-        case parse_errors.InvalidChoice(argument=argument, value=value, choices=choices):
-            return f"{_name(argument)}: {value!r} is none of {', '.join(choices)}"
-        case parse_errors.BadValue(argument=argument):
-            return f"{_name(argument)}: its value is missing"
-        case parse_errors.InstantiationFailure(argument=argument, message=message):
-            return f"{_name(argument)}: {message}" if argument else message
-    return ""
+def _one_line(report: str, parts: dict[str, Any]) -> str:
+    """Returns the first paragraph of tyro's report on a mistake; it names the nearest flag and what is missing."""
+    words: list[str] = []
+    for line in report.splitlines()[1:]:  # the first is a title
+        text = line.strip("│ ")
+        if any(letter.isalnum() for letter in text):
+            words += text.split()
+        elif words:
+            break
+    message = " ".join(words).removeprefix("Error parsing ").replace("'options.", "'")
+    if message.startswith("Missing from"):
+        fields = [field for part in parts.values() for field in dataclasses.fields(part)]
+        return f"missing {' or '.join(_flag(f.name).upper() for f in fields if f.default is tyro.MISSING)}"
+    if not message.startswith("Unrecognized options: "):
+        return message
+    unknown = message.removeprefix("Unrecognized options: ").partition(", ")[0]
+    flags = [_flag(name) for part in parts.values() for name in config_fields(part)]
+    return f"unknown argument {unknown!r}{did_you_mean(_flag(unknown.partition('=')[0].lstrip('-')), flags, '--')}"
 
 
-def _name(argument: Any) -> str:
-    """Returns an option's flag, --run-dir, or a positional argument's name, RUN-DIR."""
-    name: str = argument.display_name()
-    return name if name.startswith("-") else name.rpartition(".")[2].upper()
+def _flag(name: str) -> str:
+    return name.replace("_", "-")
 
 
 def _first_fields(preset: Config) -> Any:

@@ -1,69 +1,84 @@
 """Imports and exports public checkpoints. ``python -m experiments.convert tokenizer IN OUT``"""
 
-import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from rsjax.command import main_errors, refuse_repeated
+import tyro
+
+from experiments.cli import main_errors, parse_options
+from rsjax.config import require
 
 PROG = "python -m experiments.convert"
+ABOUT = """Imports and exports PyTorch and safetensors checkpoints.
 
+KIND is one of
+  tokenizer: Open-MAGVIT2's image tokenizer, either generation;
+  genie: 1xgpt's Genie (STMaskGIT); reads the config.json beside IN;
+  ivideogpt: iVideoGPT's tokenizer or transformer, whichever IN holds;
+  irasim: IRASim's transformer, Frame-Ada or Video-Ada;
+  sdxl: the autoencoder of Stable Diffusion XL; reads the config.json beside IN;
+  cogvideox: CogVideoX's autoencoder or transformer, whichever IN holds; reads the config.json beside IN;
+  text: texts: IN is a local directory with CogVideoX's text_encoder and tokenizer, OUT their embeddings;
+  lpips: the perceptual distance: torchvision's backbone and the published heads."""
 
-KINDS = {
-    "tokenizer": "Open-MAGVIT2's image tokenizer, either generation",
-    "genie": "1xgpt's Genie (STMaskGIT); reads the config.json beside IN",
-    "ivideogpt": "iVideoGPT's tokenizer or transformer, whichever IN holds",
-    "irasim": "IRASim's transformer, Frame-Ada or Video-Ada",
-    "sdxl": "the autoencoder of Stable Diffusion XL; reads the config.json beside IN",
-    "cogvideox": "CogVideoX's autoencoder or transformer, whichever IN holds; reads the config.json beside IN",
-    "text": "texts: IN is a local directory with CogVideoX's text_encoder and tokenizer, OUT their embeddings",
-    "lpips": "the perceptual distance: torchvision's backbone and the published heads",
+# The kinds that each option belongs to.
+BELONGS = {
+    "weights": ("tokenizer", "irasim"),
+    "heads": ("genie", "ivideogpt", "irasim"),
+    "part": ("ivideogpt", "cogvideox"),
+    "task": ("text",),
+    "store": ("text",),
+    "tokens": ("text",),
+    "heads_file": ("lpips",),
 }
 
 
-def parser() -> argparse.ArgumentParser:
-    """Returns the parser of the command line."""
-    top = argparse.ArgumentParser(PROG, description="Imports and exports PyTorch and safetensors checkpoints.")
-    kinds = top.add_subparsers(dest="kind", required=True, metavar="|".join(KINDS))
-    for kind, text in KINDS.items():
-        command = kinds.add_parser(kind, help=text, description=text)
-        command.add_argument("source", metavar="IN", type=Path, help="a public file, or a directory made here")
-        command.add_argument("out", metavar="OUT", type=Path, help="a directory, or a .safetensors file")
-        if kind == "tokenizer":
-            command.add_argument("--weights", choices=("raw", "ema"), default="raw", help="ema: their moving average")
-        if kind == "genie":
-            command.add_argument("--heads", type=int, help="attention heads, if there is no config.json")
-        if kind == "ivideogpt":
-            command.add_argument("--heads", type=int, help="attention heads of the transformer, if not of 64 channels")
-        if kind == "text":
-            command.add_argument("--task", action="append", default=[], help="a task, in words; as often as needed")
-            command.add_argument("--store", type=Path, help="a store of clips, whose tasks are embedded")
-            command.add_argument("--tokens", type=int, default=226, help="tokens of each text")
-        if kind in ("ivideogpt", "cogvideox"):
-            command.add_argument(
-                "--part", choices=("tokenizer", "world_model"), help="which one to export, if there are both"
-            )
-        if kind == "irasim":
-            command.add_argument(
-                "--weights", choices=("ema", "raw"), default="ema", help="raw: not their moving average"
-            )
-            command.add_argument("--heads", type=int, help="attention heads, if the width is none of the public sizes")
-        if kind == "lpips":
-            command.add_argument("--heads-file", type=Path, help="the published heads, if IN is only the backbone")
-    return top
+@dataclass(frozen=True)
+class Options:
+    """Options of this command."""
+
+    kind: tyro.conf.Positional[
+        Literal["tokenizer", "genie", "ivideogpt", "irasim", "sdxl", "cogvideox", "text", "lpips"]
+    ] = tyro.MISSING
+    """What to convert."""
+    source: tyro.conf.Positional[Path] = tyro.MISSING
+    """IN, a public file, or a directory made here."""
+    out: tyro.conf.Positional[Path] = tyro.MISSING
+    """OUT, a directory, or a .safetensors file."""
+    weights: Literal["raw", "ema"] | None = None
+    """The weights themselves or their moving average. Default: raw for tokenizer, ema for irasim."""
+    heads: int | None = None
+    """Attention heads: of genie without a config.json, of ivideogpt if not of 64 channels, of irasim if the width is
+    none of the public sizes."""
+    part: Literal["tokenizer", "world_model"] | None = None
+    """Which one of ivideogpt or cogvideox to export, if there are both."""
+    task: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A task for text, in words; as often as needed."""
+    store: Path | None = None
+    """A store of clips, whose tasks are embedded by text."""
+    tokens: int = 226
+    """Tokens of each text."""
+    heads_file: Path | None = None
+    """The published heads of lpips, if IN is only the backbone."""
 
 
 @main_errors()
 def main(argv: Sequence[str]) -> None:
     """Converts and prints what was written."""
-    refuse_repeated(argv, repeatable=("task",))
-    options = parser().parse_args(argv)
+    options = parse_options(argv, PROG, ABOUT, Options())
+    for name, kinds in BELONGS.items():
+        require(
+            options.kind in kinds or getattr(options, name) == getattr(Options, name),
+            f"--{name.replace('_', '-')} belongs to {' and '.join(kinds)}, not to {options.kind}; leave it out",
+        )
     # JAX is loaded only now, after arguments are known to be good.
     from rsjax.tools.convert import cogvideox, genie, irasim, ivideogpt, kl_autoencoder, lpips, tokenizer
 
     if options.kind == "tokenizer":
-        lines = tokenizer.convert(options.source, options.out, options.weights)
+        lines = tokenizer.convert(options.source, options.out, options.weights or "raw")
     elif options.kind == "genie":
         lines = genie.convert(options.source, options.out, options.heads)
     elif options.kind == "ivideogpt":
@@ -71,14 +86,16 @@ def main(argv: Sequence[str]) -> None:
     elif options.kind == "cogvideox":
         lines = cogvideox.convert(options.source, options.out, options.part)
     elif options.kind == "text":
-        texts = (options.task, options.store, options.tokens)
-        lines = cogvideox.embed_texts(options.source, options.out, *texts)
+        lines = cogvideox.embed_texts(options.source, options.out, options.task, options.store, options.tokens)
     elif options.kind == "irasim":
-        lines = irasim.convert(options.source, options.out, options.weights, options.heads)
+        lines = irasim.convert(options.source, options.out, options.weights or "ema", options.heads)
     elif options.kind == "sdxl":
         lines = kl_autoencoder.convert(options.source, options.out)
     else:
-        lines = lpips.convert([path for path in (options.source, options.heads_file) if path], options.out)
+        files = [options.source]
+        if options.heads_file is not None:
+            files.append(options.heads_file)
+        lines = lpips.convert(files, options.out)
     print(*lines, sep="\n")
 
 

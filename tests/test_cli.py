@@ -27,7 +27,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class NeedsRun:
-    run_dir: tyro.conf.Positional[Path]
+    run_dir: tyro.conf.Positional[Path] = tyro.MISSING
     clips: int = 4
 
 
@@ -101,13 +101,16 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         (["tiny", "--rundir", "x"], "did you mean '--run-dir'?"),
         (["tiny", "extra"], "unknown argument 'extra'"),
         (["tiny", "--train.steps", "many"], "--train.steps: invalid literal for int() with base 10: 'many'"),
-        (["tiny", "--train.steps"], "--train.steps: its value is missing"),
-        (["tiny", "--store"], "--store: its value is missing"),
+        (["tiny", "--train.steps"], "Missing value for argument '--train.steps'"),
+        (["tiny", "--store"], "Missing value for argument '--store'"),
         (["tiny", "--train.steps", "3", "--train.batch_size=4", "--train.steps=5"], "--train.steps is given twice"),
         (["tiny", "--model.max_frames", "16", "--model.max-frames", "16"], "--model.max-frames is given twice"),
         (["tiny", "--resume", "--no-resume"], "--resume is given twice; give it once, with all its values"),
         (["tiny", "--store", "a", "--store", "b"], "--store is given twice"),
-        (["tiny", "--model.sample.unmask", "worst"], "--model.sample.unmask: 'worst' is none of random, greedy"),
+        (
+            ["tiny", "--model.sample.unmask", "worst"],
+            "invalid choice 'worst' for argument '--model.sample.unmask'. Expected one of ('random', 'greedy')",
+        ),
         (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
         (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
         (["debug", "--model", "genie", "--model.loss.gamma", "2"], "unknown argument '--model.loss.gamma'"),

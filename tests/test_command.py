@@ -112,7 +112,7 @@ def test_one_interrupt_is_one_line(lines: str) -> None:
 
 
 @pytest.mark.parametrize("number", ANSWERS)
-@pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("experiments.convert", "argparse")])
+@pytest.mark.parametrize(("command", "imported"), [("experiments.train", "tyro"), ("experiments.convert", "tyro")])
 def test_a_signal_while_a_command_is_imported_is_one_line(
     number: signal.Signals, command: str, imported: str, tmp_path: Path
 ) -> None:
