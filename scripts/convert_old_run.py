@@ -10,24 +10,51 @@ import sys
 from pathlib import Path
 from typing import Any
 
-SHARED = ("log_every", "checkpoint_every", "eval_every", "sharding", "fsdp", "workers", "max_damaged", "wandb", "profile")
+SHARED = (
+    *("log_every", "checkpoint_every", "eval_every", "sharding", "fsdp"),
+    *("workers", "max_damaged", "wandb", "profile"),
+)
 DROPPED = ("skip_budget", "keep_last", "keep_every", "keep_best", "restarts")
-OWN_FRAMES = {"own_frames": "own_frames", "own_frames_after": "own_frames_after"}
+DEPARTURES = (
+    *("integrate_actions", "read_previous", "whole_frames", "action_dropout", "temporal_norm", "final_norm"),
+    *("shifts", "shift_pixels"),
+)
 
 
 def upgraded(config: dict[str, Any]) -> dict[str, Any]:
     """Returns the configuration with today's fields."""
-    if "runtime" in config:
-        return config
-    config["runtime"] = {name: config["train"][name] for name in SHARED if name in config["train"]}
-    for section in ("tokenizer_train", "train"):
-        train = config[section]
-        for name in (*SHARED, *DROPPED):
-            train.pop(name, None)
-        optimizer = train["optimizer"]
-        optimizer["betas"] = [optimizer.pop("beta1"), optimizer.pop("beta2")]
-        optimizer.pop("decay_share", None)
+    if "runtime" not in config:
+        config["runtime"] = {name: config["train"][name] for name in SHARED if name in config["train"]}
+        for section in ("tokenizer_train", "train"):
+            upgrade_training(config[section])
+    model = config["model"]
+    if model["family"] in ("roboscape", "genie") and "departures" not in model:
+        upgrade_model(model)
     return config
+
+
+def upgrade_training(train: dict[str, Any]) -> None:
+    """Removes what both trainings share or nobody sets, and joins the optimizer's betas."""
+    for name in (*SHARED, *DROPPED):
+        train.pop(name, None)
+    optimizer = train["optimizer"]
+    optimizer["betas"] = [optimizer.pop("beta1"), optimizer.pop("beta2")]
+    optimizer.pop("decay_share", None)
+
+
+def upgrade_model(model: dict[str, Any]) -> None:
+    """Gathers the departures from the paper."""
+    departures = {name: model.pop(name) for name in DEPARTURES if name in model}
+    departures["rotary"] = model.pop("positions", "learned") == "rotary"
+    mask = model["mask"]
+    departures["visible_prefix"] = mask.pop("visible_prefix", 0.0)
+    departures["self_conditioning"] = mask.pop("own_frames", 0.0)
+    departures["self_conditioning_after"] = mask.pop("own_frames_after", 0)
+    if "loss" in model:
+        departures["observed_anchor"] = model["loss"].pop("keypoint_target", "observed") == "observed"
+        departures["masked_keypoints"] = model["loss"].pop("keypoint_masked_only", True)
+        departures["visible_keypoints"] = True
+    model["departures"] = departures
 
 
 def main() -> None:

@@ -92,4 +92,5 @@ def irasim_tiny(base: Config) -> Config:
             optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
             ema=0.998,
         ),
+        runtime=replace(base.runtime, eval_every=1200),
     )
