@@ -11,7 +11,7 @@ import cv2
 
 from rsjax.config import content_key
 from rsjax.data.store import MANIFEST, StoreError, open_store
-from rsjax.files import disk_guard, holder, lock
+from rsjax.files import disk_guard, making
 from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.tools.ingest.clips import CLIPS
 from rsjax.tools.ingest.episode import EpisodeRef
@@ -19,7 +19,6 @@ from rsjax.tools.ingest.packing import choose_contents, cut_episodes, pack, refu
 from rsjax.tools.ingest.summary import IngestSummary, no_clips, summarise, write_tables
 from rsjax.tools.ingest.work_items import EpisodeWork, IngestPlan, mark_path, run_episode
 
-LOCK = "lock"
 Settle = Callable[[EpisodeRef, int, int], None]  # takes an episode, how many work items were run, how many clips made
 Progress = Callable[[int, int], None]  # takes (done, in all)
 # Runs the work items that have no mark, on workers that may die, and calls Settle for every episode. Raises a UserError
@@ -80,9 +79,7 @@ def ingest(
     up_to_date = is_up_to_date(plan, refs)
     if up_to_date and not retry:
         return None
-    with lock(plan.folder / LOCK) as locked:
-        if not locked:
-            raise StoreError(f"{plan.out}: {holder(plan.folder / LOCK)} is making it; wait for that one or stop it")
+    with making(plan.out, wait=False):
         if retry and not _forget_failures(plan, refs) and up_to_date:
             return None
         this_run = _run(plan, refs, run, progress)

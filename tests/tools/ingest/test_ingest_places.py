@@ -13,12 +13,11 @@ import pytest
 
 from rsjax.data.codec import Record
 from rsjax.data.store import StoreError
-from rsjax.files import FileError, lock
+from rsjax.files import FileError, making
 from rsjax.tools.ingest import packing
 from rsjax.tools.ingest.annotate import Annotators
 from rsjax.tools.ingest.clips import ClipConfig
 from rsjax.tools.ingest.episode import EpisodeRef
-from rsjax.tools.ingest.ingest import LOCK
 from rsjax.tools.ingest.windows import WindowConfig
 from rsjax.tools.ingest.work_items import EpisodeWork, run_episode, run_item
 from tests.tools.ingest.toy import CONFIG, Source, clip_plan, ingested
@@ -38,7 +37,7 @@ def test_an_id_leads_nowhere_but_into_the_folder(tmp_path: Path) -> None:
     summary = ingested(clip_plan(tmp_path / "inner", Hostile(0)))
     assert summary is not None and summary.done == 5
     assert [path.name for path in tmp_path.iterdir()] == ["inner"]
-    assert sorted(path.name for path in (tmp_path / "inner").iterdir()) == ["store", "store.work"]
+    assert sorted(path.name for path in (tmp_path / "inner").iterdir()) == [".store.lock", "store", "store.work"]
 
 
 def test_what_is_no_store_of_this_data_set_is_not_replaced(tmp_path: Path) -> None:
@@ -59,7 +58,7 @@ def test_what_is_no_store_of_this_data_set_is_not_replaced(tmp_path: Path) -> No
 
 def test_two_that_make_one_store_do_not_meet(tmp_path: Path) -> None:
     plan = clip_plan(tmp_path, Source(2))
-    with lock(plan.folder / LOCK), pytest.raises(StoreError, match=rf"store: process {os.getpid()} on .* is making it"):
+    with making(plan.out, wait=False), pytest.raises(FileError, match=rf"store: process {os.getpid()} on .* is making it"):
         ingested(plan)
     assert ingested(plan) is not None
 
