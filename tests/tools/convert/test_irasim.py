@@ -11,7 +11,7 @@ import pytest
 from rsjax.models.irasim.autoencoder import init
 from rsjax.models.irasim.config import KLConfig
 from rsjax.tools.convert.directory import load_irasim, load_kl_autoencoder
-from rsjax.tools.convert.files import write_safetensors
+from rsjax.tools.convert.files import read_tensors, write_safetensors
 from rsjax.tools.convert.kl_autoencoder import to_public
 from tests.models.irasim import public, toy
 from tests.tools.convert.test_commands import GENIE, assert_same, convert, refused
@@ -63,6 +63,20 @@ def test_sdxl_comes_back_to_the_bit_with_its_factor(vae: Path, capsys: pytest.Ca
     (vae.parent / "out").mkdir()
     convert("sdxl", vae.parent / "own", vae.parent / "out" / "x.safetensors")
     assert json.loads((vae.parent / "out" / "config.json").read_text())["scaling_factor"] == 0.2
+
+
+def test_sdxl_has_the_names_of_diffusers(vae: Path) -> None:
+    names = set(read_tensors(vae).tensors)
+    assert names >= {
+        "quant_conv.weight",
+        "encoder.down_blocks.0.resnets.0.conv1.weight",
+        "encoder.down_blocks.0.downsamplers.0.conv.weight",
+        "encoder.mid_block.resnets.1.norm2.bias",
+        "decoder.mid_block.attentions.0.group_norm.weight",
+        "decoder.mid_block.attentions.0.to_out.0.weight",
+        "decoder.up_blocks.0.upsamplers.0.conv.bias",
+        "decoder.conv_norm_out.weight",
+    }
 
 
 def test_one_directory_holds_both_networks(weights: Path, vae: Path) -> None:

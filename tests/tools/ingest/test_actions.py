@@ -51,7 +51,7 @@ def test_differences_lead_from_one_place_to_the_other(rows: np.ndarray, step: in
 
 
 def test_places_and_held_dimensions_keep_the_last_command() -> None:
-    rows = np.array([[0, 0], [1, 1], [2, 1], [3, 0], [4, 0]], np.float32)
+    rows = np.array([[0, 0], [1, 0], [2, 1], [3, 1], [4, 0]], np.float32)
     frames = np.array([0, 2, 4])
     assert sampled_actions(rows, frames, EVERY, Layout("absolute")).tolist() == [[0, 0], [2, 1], [4, 0]]
     assert sampled_actions(rows, frames, EVERY, Layout("delta", held=(1,))).tolist() == [[0, 0], [3, 1], [7, 0]]
