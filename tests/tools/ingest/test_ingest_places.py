@@ -5,19 +5,18 @@ import os
 import pickle
 import re
 import tracemalloc
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
-from rsjax.data.codec import Record
 from rsjax.data.store import StoreError
 from rsjax.files import FileError, making
-from rsjax.tools.ingest import packing
 from rsjax.tools.ingest.annotate import Annotators
 from rsjax.tools.ingest.clips import ClipConfig
 from rsjax.tools.ingest.episode import EpisodeRef
+from rsjax.tools.ingest.ingest import ingest
 from rsjax.tools.ingest.windows import WindowConfig
 from rsjax.tools.ingest.work_items import EpisodeWork, run_episode, run_item
 from tests.tools.ingest.toy import CONFIG, Source, clip_plan, ingested
@@ -58,7 +57,10 @@ def test_what_is_no_store_of_this_data_set_is_not_replaced(tmp_path: Path) -> No
 
 def test_two_that_make_one_store_do_not_meet(tmp_path: Path) -> None:
     plan = clip_plan(tmp_path, Source(2))
-    with making(plan.out, wait=False), pytest.raises(FileError, match=rf"store: process {os.getpid()} on .* is making it"):
+    with (
+        making(plan.out, wait=False),
+        pytest.raises(FileError, match=rf"store: process {os.getpid()} on .* is making it"),
+    ):
         ingested(plan)
     assert ingested(plan) is not None
 
@@ -155,17 +157,16 @@ def test_messages_to_and_from_workers_are_small(tmp_path: Path) -> None:
         assert max(len(pickle.dumps(message)) for message in messages) < 2000
 
 
-def test_a_failed_packing_leaves_the_old_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_packing_leaves_the_old_store(tmp_path: Path) -> None:
     ingested(clip_plan(tmp_path, Source(2)))
     before = hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest()
 
-    def failing(*arguments: object) -> Iterator[Record]:
-        raise OSError(errno.ENOSPC, "No space left on device")
-        yield {}
+    def fill_the_disk(done: int, total: int) -> None:
+        if done == total:  # all clips are written, but not the manifest
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(packing, "_records", failing)
     with pytest.raises(FileError, match=r"disk is full"):
-        ingested(clip_plan(tmp_path, Source(3)))
+        ingest(clip_plan(tmp_path, Source(3)), progress=fill_the_disk)
     assert hashlib.sha256((tmp_path / "store" / "manifest.json").read_bytes()).digest() == before
 
 
