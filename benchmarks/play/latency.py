@@ -55,11 +55,13 @@ def measure(browser: Any, address: str, shown: tuple[str, ...]) -> dict[str, str
 
 def drive(page: Any, seconds: float) -> None:
     """Holds one key after the other."""
-    end, number = time.monotonic() + seconds, 0
+    end = time.monotonic() + seconds
+    number = 0
     page.keyboard.down(KEYS[0])
     while time.monotonic() < end:
         page.wait_for_timeout(1000 * HOLD)
-        before, number = KEYS[number], (number + 1) % len(KEYS)
+        before = KEYS[number]
+        number = (number + 1) % len(KEYS)
         page.keyboard.down(KEYS[number])
         page.keyboard.up(before)
     page.wait_for_timeout(600)  # the page writes its figures twice a second

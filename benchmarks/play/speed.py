@@ -24,7 +24,8 @@ def main() -> None:
         page.ask("start", clip=0)
         for kinds in ((), ("depth",), ("depth", "truth")):
             page.ask("watch", kinds=list(kinds))
-            times, inside = [], []
+            times = []
+            inside = []
             for _ in range(STEPS):
                 began = time.perf_counter()
                 number = page.send("step", branch=0, source={"kind": "random"})

@@ -20,7 +20,8 @@ from rsjax.models.diffusion.schedule import alphas
 
 def autoencoder(config: CausalVAEConfig) -> tuple[nn.Module, Any, Any]:
     """Returns the autoencoder, and its functions that map frames (B, 3, T, H, W) to latents and back."""
-    levels, patch = len(config.widths), config.patch_size
+    levels = len(config.widths)
+    patch = config.patch_size
     vae = AutoencoderKLCogVideoX(
         in_channels=3 * patch**2,
         out_channels=3 * patch**2,
@@ -69,14 +70,16 @@ def transformer(arch: Architecture) -> tuple[nn.Module, Any]:
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
     """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip."""
-    model, clips = config.model, config.clips
+    model = config.model
+    clips = config.clips
     assert isinstance(model, CogVideoXConfig)
     arch = Architecture.create(model, clips)
     network, rotary = transformer(arch)
     network.to(device)
     vae, encode, decode = autoencoder(model.autoencoder)
     vae.to(device)
-    channels, guidance = model.image == "channels", model.sample.guidance
+    channels = model.image == "channels"
+    guidance = model.sample.guidance
     left = torch.tensor(alphas(model.noise), dtype=torch.float32, device=device)[:, None, None, None, None]
     latents = torch.randn(batch, arch.frames, arch.channels, arch.rows, arch.columns, device=device)
     text = torch.randn(batch, model.text.tokens, model.text.width, device=device)
@@ -89,12 +92,15 @@ def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
 
     def loss() -> Tensor:
         t = torch.randint(0, model.noise.steps, (batch,), device=device)
-        noise, signal, spread = torch.randn_like(latents), left[t].sqrt(), (1 - left[t]).sqrt()
+        noise = torch.randn_like(latents)
+        signal = left[t].sqrt()
+        spread = (1 - left[t]).sqrt()
         made = velocity(signal * latents + spread * noise, t, latents[:, 0], text)
         return (made - (signal * noise - spread * latents)).square().mean()
 
     def chunk(image: Tensor) -> Tensor:
-        scheduler, x = make_scheduler(model), torch.randn_like(latents)
+        scheduler = make_scheduler(model)
+        x = torch.randn_like(latents)
         for step in scheduler.timesteps:
             t = torch.full((batch,), int(step), device=device)
             if guidance == 1:
@@ -129,7 +135,8 @@ def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
 
 def make_scheduler(model: CogVideoXConfig) -> Any:
     """Returns the sampler of ``diffusers`` with the model's settings, at its first step."""
-    noise, sample = model.noise, model.sample
+    noise = model.noise
+    sample = model.sample
     scheduler = CogVideoXDDIMScheduler(
         num_train_timesteps=noise.steps,
         beta_start=noise.beta_start,

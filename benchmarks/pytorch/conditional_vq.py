@@ -19,8 +19,10 @@ class Resnet(nn.Module):
 
     def __init__(self, width_in: int, width: int, groups: int) -> None:
         super().__init__()
-        self.norm1, self.norm2 = nn.GroupNorm(groups, width_in, eps=1e-6), nn.GroupNorm(groups, width, eps=1e-6)
-        self.conv1, self.conv2 = nn.Conv2d(width_in, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1)
+        self.norm1 = nn.GroupNorm(groups, width_in, eps=1e-6)
+        self.norm2 = nn.GroupNorm(groups, width, eps=1e-6)
+        self.conv1 = nn.Conv2d(width_in, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
         if width_in != width:
             self.conv_shortcut = nn.Conv2d(width_in, width, 1)
 
@@ -93,7 +95,8 @@ class CrossAttention(nn.Module):
         super().__init__()
         self.q_pos_emb = nn.Parameter(torch.zeros(size**2, width))
         self.kv_pos_emb = nn.Parameter(torch.zeros(config.context_frames * size**2, width))
-        self.q_norm, self.kv_norm = nn.GroupNorm(config.norm_groups, width), nn.GroupNorm(config.norm_groups, width)
+        self.q_norm = nn.GroupNorm(config.norm_groups, width)
+        self.kv_norm = nn.GroupNorm(config.norm_groups, width)
         self.att = nn.MultiheadAttention(width, config.heads, config.dropout, batch_first=True)
 
     def forward(self, z: Tensor, context: Tensor) -> Tensor:
@@ -111,11 +114,14 @@ class Half(nn.Module):
 
     def __init__(self, config: ConditionalVQConfig, up: bool, size: int | None) -> None:
         super().__init__()
-        self.up, self.limit = up, config.attention_size if size else 0
+        self.up = up
+        self.limit = config.attention_size if size else 0
         widths = config.widths[::-1] if up else config.widths
         pixels = 3 * config.patch_size**2
         self.conv_in = nn.Conv2d(config.latent if up else pixels, widths[0], 3, padding=1)
-        levels, cross, width_in = [], [CrossAttention(widths[0], size, config)] if up and size else [], widths[0]
+        levels = []
+        cross = [CrossAttention(widths[0], size, config)] if up and size else []
+        width_in = widths[0]
         for i, width in enumerate(widths):
             last = i == len(widths) - 1
             levels.append(Level(width_in, width, config.res_blocks + up, config.norm_groups, up, last))
@@ -132,7 +138,8 @@ class Half(nn.Module):
 
     def forward(self, x: Tensor, context: list[Tensor] | None = None) -> tuple[Tensor, list[Tensor]]:
         """Returns the output and the features after each stage; ``context`` holds such features of another half."""
-        cross, stages = iter(self.cross_att_blocks), [self.mid_block] * self.up
+        cross = iter(self.cross_att_blocks)
+        stages = [self.mid_block] * self.up
         stages = [*stages, *getattr(self, "up_blocks" if self.up else "down_blocks")]
         x = self.conv_in(x)
         features = [x]
@@ -165,21 +172,26 @@ class ConditionalVQTorch(nn.Module):
         super().__init__()
         self.config = config
         patches = config.latent * config.future_patch**2
-        self.encoder, self.decoder = Half(config, False, None), Half(config, True, None)
+        self.encoder = Half(config, False, None)
+        self.decoder = Half(config, True, None)
         self.cond_encoder = Half(config, False, image_size // config.patch_size)
         self.cond_decoder = Half(config, True, config.grid(image_size))
         self.quant_conv, self.post_quant_conv = (nn.Conv2d(config.latent, config.latent, 1) for _ in range(2))
-        self.quant_linear, self.post_quant_linear = nn.Linear(patches, config.latent), nn.Linear(config.latent, patches)
-        self.quantize, self.dynamics_quantize = Codebook(config), Codebook(config)
+        self.quant_linear = nn.Linear(patches, config.latent)
+        self.post_quant_linear = nn.Linear(config.latent, patches)
+        self.quantize = Codebook(config)
+        self.dynamics_quantize = Codebook(config)
 
     def latents(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the latents that the codebooks quantise, (B, c, g², C) and (B, F, n, C)."""
-        cfg, (clips, count) = self.config, frames.shape[:2]
+        cfg = self.config
+        clips, count = frames.shape[:2]
         later = count - cfg.context_frames
         unshuffled = [self._to_channels(x.flatten(0, 1)) for x in frames.split([cfg.context_frames, later], 1)]
         h, features = self.encoder(unshuffled[0])
         d, _ = self.cond_encoder(unshuffled[1], self._stacked(features, clips, later))
-        p, grid = cfg.future_patch, d.shape[-1]
+        p = cfg.future_patch
+        grid = d.shape[-1]
         d = d.reshape(len(d), cfg.latent, grid // p, p, grid // p, p).permute(0, 2, 4, 3, 5, 1)
         d = self.quant_linear(d.reshape(clips, later, (grid // p) ** 2, -1))
         h = self.quant_conv(h).flatten(2).transpose(1, 2)
@@ -196,8 +208,10 @@ class ConditionalVQTorch(nn.Module):
 
     def images(self, context: Tensor, later: Tensor) -> Tensor:
         """Decodes quantised latents, laid out as :meth:`latents` returns them."""
-        cfg, (clips, count) = self.config, later.shape[:2]
-        grid, p = int(context.shape[2] ** 0.5), cfg.future_patch
+        cfg = self.config
+        clips, count = later.shape[:2]
+        grid = int(context.shape[2] ** 0.5)
+        p = cfg.future_patch
         h = context.flatten(0, 1).transpose(1, 2).reshape(-1, cfg.latent, grid, grid)
         first, features = self.decoder(self.post_quant_conv(h))
         d = self.post_quant_linear(later).reshape(-1, grid // p, grid // p, p, p, cfg.latent)

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from benchmarks.pytorch.magvit2 import Decoder, Encoder
+from benchmarks.pytorch.magvit2 import MagvitDecoderTorch, MagvitEncoderTorch
 from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import Config, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
@@ -41,7 +41,8 @@ class STBlock(nn.Module):
 
     def __init__(self, config: Architecture) -> None:
         super().__init__()
-        self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.norm1 = nn.LayerNorm(config.width)
+        self.norm2 = nn.LayerNorm(config.width)
         self.spatial_attn = Attention(config.width, config.heads)
         self.temporal_attn = Attention(config.width, config.heads)
         hidden = config.mlp_ratio * config.width
@@ -123,11 +124,14 @@ def decode_frame(model: GenieTorch, tokens: Tensor, t: int, steps: int, actions:
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
     """Returns the work to time; sampling decodes one frame, and each of its steps passes over the whole window."""
-    arch, model = Architecture.create(config), config.model
+    arch = Architecture.create(config)
+    model = config.model
     assert isinstance(model, TokenModelConfig)
     network = GenieTorch(arch).to(device)
-    encoder, decoder = Encoder(config.tokenizer).to(device), Decoder(config.tokenizer).to(device)
-    frames, window = config.clips.frames, min(horizon, arch.frames)
+    encoder = MagvitEncoderTorch(config.tokenizer).to(device)
+    decoder = MagvitDecoderTorch(config.tokenizer).to(device)
+    frames = config.clips.frames
+    window = min(horizon, arch.frames)
     tokens = torch.randint(0, 2**arch.code_bits, (batch, max(frames, window), arch.grid**2), device=device)
     actions = torch.randn(*tokens.shape[:2], max(1, arch.action_inputs), device=device)
     mask = torch.rand(tokens[:, :frames].shape, device=device) < 0.5

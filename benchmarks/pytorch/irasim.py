@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from diffusers import AutoencoderKL, DDIMScheduler, PNDMScheduler
 from torch import Tensor, nn
 
-from benchmarks.pytorch.magvit2 import Decoder, Encoder
+from benchmarks.pytorch.magvit2 import MagvitDecoderTorch, MagvitEncoderTorch
 from benchmarks.pytorch.measure import TorchWork
 from rsjax.config import Config
 from rsjax.models.diffusion.layers import TIME_CHANNELS, grid_positions, positions
@@ -27,7 +27,9 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.heads, self.qkv, self.proj = heads, nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         n, length, width = x.shape
@@ -40,21 +42,24 @@ class Mlp(nn.Module):
 
     def __init__(self, inputs: int, hidden: int, width: int, gelu: bool = True) -> None:
         super().__init__()
-        self.fc1, self.fc2, self.gelu = nn.Linear(inputs, hidden), nn.Linear(hidden, width), gelu
+        self.fc1 = nn.Linear(inputs, hidden)
+        self.fc2 = nn.Linear(hidden, width)
+        self.gelu = gelu
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.fc1(x)
         return self.fc2(F.gelu(x, approximate="tanh") if self.gelu else x)
 
 
-class Block(nn.Module):
+class DiTBlockTorch(nn.Module):
     """Attention, then an MLP, each with adaptive LayerNorm and gate, on (N, L, D) under a condition (N, D)."""
 
     def __init__(self, config: Architecture) -> None:
         super().__init__()
         width = config.width
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=1e-6, elementwise_affine=False) for _ in range(2))
-        self.attn, self.mlp = Attention(width, config.heads), Mlp(width, config.mlp_ratio * width, width)
+        self.attn = Attention(width, config.heads)
+        self.mlp = Mlp(width, config.mlp_ratio * width, width)
         self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -86,7 +91,9 @@ class IRASimTorch(nn.Module):
 
     def __init__(self, config: Architecture) -> None:
         super().__init__()
-        self.config, width, video = config, config.width, config.conditioning == "video"
+        self.config = config
+        width = config.width
+        video = config.conditioning == "video"
         patch = (config.patch_size, config.patch_size)
         self.x_embedder = nn.ModuleDict({"proj": nn.Conv2d(config.channels, width, patch, patch)})
         self.t_embedder = nn.ModuleDict(
@@ -95,14 +102,15 @@ class IRASimTorch(nn.Module):
         inputs = config.action_inputs * (config.frames - 1 if video else 1)
         self.embed_state = Mlp(inputs, config.mlp_ratio * width, width, config.action_activation == "gelu")
         self.mask_emb_fn = nn.Embedding(1, width)
-        self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(DiTBlockTorch(config) for _ in range(config.blocks))
         self.final_layer = Final(config)
         fixed = {"pos_embed": grid_positions(*config.grid, width), "temp_embed": positions(config.frames, width)}
         for name, x in fixed.items():
             self.register_buffer(name, torch.from_numpy(x)[None])
 
     def forward(self, latents: Tensor, t: Tensor, actions: Tensor) -> Tensor:
-        cfg, (clips, frames) = self.config, latents.shape[:2]
+        cfg = self.config
+        clips, frames = latents.shape[:2]
         x = self.x_embedder["proj"](latents.flatten(0, 1)).flatten(2).transpose(1, 2) + self.pos_embed
         cells = x.shape[1]
         half = TIME_CHANNELS // 2
@@ -123,7 +131,8 @@ class IRASimTorch(nn.Module):
             x = block(x.flatten(0, 1), plain[:, 0].repeat_interleave(cells, 0))
             x = x.reshape(clips, cells, frames, -1).transpose(1, 2).flatten(0, 1)
         x = self.final_layer(x, plain.flatten(0, 1))
-        p, (rows, columns) = cfg.patch_size, cfg.grid
+        p = cfg.patch_size
+        rows, columns = cfg.grid
         x = x.reshape(clips, frames, rows, columns, p, p, cfg.channels).permute(0, 1, 6, 2, 4, 3, 5)
         return x.reshape(clips, frames, cfg.channels, rows * p, columns * p)
 
@@ -133,8 +142,8 @@ def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
     if config.network == "magvit2":
         halves = nn.ModuleList(
             [
-                Encoder(config.convolutions),
-                Decoder(replace(config.convolutions, code_bits=config.latent_channels, vocabularies=1)),
+                MagvitEncoderTorch(config.convolutions),
+                MagvitDecoderTorch(replace(config.convolutions, code_bits=config.latent_channels, vocabularies=1)),
             ]
         )
         return halves, lambda x: halves[0](x).chunk(2, dim=1)[0], halves[1]
@@ -152,7 +161,9 @@ def autoencoder(config: KLConfig) -> tuple[nn.Module, Any, Any]:
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
     """Returns the work to time; sampling goes from pixels to pixels, in chunks as long as a clip."""
-    model, clips, arch = config.model, config.clips, architecture(config)
+    model = config.model
+    clips = config.clips
+    arch = architecture(config)
     assert isinstance(model, IRASimConfig)
     network = IRASimTorch(arch).to(device)
     vae, encode, decode = autoencoder(model.autoencoder)
@@ -199,7 +210,8 @@ def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
 
 def make_scheduler(model: IRASimConfig) -> Any:
     """Returns the sampler of ``diffusers`` with the model's settings, at its first step."""
-    noise, sample = model.noise, model.sample
+    noise = model.noise
+    sample = model.sample
     kind, more = (PNDMScheduler, {}) if sample.sampler == "pndm" else (DDIMScheduler, {"clip_sample": False})
     scheduler = kind(
         num_train_timesteps=noise.steps,

@@ -30,8 +30,10 @@ class Sampler:
         )
         self.tokenizer = ConditionalVQTorch(config.autoencoder, clips.image_size)
         self.inputs = clips.action_dim * (1 + config.integrate_actions)
-        self.llama, self.actions = LlamaForCausalLM(settings), nn.Linear(self.inputs, config.width)
-        self.temperature, self.top_k = config.sample.temperature or 1.0, config.sample.top_k or self.layout.vocabulary
+        self.llama = LlamaForCausalLM(settings)
+        self.actions = nn.Linear(self.inputs, config.width)
+        self.temperature = config.sample.temperature or 1.0
+        self.top_k = config.sample.top_k or self.layout.vocabulary
 
     def loss(self, tokens: Tensor, actions: Tensor) -> Tensor:
         """Returns the mean cross-entropy of sequences (B, L) after the first slot; actions (B, F, A)."""
@@ -42,7 +44,8 @@ class Sampler:
     @torch.no_grad()
     def generate(self, frames: Tensor, actions: Tensor) -> Tensor:
         """Returns videos (B, c + F, 3, H, W) from context frames (B, c, 3, H, W) and actions (B, F, A)."""
-        layout, (clips, count) = self.layout, frames.shape[:2]
+        layout = self.layout
+        clips, count = frames.shape[:2]
         stand_in = torch.cat([frames, frames[:, -1:]], 1)  # the tokenizer needs at least one later frame
         context = self.tokenizer.tokenize(stand_in)[0]
         separators = torch.full((clips, count, 1), layout.separator, device=frames.device)
@@ -69,9 +72,11 @@ class Sampler:
 
 def create(config: Config, batch: int, horizon: int, device: str) -> TorchWork:
     """Returns the work to time; sampling goes from pixels to pixels."""
-    model, clips = config.model, config.clips
+    model = config.model
+    clips = config.clips
     assert isinstance(model, IVideoGPTConfig)
-    sampler, context = Sampler(model, clips), model.autoencoder.context_frames
+    sampler = Sampler(model, clips)
+    context = model.autoencoder.context_frames
     for network in (sampler.tokenizer, sampler.llama, sampler.actions):
         network.to(device)
     layout = sampler.layout

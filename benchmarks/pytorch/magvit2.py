@@ -24,13 +24,14 @@ def _norm(config: TokenizerConfig, width: int, local: bool) -> nn.GroupNorm:
     return (CellNorm if local else nn.GroupNorm)(config.norm_groups, width, eps=1e-6)
 
 
-class Block(nn.Module):
+class MagvitResBlockTorch(nn.Module):
     """GroupNorm → SiLU → convolution, twice, plus the input; with ``local`` no cell sees another."""
 
     def __init__(self, config: TokenizerConfig, width_in: int, width: int, local: bool = False) -> None:
         super().__init__()
         side = 1 if local else 3
-        self.norm1, self.norm2 = _norm(config, width_in, local), _norm(config, width, local)
+        self.norm1 = _norm(config, width_in, local)
+        self.norm2 = _norm(config, width, local)
         self.conv1 = nn.Conv2d(width_in, width, side, padding=side // 2, bias=False)
         self.conv2 = nn.Conv2d(width, width, side, padding=side // 2, bias=False)
         if width_in != width:
@@ -42,16 +43,20 @@ class Block(nn.Module):
 
 
 def _blocks(config: TokenizerConfig, width_in: int, width: int, local: bool = False) -> nn.ModuleList:
-    return nn.ModuleList(Block(config, width if i else width_in, width, local) for i in range(config.res_blocks))
+    return nn.ModuleList(
+        MagvitResBlockTorch(config, width if i else width_in, width, local) for i in range(config.res_blocks)
+    )
 
 
-class Encoder(nn.Module):
+class MagvitEncoderTorch(nn.Module):
     """Maps images (N, 3, H, W) to latents (N, C, h, w)."""
 
     def __init__(self, config: TokenizerConfig) -> None:
         super().__init__()
-        local, width = config.local_codes, config.channels
-        self.patch, side = config.patch_size, 1 if local else 3
+        local = config.local_codes
+        width = config.channels
+        self.patch = config.patch_size
+        side = 1 if local else 3
         self.conv_in = nn.Conv2d(3 * config.patch_size**2, width, side, padding=side // 2, bias=False)
         levels = []
         for i, multiplier in enumerate(config.channel_multipliers):
@@ -63,7 +68,8 @@ class Encoder(nn.Module):
             levels.append(level)
         self.down = nn.ModuleList(levels)
         self.mid_block = _blocks(config, width, width, local)
-        self.norm_out, self.conv_out = _norm(config, width, local), nn.Conv2d(width, config.code_bits, 1)
+        self.norm_out = _norm(config, width, local)
+        self.conv_out = nn.Conv2d(width, config.code_bits, 1)
 
     def forward(self, images: Tensor) -> Tensor:
         x = self.conv_in(to_channels(images, self.patch))
@@ -81,21 +87,25 @@ class Adaptive(nn.Module):
     def __init__(self, config: TokenizerConfig, width: int) -> None:
         super().__init__()
         self.groups = config.norm_groups
-        self.gamma, self.beta = nn.Linear(config.code_bits, width), nn.Linear(config.code_bits, width)
+        self.gamma = nn.Linear(config.code_bits, width)
+        self.beta = nn.Linear(config.code_bits, width)
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:
         scale = self.gamma((codes.var((2, 3)) + 1e-6).sqrt())[..., None, None]
         return scale * F.group_norm(x, self.groups, eps=1e-6) + self.beta(codes.mean((2, 3)))[..., None, None]
 
 
-class Decoder(nn.Module):
+class MagvitDecoderTorch(nn.Module):
     """Maps codes or latents (N, C, h, w) to images (N, 3, H, W), not clipped."""
 
     def __init__(self, config: TokenizerConfig) -> None:
         super().__init__()
-        self.patch, width = config.patch_size, config.channels * config.channel_multipliers[-1]
+        self.patch = config.patch_size
+        width = config.channels * config.channel_multipliers[-1]
         self.conv_in = nn.Conv2d(config.code_bits, width, 3, padding=1)
-        self.mid_block, levels, norms = _blocks(config, width, width), [], []
+        self.mid_block = _blocks(config, width, width)
+        levels = []
+        norms = []
         for i, multiplier in reversed(list(enumerate(config.channel_multipliers))):
             norms.append(Adaptive(config, width))
             level = nn.ModuleDict({"block": _blocks(config, width, config.channels * multiplier)})

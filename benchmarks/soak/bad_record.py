@@ -32,7 +32,8 @@ def try_bad_record(soak: Soak, show: Callable[[str], None]) -> dict[str, Any]:
     Raises:
         SoakError: the run that was left alone failed.
     """
-    rng, place = random.Random(f"{soak.options.seed} record"), soak.out / "bad-record"
+    rng = random.Random(f"{soak.options.seed} record")
+    place = soak.out / "bad-record"
     shutil.rmtree(place, ignore_errors=True)
     for stage in soak.all_stages[: soak.all_stages.index("world_model")]:
         copy_tree(soak.reference / stage, place / "whole" / stage)

@@ -23,7 +23,8 @@ def compare_stages(one: Path, two: Path) -> list[str]:
     """
     differences = compare_logs(one, two)
     for name in (SKIPPED, QUARANTINE):
-        lines, others = json_lines(one, name), json_lines(two, name)
+        lines = json_lines(one, name)
+        others = json_lines(two, name)
         if lines != others:
             differences.append(f"{name}: {len(lines - others)} lines only here, {len(others - lines)} only there")
     differences += compare_arrays(one / "weights", two / "weights")
@@ -41,7 +42,8 @@ def compare_stages(one: Path, two: Path) -> list[str]:
 
 def compare_logs(one: Path, two: Path) -> list[str]:
     """Returns the first difference between two loss curves as a sentence."""
-    rows, others = read_curve(one), read_curve(two)
+    rows = read_curve(one)
+    others = read_curve(two)
     for row, other in zip(rows, others, strict=False):
         names = [name for name in row | other if repr(row.get(name)) != repr(other.get(name))]  # repr: NaN is NaN
         if names:
@@ -57,7 +59,8 @@ def compare_arrays(one: Path, two: Path) -> list[str]:
     missing = [f"{path}: missing" for path in (one, two) if not path.exists()]
     if missing:
         return missing
-    arrays, others = read_arrays(one), read_arrays(two)
+    arrays = read_arrays(one)
+    others = read_arrays(two)
     only = [f"{one.name}: {name} is only in one of them" for name in sorted(arrays.keys() ^ others.keys())]
     shared = sorted(arrays.keys() & others.keys())
     return only + [f"{one.name}: {name} differs" for name in shared if not same_bits(arrays[name], others[name])]
@@ -79,7 +82,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def compare_stores(one: Path, two: Path) -> list[str]:
     """Returns the splits of two stores whose records differ, one line each."""
-    here, there = open_store(one), open_store(two)
+    here = open_store(one)
+    there = open_store(two)
     if here.splits != there.splits:
         return [f"{one.name}: splits {here.splits} against {there.splits}"]
     return [f"{one.name}: {split} differs" for split in here.splits if _records(here, split) != _records(there, split)]
@@ -92,7 +96,8 @@ def _records(store: Store, split: str) -> list[bytes]:
 
 def json_lines(folder: Path, name: str) -> set[str]:
     """Reads one of a stage's lists, with the run's own path left out; torn and repeated lines do not count."""
-    path, lines = folder / name, set()
+    path = folder / name
+    lines = set()
     for line in path.read_text().splitlines() if path.exists() else ():
         with contextlib.suppress(ValueError):
             lines.add(json.dumps(json.loads(line)).replace(str(folder.parent), "RUN"))

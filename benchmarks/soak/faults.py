@@ -112,7 +112,8 @@ def _kill_writing(attempt: Attempt, rng: random.Random, interval: float) -> Faul
 def _kill(attempt: Attempt) -> Fault:
     """Kills, and counts the kill as what it hit: a checkpoint half written, or the phase."""
     kinds = {"starting": KILL_STARTING, "compiling": KILL_COMPILING, "training": KILL_TRAINING}
-    folder, phase = attempt.folder, attempt.phase()
+    folder = attempt.folder
+    phase = attempt.phase()
     attempt.kill()
     return Fault(KILL_WRITING if phase == "training" and unfinished(folder) else kinds[phase])
 
@@ -125,7 +126,8 @@ def _terminate(attempt: Attempt, rng: random.Random, interval: float) -> Fault |
     if not waited:
         return None
     attempt.process.send_signal(signal.SIGTERM)
-    began, status = time.monotonic(), None
+    began = time.monotonic()
+    status = None
     while status is None and time.monotonic() < began + PATIENCE:
         try:
             status = attempt.process.wait(DUMP_EVERY)
@@ -154,7 +156,8 @@ def _damage(attempt: Attempt, rng: random.Random, interval: float) -> Fault | No
 
 def _has_spare(attempt: Attempt, folder: Path) -> bool:
     """Whether the last checkpoint but one is known to be sound: restored from, or written after the one that was."""
-    steps, resumed = checkpoints(folder), attempt.resumed.get(folder, 0)
+    steps = checkpoints(folder)
+    resumed = attempt.resumed.get(folder, 0)
     return len(steps) > 1 and steps[-1] > resumed and steps[-2] >= resumed
 
 
@@ -187,7 +190,8 @@ def _wait_in_training(attempt: Attempt, rng: random.Random, interval: float) -> 
 def damage_file(directory: Path, rng: random.Random) -> str:
     """Changes a byte of one of the directory's files, or truncates or deletes the file; returns which."""
     path = rng.choice(sorted(p for p in directory.rglob("*") if p.is_file()))
-    content, way = bytearray(path.read_bytes()), rng.choice(("flipped", "truncated", "deleted"))
+    content = bytearray(path.read_bytes())
+    way = rng.choice(("flipped", "truncated", "deleted"))
     if way == "deleted" or not content:
         path.unlink()
         return f"{path.relative_to(directory)} deleted"
@@ -217,7 +221,8 @@ def damage_record(store: Path, rng: random.Random) -> int:
 
 
 def _unreadable(store: Path) -> list[int]:
-    source, numbers = open_store(store).source("train"), []
+    source = open_store(store).source("train")
+    numbers = []
     for number in range(len(source)):
         try:
             source[number]

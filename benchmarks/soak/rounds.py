@@ -114,7 +114,9 @@ def run_round(
         show: prints a line.
     """
     events: list[Event] = []
-    began, starts, kinds = time.monotonic(), 0, iter(kinds)
+    began = time.monotonic()
+    starts = 0
+    kinds = iter(kinds)
     while True:
         kind = next(kinds, None) if time.monotonic() < until else None
         starts += 1

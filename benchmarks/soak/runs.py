@@ -85,7 +85,8 @@ class Soak:
 
 def without(argv: Sequence[str], flags: Collection[str]) -> tuple[str, ...]:
     """Returns arguments without these options, each with one value, whose names have dashes."""
-    kept, words = [], iter(argv)
+    kept = []
+    words = iter(argv)
     for word in words:
         if word.partition("=")[0].replace("_", "-") not in flags:
             kept.append(word)
@@ -103,7 +104,8 @@ def make_reference(soak: Soak, show: Callable[[str], None]) -> None:
     Raises:
         SoakError: ``--reference`` is of another configuration or not finished, or making the run failed.
     """
-    folder, last = soak.reference, soak.all_stages.index(soak.stages[-1])
+    folder = soak.reference
+    last = soak.all_stages.index(soak.stages[-1])
     if soak.options.reference is not None:
         run = Run(soak.config, folder, soak.options.data_dir)
         if missing := [stage for stage in soak.all_stages[: last + 1] if not run.finished(stage)]:
@@ -125,7 +127,8 @@ def make_reference(soak: Soak, show: Callable[[str], None]) -> None:
 
 def prepare(soak: Soak, place: Path) -> Target:
     """Prepares a run for faults: a directory that is empty except for the stages that the reference provides."""
-    run, whole = place / "run", soak.stages == soak.all_stages
+    run = place / "run"
+    whole = soak.stages == soak.all_stages
     for stage in soak.all_stages[: soak.all_stages.index(soak.stages[0])]:
         copy_tree(soak.reference / stage, run / stage)
     place.mkdir(parents=True, exist_ok=True)
@@ -153,7 +156,8 @@ def step_seconds(folder: Path) -> float:
 
 def compare_with_reference(soak: Soak, place: Path) -> list[str]:
     """Returns the differences between a run with faults and the reference; none if they are bit-identical."""
-    run, reference = place / "run", soak.reference
+    run = place / "run"
+    reference = soak.reference
     lines = [f"{stage}: {line}" for stage in soak.trained for line in compare_stages(run / stage, reference / stage)]
     if soak.stages == soak.all_stages:
         pairs = ((run, place / "data"), (reference, soak.options.data_dir))

@@ -52,7 +52,8 @@ def run_soak(soak: Soak, command: str, show: Callable[[str], None]) -> dict[str,
         if not can_mount(soak.out):
             kinds = {kind: share for kind, share in SHARES.items() if kind != FULL_DISK}
             result["notes"] = ["No full disks: mounting a small one needs root and Linux."]
-        rounds, seconds = result["rounds"], 60 * soak.options.minutes
+        rounds = result["rounds"]
+        seconds = 60 * soak.options.minutes
         while not any(map(failed, rounds)) and (left := seconds - sum(one["seconds"] for one in rounds)) > 0:
             rounds.append(_round(soak, len(rounds) + 1, kinds, left, show))
             _save(soak, result)
@@ -66,7 +67,8 @@ def _round(
     soak: Soak, number: int, kinds: dict[str, int], seconds: float, show: Callable[[str], None]
 ) -> dict[str, Any]:
     """Runs a round and compares it; returns it as JSON. The run is kept if it fails or differs."""
-    place, rng = soak.out / "round", random.Random(f"{soak.options.seed} {number}")
+    place = soak.out / "round"
+    rng = random.Random(f"{soak.options.seed} {number}")
     shutil.rmtree(place, ignore_errors=True)
     target = prepare(soak, place)
     until = time.monotonic() + seconds

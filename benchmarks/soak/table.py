@@ -26,7 +26,8 @@ def _row(kind: str, events: Sequence[dict[str, Any]]) -> tuple[str, ...]:
 
 def conclusion(result: dict[str, Any]) -> list[str]:
     """Returns the result in a few sentences: the time under faults, and whether the runs ended the same."""
-    rounds, trial = result["rounds"], result["bad_record"]
+    rounds = result["rounds"]
+    trial = result["bad_record"]
     seconds, starts = (sum(one[name] for one in rounds) for name in ("seconds", "starts"))
     lines = [
         f"{duration(seconds)} with faults, {starts} starts of the command.",
@@ -55,7 +56,8 @@ def failed(one: dict[str, Any]) -> bool:
 
 def passed(result: dict[str, Any]) -> bool:
     """Whether every fault was survived and nothing differed."""
-    rounds, trial = result["rounds"], result["bad_record"]
+    rounds = result["rounds"]
+    trial = result["bad_record"]
     survived = all(event["survived"] for one in rounds for event in one["events"])
     return bool(rounds) and survived and not any(map(failed, rounds)) and (trial is None or trial["passed"])
 

@@ -6,8 +6,7 @@ gradient of their sum equals the reference's two. As there, both use the paramet
 Axes: B images, H×W pixels.
 """
 
-from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -54,28 +53,34 @@ def adversarial_terms(
         "adversarial", the non-saturating loss of each image's mean logit; "hinge"; "lecam"; and "real_logit" and
         "fake_logit", which carry no gradient.
     """
+
+    def logits(params: Params, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w"]:
+        return cast(Array, Discriminator(axis_name).apply({"params": params}, images))
+
     # Batch norm must not mix real and fake images, hence three passes (XLA merges the two on fakes).
-    judge = cast(Callable[[Any, Array], Array], lambda p, images: Discriminator(axis_name).apply({"params": p}, images))
-    fooled = judge(jax.lax.stop_gradient(params), output)
-    real, fake = judge(params, target), judge(params, jax.lax.stop_gradient(output))
+    fooled = logits(jax.lax.stop_gradient(params), output)
+    real = logits(params, target)
+    fake = logits(params, jax.lax.stop_gradient(output))
 
     count = jnp.float32(len(target))
-    logits = {name: (jax.lax.stop_gradient(jnp.mean(x)) * count, count) for name, x in (("real", real), ("fake", fake))}
-    global_means = {
-        name: _total(value, axis_name) / _total(weight, axis_name) for name, (value, weight) in logits.items()
-    }
-    anchors = updated_averages(averages, **global_means, decay=train.lecam_decay)
+    real_sum = jax.lax.stop_gradient(jnp.mean(real)) * count
+    fake_sum = jax.lax.stop_gradient(jnp.mean(fake)) * count
+    real_mean = _total(real_sum, axis_name) / _total(count, axis_name)
+    fake_mean = _total(fake_sum, axis_name) / _total(count, axis_name)
+    anchors = updated_averages(averages, real_mean, fake_mean, train.lecam_decay)
     means = {
         "adversarial": jnp.mean(jax.nn.softplus(-jnp.mean(fooled, axis=(1, 2)))),
         "hinge": jnp.mean(jax.nn.relu(1 - real)) + jnp.mean(jax.nn.relu(1 + fake)),
         "lecam": _mean_square_excess(real - anchors["fake"]) + _mean_square_excess(anchors["real"] - fake),
     }
     terms = {name: (active * mean * count, count) for name, mean in means.items()}
-    return terms | {"real_logit": logits["real"], "fake_logit": logits["fake"]}
+    return terms | {"real_logit": (real_sum, count), "fake_logit": (fake_sum, count)}
 
 
 def _total(x: Scalar, axis_name: str | None) -> Scalar:
-    return jax.lax.psum(x, axis_name) if axis_name else x
+    if axis_name is None:
+        return x
+    return jax.lax.psum(x, axis_name)
 
 
 def _mean_square_excess(x: Array) -> Scalar:

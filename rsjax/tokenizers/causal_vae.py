@@ -7,6 +7,7 @@ Axes: B videos, T frames of a piece, H×W pixels or cells, C channels, z latent 
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -39,8 +40,10 @@ class CausalConv(nn.Module):
     @nn.compact
     def __call__(self, x: Video) -> Video:
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (SIZE, SIZE, SIZE, x.shape[-1], self.features))
-        known = self.has_variable(PAST, "frames")
-        past = self.get_variable(PAST, "frames") if known else jnp.repeat(x[:, :1], SIZE - 1, axis=1)
+        if self.has_variable(PAST, "frames"):
+            past: Video = self.get_variable(PAST, "frames")
+        else:
+            past = jnp.repeat(x[:, :1], SIZE - 1, axis=1)
         frames = jnp.concatenate([past, x], axis=1)
         if self.is_mutable_collection(PAST):
             self.put_variable(PAST, "frames", frames[:, 1 - SIZE :])
@@ -52,13 +55,17 @@ def convolve(frames: Video, kernel: Float[Array, "3 3 3 C D"], dtype: Dtype) -> 
     around = ((1, 1), (1, 1))
     if not on_cpu():
         names = ("NTHWC", "THWIO", "NTHWC")
-        frames, kernel = frames.astype(dtype), kernel.astype(dtype)
+        frames = frames.astype(dtype)
+        kernel = kernel.astype(dtype)
         made = jax.lax.conv_general_dilated(frames, kernel, (1, 1, 1), ((0, 0), *around), dimension_numbers=names)
         return made.astype(jnp.float32)
-    count, names = frames.shape[1] - SIZE + 1, ("NHWC", "HWIO", "NHWC")
+    count = frames.shape[1] - SIZE + 1
+    names = ("NHWC", "HWIO", "NHWC")
     stacked = jnp.concatenate([frames[:, i : i + count] for i in range(SIZE)], axis=-1)
     flat = kernel.transpose(1, 2, 0, 3, 4).reshape(SIZE, SIZE, -1, kernel.shape[-1])
-    convolve = convolve_bf16 if dtype == "bfloat16" else jax.lax.conv_general_dilated
+    convolve: Any = jax.lax.conv_general_dilated
+    if dtype == "bfloat16":
+        convolve = convolve_bf16
     return by_frame(stacked, lambda x: convolve(x, flat, (1, 1), around, dimension_numbers=names))
 
 
@@ -82,7 +89,9 @@ class CellNorm(nn.Module):
 
 def spread(cells: Video, like: Video) -> Video:
     """Repeats cells to the frames, rows and columns of another video; in time as :func:`_repeat` does."""
-    frames, times, alone = like.shape[1], like.shape[2] // cells.shape[2], cells.shape[1] % 2
+    frames = like.shape[1]
+    times = like.shape[2] // cells.shape[2]
+    alone = cells.shape[1] % 2
     if cells.shape[1] != frames:
         cells = _repeat(cells, (frames - alone) // (cells.shape[1] - alone))
     return cells.repeat(times, axis=2).repeat(times, axis=3)
@@ -101,7 +110,7 @@ def _halve(x: Video) -> Video:
     return jnp.concatenate([x[:, :alone], (x[:, alone::2] + x[:, alone + 1 :: 2]) / 2], axis=1)
 
 
-class ResBlock(nn.Module):
+class CausalResBlock(nn.Module):
     """Norm → SiLU → causal convolution, twice, plus the input, through a linear layer where the width changes."""
 
     features: int
@@ -122,59 +131,65 @@ class ResBlock(nn.Module):
         return x + h
 
 
-class Encoder(nn.Module):
+class CausalEncoder(nn.Module):
     """Maps a piece of a video to the posterior's mean and log-variance, (B, t, h, w, 2 z)."""
 
     config: CausalVAEConfig
 
     @nn.compact
     def __call__(self, frames: Float[Array, "B T H W 3"]) -> Video:
-        cfg, last, dtype = self.config, len(self.config.widths) - 1, self.config.compute_dtype
-        x = frames if cfg.patch_size == 1 else by_frame(frames, lambda x: space_to_depth(x, cfg.patch_size))
+        cfg = self.config
+        last = len(cfg.widths) - 1
+        dtype = cfg.compute_dtype
+        x = by_frame(frames, partial(space_to_depth, factor=cfg.patch_size))
         x = CausalConv(cfg.widths[0], dtype, name="conv_in")(x)
         for level, width in enumerate(cfg.widths):
             for i in range(cfg.res_blocks):
-                x = ResBlock(width, cfg.norm_groups, dtype, name=f"down_{level}_block_{i}")(x)
+                x = CausalResBlock(width, cfg.norm_groups, dtype, name=f"down_{level}_block_{i}")(x)
             if level < last:
-                x = _halve(x) if level < TIME_LEVELS and x.shape[1] > 1 else x
+                if level < TIME_LEVELS and x.shape[1] > 1:
+                    x = _halve(x)
                 x = by_frame(x, Downsample(name=f"down_{level}_downsample"))
         for i in range(2):
-            x = ResBlock(cfg.widths[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
+            x = CausalResBlock(cfg.widths[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
         x = nn.silu(GroupNorm(cfg.norm_groups, name="norm_out")(x))
         return CausalConv(2 * cfg.latent_channels, dtype, name="conv_out")(x)
 
 
-class Decoder(nn.Module):
+class CausalDecoder(nn.Module):
     """Maps a piece of latents to frames, not clipped."""
 
     config: CausalVAEConfig
 
     @nn.compact
     def __call__(self, latents: Float[Array, "B t h w z"]) -> Float[Array, "B T H W 3"]:
-        cfg, last, dtype = self.config, len(self.config.widths) - 1, self.config.compute_dtype
+        cfg = self.config
+        last = len(cfg.widths) - 1
+        dtype = cfg.compute_dtype
         x = CausalConv(cfg.widths[-1], dtype, name="conv_in")(latents)
         for i in range(2):
-            x = ResBlock(cfg.widths[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x, latents)
+            x = CausalResBlock(cfg.widths[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x, latents)
         for level, width in enumerate(reversed(cfg.widths)):
             for i in range(cfg.res_blocks + 1):
-                x = ResBlock(width, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x, latents)
+                x = CausalResBlock(width, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x, latents)
             if level < last:
                 # Repeating frames after this layer gives the same result as before it, with half the work.
                 x = by_frame(x, Upsample(dtype, name=f"up_{level}_upsample"))
-                x = _repeat(x, 2) if level < TIME_LEVELS and x.shape[1] > 1 else x
+                if level < TIME_LEVELS and x.shape[1] > 1:
+                    x = _repeat(x, 2)
         x = nn.silu(CellNorm(cfg.norm_groups, name="norm_out")(x, latents))
         x = CausalConv(3 * cfg.patch_size**2, dtype, name="conv_out")(x)
-        return x if cfg.patch_size == 1 else by_frame(x, lambda x: depth_to_space(x, cfg.patch_size))
+        return by_frame(x, partial(depth_to_space, factor=cfg.patch_size))
 
 
 def encode(config: CausalVAEConfig, params: Params, frames: Float[Array, "B T H W 3"]) -> Float[Array, "B t h w z2"]:
     """Returns the posterior's mean and log-variance of whole videos of 8k + 1 frames, piece by piece."""
-    return _in_pieces(Encoder(config), params["encoder"], frames, ENCODED)
+    return _in_pieces(CausalEncoder(config), params["encoder"], frames, ENCODED)
 
 
 def decode(config: CausalVAEConfig, params: Params, latents: Float[Array, "B t h w z"]) -> Float[Array, "B T H W 3"]:
     """Returns the frames of whole videos' latents, an odd number of latent frames, piece by piece."""
-    return _in_pieces(Decoder(config), params["decoder"], latents, DECODED)
+    return _in_pieces(CausalDecoder(config), params["decoder"], latents, DECODED)
 
 
 def _in_pieces(network: nn.Module, params: Params, x: Video, size: int) -> Video:

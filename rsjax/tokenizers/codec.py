@@ -24,9 +24,10 @@ from rsjax.trainable import Params
 Tokens = dict[str, Int[np.ndarray, "B T h w"]]
 Grids: TypeAlias = Int[np.ndarray, "*B h w"] | Float32[np.ndarray, "*B h w D"]  # tokens, or codes of D bits
 
-Result = TypeVar("Result")
+T = TypeVar("T")
 
-PIXELS, CPU_PIXELS = 128 * 64**2, 16 * 64**2  # of a pass; a CPU keeps the features of so few pixels in its cache
+PIXELS = 128 * 64**2  # of a pass
+CPU_PIXELS = 16 * 64**2  # a CPU keeps the features of so few pixels in its cache
 
 
 @dataclass(frozen=True)
@@ -93,16 +94,23 @@ class Codec:
 
     def _chunked(self, method: Literal["encode", "decode"], images: np.ndarray) -> np.ndarray:
         def apply(chunk: np.ndarray) -> ArrayLike:
-            return _apply(self.config, method, self.params, divide(chunk, self.params))
+            x = divide(chunk, self.params)
+            return _run(self.config, method, mesh_of(x), self.params, x)
 
-        axes = 3 if method == "encode" or images.dtype == np.float32 else 2  # of pixels, of codes, or of tokens
-        side = images.shape[1 - axes] * (self.config.downsampling if method == "decode" else 1)
+        axes = 3  # of pixels, or of codes
+        if method == "decode" and images.dtype != np.float32:
+            axes = 2  # of tokens
+        side = images.shape[1 - axes]
+        if method == "decode":
+            side *= self.config.downsampling
         return in_chunks(apply, images, axes, images_per_pass(side))
 
 
 def images_per_pass(side: int) -> int:
     """Returns how many images of ``side`` × ``side`` pixels one pass takes, over all devices."""
-    pixels = CPU_PIXELS * jax.local_device_count() if jax.default_backend() == "cpu" else PIXELS
+    pixels = PIXELS
+    if jax.default_backend() == "cpu":
+        pixels = CPU_PIXELS * jax.local_device_count()
     return max(1, pixels // side**2)
 
 
@@ -113,7 +121,8 @@ def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_
         apply: the function; its result for an item must not depend on the other items.
         items: with any leading axes before the ``item_axes`` of an item.
     """
-    lead, item = items.shape[:-item_axes], items.shape[-item_axes:]
+    lead = items.shape[:-item_axes]
+    item = items.shape[-item_axes:]
     flat = items.reshape(-1, *item)
     whole = 2 ** (len(flat) - 1).bit_length()  # powers of 2, so that few programs are compiled
     size = max(1, min(most, whole // passes_at_once()))
@@ -127,7 +136,7 @@ def in_chunks(apply: Callable[[np.ndarray], ArrayLike], items: np.ndarray, item_
     return joined.reshape(*lead, *joined.shape[1:])
 
 
-def each_pass(run: Callable[[int], Result], starts: range) -> list[Result]:
+def each_pass(run: Callable[[int], T], starts: range) -> list[T]:
     """Returns the results of passes that start at these items, :func:`passes_at_once` of which run at the same time."""
     with ThreadPoolExecutor(passes_at_once()) as threads:
         return list(threads.map(run, starts))
@@ -138,11 +147,9 @@ def passes_at_once() -> int:
 
     Passes on several devices must keep their order.
     """
-    return 2 if jax.default_backend() == "cpu" and jax.device_count() == 1 else 1
-
-
-def _apply(config: TokenizerConfig, method: str, params: Params, x: ArrayLike) -> ArrayLike:
-    return _run(config, method, mesh_of(x), params, x)
+    if jax.default_backend() == "cpu" and jax.device_count() == 1:
+        return 2
+    return 1
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

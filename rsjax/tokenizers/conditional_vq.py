@@ -35,7 +35,8 @@ class CrossAttention(nn.Module):
 
     @nn.compact
     def __call__(self, z: Map, context: Float[Array, "B c h w C"], index: Index) -> Map:
-        cfg, (clips, frames, h, w, width) = self.config, context.shape
+        cfg = self.config
+        clips, frames, h, w, width = context.shape
         # Context frames are stacked along the height before the norm, as in the public code.
         kv = GroupNorm(cfg.norm_groups, 1e-5, name="kv_norm")(context.reshape(clips, frames * h, w, width))
         kv = kv.reshape(clips, -1, width) + self.param("kv_pos_emb", nn.initializers.zeros, (frames * h * w, width))
@@ -54,7 +55,8 @@ class CrossAttention(nn.Module):
         """Returns dropout by the clip's number, so that a step does not depend on how its batch is split."""
         if index is None or not self.config.dropout:
             return lambda x, draw: x
-        key, share = self.make_rng("dropout"), 1 - self.config.dropout
+        key = self.make_rng("dropout")
+        share = 1 - self.config.dropout
 
         def drop(x: Float[Array, "B ..."], draw: Any) -> Float[Array, "B ..."]:
             def kept(number: Int[Array, ""]) -> Bool[Array, "..."]:
@@ -86,7 +88,7 @@ def _attend(
     return jnp.moveaxis(made, 0, 1)
 
 
-class Encoder(nn.Module):
+class ConditionalEncoder(nn.Module):
     """Maps images in [0, 1] to latents; later frames need the features of the ``context``."""
 
     config: ConditionalVQConfig
@@ -96,14 +98,15 @@ class Encoder(nn.Module):
         self, images: Float[Array, "N H W 3"], context: Features | None = None, index: Index = None
     ) -> tuple[Map, list[Map]]:
         """Returns the latents (N, g, g, latent), and the features after each level."""
-        cfg, features = self.config, list[Map]()
-        x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
+        cfg = self.config
+        features = list[Map]()
+        x = space_to_depth(images, cfg.patch_size)
         after = _crossing(cfg, context, index, features)
         sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, cfg.latent)
         return encode(x, *sizes, context is not None, cfg.compute_dtype, after), features
 
 
-class Decoder(nn.Module):
+class ConditionalDecoder(nn.Module):
     """Maps latents to images in about [0, 1] (not clipped); later frames need the features of the ``context``."""
 
     config: ConditionalVQConfig
@@ -113,11 +116,12 @@ class Decoder(nn.Module):
         self, latents: Map, context: Features | None = None, index: Index = None
     ) -> tuple[Float[Array, "N H W 3"], list[Map]]:
         """Returns images, and the features after the middle and each level."""
-        cfg, features = self.config, list[Map]()
+        cfg = self.config
+        features = list[Map]()
         after = _crossing(cfg, context, index, features)
         sizes = (cfg.widths, cfg.res_blocks, cfg.norm_groups, 3 * cfg.patch_size**2)
         x = decode(latents, *sizes, context is not None, cfg.compute_dtype, after)
-        return (depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x), features
+        return depth_to_space(x, cfg.patch_size), features
 
 
 def _crossing(
@@ -179,12 +183,15 @@ class ConditionalVQ(nn.Module):
 
     def setup(self) -> None:
         cfg = self.config
-        self.encoder, self.cond_encoder = Encoder(cfg), Encoder(cfg)
-        self.decoder, self.cond_decoder = Decoder(cfg), Decoder(cfg)
+        self.encoder = ConditionalEncoder(cfg)
+        self.cond_encoder = ConditionalEncoder(cfg)
+        self.decoder = ConditionalDecoder(cfg)
+        self.cond_decoder = ConditionalDecoder(cfg)
         self.quant_conv, self.post_quant_conv = (nn.Conv(cfg.latent, (1, 1)) for _ in range(2))
         self.quant_linear = nn.Dense(cfg.latent)
         self.post_quant_linear = nn.Dense(cfg.latent * cfg.future_patch**2)
-        self.quantize, self.dynamics_quantize = Codebook(cfg), Codebook(cfg)
+        self.quantize = Codebook(cfg)
+        self.dynamics_quantize = Codebook(cfg)
 
     def __call__(self, frames: Float[Array, "B T H W 3"], index: Index = None) -> Reconstruction:
         """Encodes and decodes clips in [0, 1], differentiable through the codebooks."""

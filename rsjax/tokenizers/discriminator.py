@@ -38,7 +38,9 @@ class BatchNorm(nn.Module):
 
     def _over_batch(self, x: Float[Array, "B h w C"]) -> Float[Array, " C"]:
         mean = jnp.mean(x, axis=(0, 1, 2))
-        return jax.lax.pmean(mean, self.axis_name) if self.axis_name else mean
+        if self.axis_name is None:
+            return mean
+        return jax.lax.pmean(mean, self.axis_name)
 
 
 class Discriminator(nn.Module):

@@ -36,7 +36,9 @@ def _positions(config: TokenizerConfig, image_size: int, half: str, module: str)
     if level := re.match(r"(down|up)_(\d+)_", module):
         return (size // 2 ** (int(level[2]) + module.endswith("downsample"))) ** 2
     at_full_size = {"encoder": "conv_in", "decoder": "conv_out"}[half]
-    return size**2 if module == at_full_size else config.grid(image_size) ** 2
+    if module == at_full_size:
+        return size**2
+    return config.grid(image_size) ** 2
 
 
 def traced_flops(
@@ -63,8 +65,11 @@ def products(jaxpr: Any) -> int:
             (contracted, _), _ = eqn.params["dimension_numbers"]
             total += 2 * eqn.outvars[0].aval.size * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
         elif eqn.primitive.name == "conv_general_dilated":
-            kernel, spec = eqn.invars[1].aval, eqn.params["dimension_numbers"].rhs_spec
+            kernel = eqn.invars[1].aval
+            spec = eqn.params["dimension_numbers"].rhs_spec
             total += 2 * eqn.outvars[0].aval.size * kernel.size // kernel.shape[spec[0]]
-        turns = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
+        turns = 1
+        if eqn.primitive.name == "scan":
+            turns = eqn.params["length"]
         total += turns * sum(products(inner) for inner in jaxprs_in_params(eqn.params))
     return total

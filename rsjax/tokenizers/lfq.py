@@ -101,7 +101,8 @@ def entropy_loss(
         total: adds arrays over devices. The average code covers all devices' tokens, the mean entropy only this one's.
     """
     logits = 4.0 * latents.reshape(-1, latents.shape[-1]).astype(jnp.float32) / temperature  # (N, D)
-    log_one, log_zero = jax.nn.log_sigmoid(logits), jax.nn.log_sigmoid(-logits)
+    log_one = jax.nn.log_sigmoid(logits)
+    log_zero = jax.nn.log_sigmoid(-logits)
     per_token = -jnp.sum(jnp.exp(log_one) * log_one + jnp.exp(log_zero) * log_zero, axis=-1)
 
     half = logits.shape[-1] // 2

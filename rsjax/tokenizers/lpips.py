@@ -112,7 +112,9 @@ def load_lpips(path: str | Path, wanted_net: str = "") -> dict[str, Any]:
         raise LpipsError(f"{path}: these LPIPS weights are of {net}, not of {wanted_net}; name the other file")
     wanted = lpips_shapes(net)
     for name in sorted(wanted.keys() | tensors.keys()):
-        shape = tensors[name].shape if name in tensors else "missing"
+        shape: Any = "missing"
+        if name in tensors:
+            shape = tensors[name].shape
         if shape != wanted.get(name, "none"):
             raise LpipsError(f"{path}: {name} is {shape}, {net} needs {wanted.get(name, 'none')}; make it again")
     nested: dict[str, Any] = {"backbone": {}, "head": {}}
@@ -130,7 +132,8 @@ def min_size(params: dict[str, Any]) -> int:
 def lpips_shapes(net: str) -> dict[str, tuple[int, ...]]:
     """Returns the shape of every tensor of a file by name."""
     shapes: dict[str, tuple[int, ...]] = {}
-    width, taps = 3, 0
+    width = 3
+    taps = 0
     for conv in NETS[net]:
         shapes[f"backbone.{conv.number}.weight"] = (conv.channels, width, conv.kernel, conv.kernel)
         shapes[f"backbone.{conv.number}.bias"] = (conv.channels,)
@@ -147,7 +150,8 @@ def _net(backbone: dict[str, Any]) -> str:
 
 def _features(backbone: dict[str, Any], images: Float[Array, "B H W 3"]) -> list[Float[Array, "B h w C"]]:
     """Returns the tapped outputs, from the first to the last."""
-    x, taps = (images - _SHIFT) / _SCALE, []
+    x = (images - _SHIFT) / _SCALE
+    taps = []
     for conv in NETS[_net(backbone)]:
         if conv.pool:
             x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, conv.pool, conv.pool, 1), (1, 2, 2, 1), "VALID")

@@ -20,6 +20,8 @@ from rsjax.tokenizers import lfq
 
 def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h w C2"]:
     """Moves factor×factor blocks of pixels into channels; the inverse of :func:`depth_to_space`."""
+    if factor == 1:
+        return x
     b, height, width, c = x.shape
     x = x.reshape(b, height // factor, factor, width // factor, factor, c)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height // factor, width // factor, factor * factor * c)
@@ -27,6 +29,8 @@ def space_to_depth(x: Float[Array, "B H W C"], factor: int) -> Float[Array, "B h
 
 def depth_to_space(x: Float[Array, "B h w C2"], factor: int) -> Float[Array, "B H W C"]:
     """Moves channels (factor, factor, C) into factor×factor blocks of pixels."""
+    if factor == 1:
+        return x
     b, height, width, c = x.shape
     x = x.reshape(b, height, width, factor, factor, c // factor**2)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(b, height * factor, width * factor, c // factor**2)
@@ -37,7 +41,7 @@ def _conv3(features: int, name: str, dtype: Dtype, bias: bool = False, stride: i
     return conv(features, 3, dtype, name, stride, padding=((1, 1), (1, 1)), use_bias=bias)
 
 
-class ResBlock(nn.Module):
+class MagvitResBlock(nn.Module):
     """GroupNorm → swish → conv3, twice, plus the input (through a 1×1 convolution where the width changes).
 
     ``local``: no cell sees another one, neither through convolutions nor through norms.
@@ -60,7 +64,9 @@ class ResBlock(nn.Module):
 
 
 def _inner_conv(features: int, name: str, dtype: Dtype, local: bool) -> nn.Conv:
-    return conv(features, 1, dtype, name, use_bias=False) if local else _conv3(features, name, dtype)
+    if local:
+        return conv(features, 1, dtype, name, use_bias=False)
+    return _conv3(features, name, dtype)
 
 
 class AdaptiveGroupNorm(nn.Module):
@@ -77,7 +83,7 @@ class AdaptiveGroupNorm(nn.Module):
         return scale[:, None, None] * GroupNorm(self.groups, affine=False, name="norm")(x) + shift[:, None, None]
 
 
-class Encoder(nn.Module):
+class MagvitEncoder(nn.Module):
     """Maps images in [-1, 1] to latents, whose signs are the code."""
 
     config: TokenizerConfig
@@ -85,14 +91,15 @@ class Encoder(nn.Module):
     @nn.compact
     def __call__(self, images: Float[Array, "B H W 3"]) -> Float[Array, "B h w D"]:
         cfg = self.config
-        x = space_to_depth(images, cfg.patch_size) if cfg.patch_size > 1 else images
-        local, dtype = cfg.local_codes, cfg.compute_dtype
+        local = cfg.local_codes
+        dtype = cfg.compute_dtype
+        x = space_to_depth(images, cfg.patch_size)
         x = _inner_conv(cfg.channels, "conv_in", dtype, local)(x)
         levels = len(cfg.channel_multipliers)
         for level, multiplier in enumerate(cfg.channel_multipliers):
             for i in range(cfg.res_blocks):
                 name = f"down_{level}_block_{i}"
-                x = ResBlock(cfg.channels * multiplier, cfg.norm_groups, dtype, local, name=name)(x)
+                x = MagvitResBlock(cfg.channels * multiplier, cfg.norm_groups, dtype, local, name=name)(x)
             if level < levels - 1:
                 name = f"down_{level}_downsample"
                 if local:
@@ -100,33 +107,34 @@ class Encoder(nn.Module):
                 else:
                     x = _conv3(x.shape[-1], name, dtype, bias=True, stride=2)(x)
         for i in range(cfg.res_blocks):
-            x = ResBlock(x.shape[-1], cfg.norm_groups, dtype, local, name=f"mid_block_{i}")(x)
+            x = MagvitResBlock(x.shape[-1], cfg.norm_groups, dtype, local, name=f"mid_block_{i}")(x)
         x = nn.swish(GroupNorm(cfg.norm_groups, local=local, name="norm_out")(x))
         return conv(cfg.code_bits, 1, dtype, "conv_out")(x)
 
 
-class Decoder(nn.Module):
+class MagvitDecoder(nn.Module):
     """Maps codes in {-1, +1} to images in about [-1, 1] (not clipped)."""
 
     config: TokenizerConfig
 
     @nn.compact
     def __call__(self, codes: Float[Array, "B h w D"]) -> Float[Array, "B H W 3"]:
-        cfg, dtype = self.config, self.config.compute_dtype
+        cfg = self.config
+        dtype = self.config.compute_dtype
         x = _conv3(cfg.channels * cfg.channel_multipliers[-1], "conv_in", dtype, bias=True)(codes)
         for i in range(cfg.res_blocks):
-            x = ResBlock(x.shape[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
+            x = MagvitResBlock(x.shape[-1], cfg.norm_groups, dtype, name=f"mid_block_{i}")(x)
         for level in reversed(range(len(cfg.channel_multipliers))):
             if cfg.adaptive_norm:
                 x = AdaptiveGroupNorm(cfg.norm_groups, name=f"adaptive_{level}")(x, codes)
             for i in range(cfg.res_blocks):
                 features = cfg.channels * cfg.channel_multipliers[level]
-                x = ResBlock(features, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x)
+                x = MagvitResBlock(features, cfg.norm_groups, dtype, name=f"up_{level}_block_{i}")(x)
             if level > 0:
                 x = depth_to_space(_conv3(4 * x.shape[-1], f"up_{level}_upsample", dtype, bias=True)(x), 2)
         x = nn.swish(GroupNorm(cfg.norm_groups, name="norm_out")(x))
         x = _conv3(3 * cfg.patch_size**2, "conv_out", dtype, bias=True)(x)
-        return depth_to_space(x, cfg.patch_size) if cfg.patch_size > 1 else x
+        return depth_to_space(x, cfg.patch_size)
 
 
 class Tokenizer(nn.Module):
@@ -135,8 +143,8 @@ class Tokenizer(nn.Module):
     config: TokenizerConfig
 
     def setup(self) -> None:
-        self.encoder = Encoder(self.config)
-        self.decoder = Decoder(self.config)
+        self.encoder = MagvitEncoder(self.config)
+        self.decoder = MagvitDecoder(self.config)
 
     def __call__(self, images: Float[Array, "B H W 3"]) -> tuple[Float[Array, "B H W 3"], Float[Array, "B h w D"]]:
         """Returns (reconstruction, latents) of images in [-1, 1], differentiable through the quantiser."""

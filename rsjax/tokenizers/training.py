@@ -3,7 +3,6 @@
 Axes: B images, H×W pixels, h×w token cells, D code bits.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
@@ -34,11 +33,8 @@ from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 Images: TypeAlias = Float[Array, "B H W 3"]
 Latents: TypeAlias = Float[Array, "B h w D"]
 
-FREE = {
-    "vocabularies",
-    "depth_scale",
-    "compute_dtype",
-}  # fields that may differ between the saved tokenizer and the one to train
+# Fields that may differ between the saved tokenizer and the one to train.
+FREE = {"vocabularies", "depth_scale", "compute_dtype"}
 
 
 @dataclass(frozen=True)
@@ -94,40 +90,47 @@ class TokenizerTraining(Autoencoder[Images]):
         ``context.extra`` has "lpips", the metric's weights, and "lecam", the averages of logits, if their terms are
         active.
         """
-        train, (step, carried, axis_name) = self.train, context
-        extra = cast(dict[str, Any], carried)
-        target, variables = to_unit(batch), {"params": self.tokenizer_params(params)}
+        train = self.train
+        extra = cast(dict[str, Any], context.extra)
+        target = to_unit(batch)
+        variables = {"params": self.tokenizer_params(params)}
         output, latents = cast(tuple[Images, Latents], Tokenizer(self.tokenizer).apply(variables, target))
         count = jnp.float32(batch.shape[0])
         error = (target - output).astype(jnp.float32)
-        total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
         means = {
             "l1": jnp.mean(jnp.abs(error)),
             "l2": jnp.mean(jnp.square(error)),
-            "entropy": self.entropy(latents, total),
+            "entropy": self.entropy(latents, context.axis_name),
             "commitment": lfq.commitment_loss(latents),
         }
         if "perceptual" in train.loss_weights:
             means["perceptual"] = jnp.mean(lpips(extra["lpips"], target, output))
         terms = {name: (mean * count, count) for name, mean in means.items()}
         if "adversarial" in train.loss_weights:
-            active = (step >= train.disc_start).astype(jnp.float32)
-            judge, averages = params["discriminator"], extra["lecam"]
-            terms |= adversarial_terms(train, judge, target, output, active, averages, axis_name)
+            active = (context.step >= train.disc_start).astype(jnp.float32)
+            discriminator = params["discriminator"]
+            averages = extra["lecam"]
+            terms |= adversarial_terms(train, discriminator, target, output, active, averages, context.axis_name)
         return terms
 
-    def entropy(self, latents: Latents, total: Callable[[Any], Any]) -> Scalar:
+    def entropy(self, latents: Latents, axis_name: str | None) -> Scalar:
         """Returns LFQ's entropy loss, the mean over groups of ``entropy_group`` images.
 
         Args:
-            total: adds arrays over devices; without groups the average code covers all devices' images.
+            axis_name: pmap's axis; without groups the average code covers all devices' images.
 
         Raises:
             ConfigError: this device's images do not divide into groups.
         """
-        temperature, offset, group = (
-            getattr(self.train, f"entropy_{name}") for name in ("temperature", "offset", "group")
-        )
+        temperature = self.train.entropy_temperature
+        offset = self.train.entropy_offset
+        group = self.train.entropy_group
+
+        def total(x: Array) -> Array:
+            if axis_name is None:
+                return x
+            return jax.lax.psum(x, axis_name)
+
         if not group:
             return lfq.entropy_loss(latents, temperature, offset, total)
         images = latents.shape[0]
@@ -142,8 +145,8 @@ class TokenizerTraining(Autoencoder[Images]):
     def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
         if extra is None or "lecam" not in self.loss_weights:
             return extra
-        logits = (means["real_logit"], means["fake_logit"])
-        return extra | {"lecam": updated_averages(extra["lecam"], *logits, decay=self.train.lecam_decay)}
+        averages = updated_averages(extra["lecam"], means["real_logit"], means["fake_logit"], self.train.lecam_decay)
+        return extra | {"lecam": averages}
 
     def transform(self) -> Transform:
         train = self.train
@@ -154,7 +157,9 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def tokenizer_params(self, params: Params) -> Params:
         """Returns the tokenizer's parameters without the discriminator's."""
-        return params["generator"] if self.train.adversarial_weight else params
+        if self.train.adversarial_weight:
+            return params["generator"]
+        return params
 
     def codec(self, params: Params, normalization: Normalization) -> Codec:
         return Codec(self.tokenizer, params, normalization)
@@ -177,7 +182,9 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
         """Returns the parameters that training begins with: the saved tokenizer, and a fresh discriminator."""
-        return fresh | {"generator": saved} if "generator" in fresh else saved
+        if "generator" in fresh:
+            return fresh | {"generator": saved}
+        return saved
 
 
 def require_no_adversarial(train: TokenizerTrainConfig, network: str) -> None:

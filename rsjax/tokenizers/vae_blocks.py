@@ -19,7 +19,7 @@ from rsjax.layers.group_norm import GroupNorm
 Map = Float[Array, "N h w C"]
 
 
-class ResBlock(nn.Module):
+class VaeResBlock(nn.Module):
     """GroupNorm → SiLU → conv3, twice, plus the input (through a 1×1 convolution where the width changes)."""
 
     features: int
@@ -70,10 +70,10 @@ class SelfAttention(nn.Module):
 
 def middle(x: Map, groups: int, attention: bool, dtype: Dtype) -> Map:
     """Computes two residual blocks, optionally with attention between them, in the module that calls it."""
-    x = ResBlock(x.shape[-1], groups, dtype, name="mid_block_0")(x)
+    x = VaeResBlock(x.shape[-1], groups, dtype, name="mid_block_0")(x)
     if attention:
         x = SelfAttention(groups, name="mid_attention")(x)
-    return ResBlock(x.shape[-1], groups, dtype, name="mid_block_1")(x)
+    return VaeResBlock(x.shape[-1], groups, dtype, name="mid_block_1")(x)
 
 
 def encode(
@@ -98,7 +98,7 @@ def encode(
     x = conv(widths[0], 3, dtype, "conv_in")(x)
     for level, width in enumerate(widths):
         for i in range(res_blocks):
-            x = ResBlock(width, groups, dtype, name=f"down_{level}_block_{i}")(x)
+            x = VaeResBlock(width, groups, dtype, name=f"down_{level}_block_{i}")(x)
         if level < len(widths) - 1:
             x = Downsample(name=f"down_{level}_downsample")(x)
         x = after(x)
@@ -120,7 +120,7 @@ def decode(
     x = after(middle(conv(widths[-1], 3, dtype, "conv_in")(x), groups, attention, dtype))
     for level, width in enumerate(reversed(widths)):
         for i in range(res_blocks + 1):
-            x = ResBlock(width, groups, dtype, name=f"up_{level}_block_{i}")(x)
+            x = VaeResBlock(width, groups, dtype, name=f"up_{level}_block_{i}")(x)
         if level < len(widths) - 1:
             x = Upsample(dtype, name=f"up_{level}_upsample")(x)
         x = after(x)

@@ -11,9 +11,9 @@ import pytest
 from rsjax.config import TokenizerConfig
 from rsjax.config.presets import PRESETS
 from rsjax.tokenizers.magvit2 import (
-    Decoder,
-    Encoder,
-    ResBlock,
+    MagvitDecoder,
+    MagvitEncoder,
+    MagvitResBlock,
     Tokenizer,
     depth_to_space,
     space_to_depth,
@@ -119,7 +119,7 @@ def test_depth_to_space_puts_row_then_column_before_channel() -> None:
 @pytest.mark.parametrize("features", [8, 12])
 def test_a_residual_block_is_the_plain_computation(features: int) -> None:
     x = np.random.default_rng(1).normal(size=(2, 4, 4, 8)).astype(np.float32)
-    block = ResBlock(features, 4, "float32")
+    block = MagvitResBlock(features, 4, "float32")
     p = random_params(lambda key: block.init(key, x)["params"])
     out = jax.jit(block.apply)({"params": p}, x)
     h = conv3(swish(group_norm(x, 4, p["norm1"]["scale"], p["norm1"]["bias"])), p["conv1"]["kernel"])
@@ -131,7 +131,7 @@ def test_a_residual_block_is_the_plain_computation(features: int) -> None:
 
 def test_downsampling_pads_all_four_sides(params: Any) -> None:
     x = jax.random.normal(jax.random.key(1), (2, 16, 16, 3))
-    apply = jax.jit(partial(Encoder(SMALL).apply, capture_intermediates=True))
+    apply = jax.jit(partial(MagvitEncoder(SMALL).apply, capture_intermediates=True))
     _, state = apply({"params": params["encoder"]}, x)
     seen = {
         name: np.asarray(value["__call__"][0]) for name, value in state["intermediates"].items() if name[:2] == "do"
@@ -145,7 +145,7 @@ def test_adaptive_norm_scales_and_shifts_each_level_by_the_codes_statistics() ->
     config = replace(SMALL, adaptive_norm=True)
     p = random_params(Tokenizer(config).init_params)["decoder"]
     codes = np.sign(np.random.default_rng(2).normal(size=(2, 4, 4, 6))).astype(np.float32)
-    apply = jax.jit(partial(Decoder(config).apply, capture_intermediates=True))
+    apply = jax.jit(partial(MagvitDecoder(config).apply, capture_intermediates=True))
     _, state = apply({"params": p}, codes)
     seen = {name: np.asarray(value["__call__"][0]) for name, value in state["intermediates"].items() if name[0] != "_"}
     before = {
@@ -195,7 +195,7 @@ def test_local_codes_depend_on_their_own_pixels_alone(local: bool, images: np.nd
     changed = images.copy()
     changed[:, 4:8, 8:12] = 255 - changed[:, 4:8, 8:12]  # the pixels of the cell in row 1, column 2
     before, after = (
-        np.asarray(Encoder(config).apply({"params": params["encoder"]}, to_unit(x))) for x in (images, changed)
+        np.asarray(MagvitEncoder(config).apply({"params": params["encoder"]}, to_unit(x))) for x in (images, changed)
     )
     differ = np.argwhere(np.any(np.abs(before - after) > 1e-6, axis=(0, 3))).tolist()
     assert [1, 2] in differ

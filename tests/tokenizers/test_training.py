@@ -58,12 +58,12 @@ def test_terms_are_those_of_the_plain_computation_and_reach_both_halves() -> Non
 def test_the_entropy_is_the_mean_over_groups_of_images() -> None:
     latents = jax.random.normal(jax.random.key(0), (6, 2, 2, 4)) * 0.01
     train = TokenizerTrainConfig(batch_size=6, frames_per_clip=1, entropy_group=2)
-    grouped = TokenizerTraining(CONFIG, train, 8).entropy(latents, lambda x: x)
+    grouped = TokenizerTraining(CONFIG, train, 8).entropy(latents, None)
     groups = [lfq.entropy_loss(latents[i : i + 2], 0.01) for i in (0, 2, 4)]
     np.testing.assert_allclose(grouped, np.mean(groups), rtol=1e-5)
     assert abs(grouped - lfq.entropy_loss(latents, 0.01)) > 0.01
     with pytest.raises(ConfigError, match=r"entropy_group is 2, but a device computes 3 images"):
-        TokenizerTraining(CONFIG, train, 8).entropy(latents[:3], lambda x: x)
+        TokenizerTraining(CONFIG, train, 8).entropy(latents[:3], None)
     with pytest.raises(ConfigError, match=r"entropy_group is 4; it must divide the 6 images"):
         replace(train, entropy_group=4)
 

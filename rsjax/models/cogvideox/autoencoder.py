@@ -42,10 +42,11 @@ FREE = {"kl_weight", "image_draws", "image_noise", "compute_dtype"}
 
 def init(config: CausalVAEConfig, key: Key[Array, ""]) -> Params:
     """Returns initial parameters of "encoder", "decoder" and "latents"."""
-    z, size = config.latent_channels, 2 * config.downsampling
+    z = config.latent_channels
+    size = 2 * config.downsampling
     return {
-        "encoder": vae.Encoder(config).init(key, jnp.zeros((1, 1, size, size, 3)))["params"],
-        "decoder": vae.Decoder(config).init(jax.random.fold_in(key, 1), jnp.zeros((1, 1, 2, 2, z)))["params"],
+        "encoder": vae.CausalEncoder(config).init(key, jnp.zeros((1, 1, size, size, 3)))["params"],
+        "decoder": vae.CausalDecoder(config).init(jax.random.fold_in(key, 1), jnp.zeros((1, 1, 2, 2, z)))["params"],
         "latents": {"mean": jnp.zeros(z), "log_deviation": jnp.zeros(z)},
     }
 
@@ -81,7 +82,9 @@ class CausalVAETraining(Autoencoder[Batch]):
         return init(self.config, key)
 
     def init_extra(self) -> Extra:
-        return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
+        if "perceptual" not in self.loss_weights:
+            return None
+        return {"lpips": lpips_weights(self.train, self.image_size)}
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns the terms of :func:`rsjax.models.diffusion.latents.means_of_terms`, and "perceptual" if it is on."""
@@ -107,7 +110,9 @@ class CausalVAETraining(Autoencoder[Batch]):
         return CausalCodec(self.config, params)
 
     def notes(self) -> list[str]:
-        return notes_on_filling("windows", self.train.frames_per_clip) if self.train.steps else []
+        if self.train.steps == 0:
+            return []
+        return notes_on_filling("windows", self.train.frames_per_clip)
 
     def flops(self) -> dict[str, int]:
         count = self.train.frames_per_clip
@@ -150,7 +155,9 @@ def _window(count: int, flip: bool, record: Record, rng: np.random.Generator) ->
     rgb = record["rgb"]
     first = rng.integers(0, max(0, len(rgb) - count) + 1)
     frames = filled(rgb[first : first + count], 0)
-    return {"frames": np.ascontiguousarray(frames[:, :, ::-1]) if flip and rng.random() < 0.5 else frames}
+    if flip and rng.random() < 0.5:
+        frames = np.ascontiguousarray(frames[:, :, ::-1])
+    return {"frames": frames}
 
 
 @dataclass(frozen=True)
@@ -170,7 +177,9 @@ class CausalCodec:
         latents = np.asarray(tokens["mean"])
         most = images_per_pass(latents.shape[-2] * self.config.downsampling) // (COMPRESSION * latents.shape[1])
         frames = in_chunks(partial(self._run, _decode), latents, 4, max(1, most))
-        return Video(frames[:, : tokens["frames"][0] if "frames" in tokens else None])
+        if "frames" in tokens:
+            frames = frames[:, : tokens["frames"][0]]
+        return Video(frames)
 
     def images(
         self, rgb: UInt8[np.ndarray, "B H W 3"], rng: np.random.Generator | None = None
@@ -180,9 +189,11 @@ class CausalCodec:
         Args:
             rng: draws the noise of ``config.image_draws`` noisy copies; None: the images get no noise and D is 1.
         """
-        draws = self.config.image_draws if rng is not None else 0
-        pixels = np.repeat(rgb[:, None], max(1, draws), axis=1).astype(np.float32)
-        if rng is not None and draws:
+        copies = 1
+        if rng is not None:
+            copies = max(1, self.config.image_draws)
+        pixels = np.repeat(rgb[:, None], copies, axis=1).astype(np.float32)
+        if rng is not None and self.config.image_draws:
             spread = np.exp(rng.normal(*self.config.image_noise, pixels.shape[:2]))[..., None, None, None]
             pixels += 127.5 * spread * rng.standard_normal(pixels.shape, np.float32)
         made = self._encode(pixels.astype(np.float32).reshape(-1, 1, *rgb.shape[1:]))

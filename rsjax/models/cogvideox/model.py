@@ -62,7 +62,8 @@ class CogVideoX(WorldModel[Batch]):
     @classmethod
     def with_random_files(cls, config: Config, folder: Path) -> Config:
         assert isinstance(config.model, CogVideoXConfig)
-        text, path = config.model.text, folder / "text.safetensors"
+        text = config.model.text
+        path = folder / "text.safetensors"
         if not text.file:
             return config
         embeddings = np.random.default_rng(0).normal(size=(1, text.tokens, text.width)).astype(np.float32)
@@ -83,18 +84,23 @@ class CogVideoX(WorldModel[Batch]):
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns "error": the mean squared error of the velocity over all noisy latent frames."""
-        noise, latents, channels = self.config.noise, batch["latents"], self.config.image == "channels"
+        noise = self.config.noise
+        latents = batch["latents"]
 
         def draw(index: Int[Array, ""]) -> tuple[Array, Array]:
             t_key, noise_key = jax.random.split(jax.random.fold_in(key, index))
             return jax.random.randint(t_key, (), 0, noise.steps), jax.random.normal(noise_key, latents.shape[1:])
 
         t, drawn = jax.vmap(draw)(batch["index"])
-        noisy, image = add_noise(noise, latents, drawn, t), batch["image"]
-        noisy = noisy if channels else noisy.at[:, 0].set(image)
-        inputs = (noisy, t, batch["text"], image if channels else None)
-        predicted: Any = Transformer(self.architecture).apply({"params": params}, *inputs)
-        error = jnp.square(predicted - target(noise, latents, drawn, t))[:, 0 if channels else 1 :]
+        noisy = add_noise(noise, latents, drawn, t)
+        image = batch["image"]
+        past = 0  # latent frames that are known
+        if self.config.image != "channels":
+            noisy = noisy.at[:, 0].set(image)
+            image = None
+            past = 1
+        predicted: Any = Transformer(self.architecture).apply({"params": params}, noisy, t, batch["text"], image)
+        error = jnp.square(predicted - target(noise, latents, drawn, t))[:, past:]
         weight = batch["weight"].astype(jnp.float32)
         return {"error": (jnp.sum(weight * jnp.mean(error, axis=(1, 2, 3, 4))), jnp.sum(weight))}
 
@@ -118,7 +124,8 @@ class CogVideoX(WorldModel[Batch]):
 
         def encode(clip: Record) -> Record:
             rng = np.random.default_rng(zlib.crc32(clip["rgb"][0].tobytes()))
-            video, image = codec.encode(Video(clip["rgb"][None])), codec.images(clip["rgb"][:1], rng)
+            video = codec.encode(Video(clip["rgb"][None]))
+            image = codec.images(clip["rgb"][:1], rng)
             latents = {name: video[name] for name in ("mean", "deviation")}
             latents |= {f"image_{name}": x for name, x in image.items()}
             return {name: x[0].astype(np.float16) for name, x in latents.items()} | described(clip)
@@ -132,14 +139,16 @@ class CogVideoX(WorldModel[Batch]):
         return partial(latent_arrays, self.config.text, self.config.image_dropout)
 
     def example(self, rng: np.random.Generator) -> Record:
-        arch, text = self.architecture, self.config.text
+        arch = self.architecture
+        text = self.config.text
         draws = max(1, self.config.autoencoder.image_draws)
         cells = (arch.rows, arch.columns, arch.channels)
         shapes = {"": (arch.frames, *cells), "image_": (draws, *cells)}
         means = {f"{name}mean": rng.normal(size=shape).astype(np.float16) for name, shape in shapes.items()}
         record = means | {f"{name}deviation": np.full(shape, 0.1, np.float16) for name, shape in shapes.items()}
-        shown = rng.normal(size=(text.tokens, text.width)).astype(np.float32) if text.file else np.int32(1)
-        return record | {"text": shown}
+        if text.file:
+            return record | {"text": rng.normal(size=(text.tokens, text.width)).astype(np.float32)}
+        return record | {"text": np.int32(1)}
 
     def generate(
         self,
@@ -152,7 +161,8 @@ class CogVideoX(WorldModel[Batch]):
         depth: bool = True,
     ) -> Video:
         """Generates videos from the prompts' last frames and tasks; reads only the length T of the actions."""
-        numbers, frames = np.arange(len(prompt)) if index is None else np.asarray(index), actions.shape[1]
+        numbers = np.arange(len(prompt)) if index is None else np.asarray(index)
+        frames = actions.shape[1]
         codec = self._codec(assets)
         return Video(rollout(self.architecture, codec, self.clips.frames, params, prompt, frames, numbers))
 

@@ -55,9 +55,10 @@ def completed(fresh: Params, saved: Params) -> Params:
     If the saved network lacks the channels for an image, they begin at zero. If the learned tokens do not fit, fresh
     ones take their place.
     """
-    own, there = flatten_dict(fresh), flatten_dict(saved)
+    own = flatten_dict(fresh)
+    there = flatten_dict(saved)
     patches = ("patches", "kernel")
     if lacking := own[patches].shape[2] - there[patches].shape[2]:
         there[patches] = np.pad(there[patches], ((0, 0), (0, 0), (0, lacking), (0, 0)))
-    fits = {path: path in there and there[path].shape == x.shape for path, x in own.items()}
-    return unflatten_dict({path: there[path] if fits[path] else x for path, x in own.items()})
+    fitting = {path: there[path] for path, x in own.items() if path in there and there[path].shape == x.shape}
+    return unflatten_dict(own | fitting)

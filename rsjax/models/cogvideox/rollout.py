@@ -16,7 +16,7 @@ from rsjax.devices import divide
 from rsjax.models.cogvideox.autoencoder import CausalCodec
 from rsjax.models.cogvideox.text import empty_texts, known_tasks, texts_of
 from rsjax.models.cogvideox.transformer import Architecture, Transformer
-from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.models.diffusion.samplers import denoise, sampler_coefficients
 from rsjax.trainable import Params
 
 
@@ -35,9 +35,12 @@ def rollout(
         clip_frames: frames of a training clip; a chunk adds one frame less.
         index: each clip's number, which determines its noise.
     """
-    made, image = [codec.decode(codec.encode(Video(prompt.rgb))).rgb], prompt.rgb[:, -1]
-    count, text = len(prompt), arch.model.text
-    texts, empty = texts_of(text, known_tasks(text, prompt.tasks, count), count), empty_texts(text, count)
+    made = [codec.decode(codec.encode(Video(prompt.rgb))).rgb]
+    image = prompt.rgb[:, -1]
+    count = len(prompt)
+    text = arch.model.text
+    texts = texts_of(text, known_tasks(text, prompt.tasks, count), count)
+    empty = empty_texts(text, count)
     for number in range(-(-(frames - prompt.rgb.shape[1]) // (clip_frames - 1))):
         key = jax.random.fold_in(jax.random.key(arch.model.sample.seed), number)
         given = codec.images(image)["mean"][:, 0]
@@ -59,23 +62,28 @@ def _chunk(
 ) -> Float[Array, "B F h w C"]:
     """Returns the latents of a chunk that begins with an image."""
     cfg = arch.model
-    shape, guidance = (arch.frames, *image.shape[1:]), cfg.sample.guidance
+    shape = (arch.frames, *image.shape[1:])
+    guidance = cfg.sample.guidance
     start = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), shape))(index)
-    twice = guidance != 1
-    text = jnp.concatenate([texts, empty]) if twice else texts
+    in_channels = cfg.image == "channels"
 
-    def both(x: Array) -> Array:
-        return jnp.concatenate([x, x]) if twice else x
+    def velocity(x: Array, t: Int[Array, ""], text: Array, image: Array) -> Array:
+        known = None
+        if in_channels:
+            known = image
+        made: Any = Transformer(arch).apply({"params": params}, x, jnp.full(len(text), t), text, known)
+        return made
 
     def predict(x: Float[Array, "B F h w C"], t: Int[Array, ""]) -> Float[Array, "B F h w C"]:
-        given = both(image) if cfg.image == "channels" else None
-        v: Any = Transformer(arch).apply({"params": params}, both(x), jnp.full(len(text), t), text, given)
-        if not twice:
-            return v
-        with_text, without = jnp.split(v, 2)
+        if guidance == 1:
+            return velocity(x, t, texts, image)
+        twice = velocity(jnp.concatenate([x, x]), t, jnp.concatenate([texts, empty]), jnp.concatenate([image, image]))
+        with_text, without = jnp.split(twice, 2)
         return without + guidance * (with_text - without)
 
     def restore(x: Float[Array, "B F h w C"]) -> Float[Array, "B F h w C"]:
-        return x if cfg.image == "channels" else x.at[:, 0].set(image)
+        if in_channels:
+            return x
+        return x.at[:, 0].set(image)
 
-    return denoise(make_plan(cfg.noise, cfg.sample), predict, start, restore)
+    return denoise(sampler_coefficients(cfg.noise, cfg.sample), predict, start, restore)

@@ -21,7 +21,8 @@ from rsjax.errors import UserError, first_line
 from rsjax.models.cogvideox.config import TextConfig
 from rsjax.progress import note
 
-EMBEDDINGS, TEXTS = "embeddings", "texts"
+EMBEDDINGS = "embeddings"
+TEXTS = "texts"
 EMPTY = ""
 CURE = "make it with python -m experiments.convert text, and name it with --model.text.file"
 
@@ -46,7 +47,9 @@ def read_texts(file: str, tokens: int, width: int) -> Texts:
     try:
         with safetensors.safe_open(path, "np") as opened:
             names = json.loads((opened.metadata() or {}).get(TEXTS, "[]"))
-            made = opened.get_tensor(EMBEDDINGS).astype(np.float32) if EMBEDDINGS in opened.keys() else None  # noqa: SIM118
+            made = None
+            if EMBEDDINGS in opened.keys():  # noqa: SIM118 - it is no dict
+                made = opened.get_tensor(EMBEDDINGS).astype(np.float32)
     except (safetensors.SafetensorError, OSError, ValueError, AttributeError) as error:  # the last: a type of 8 bits
         raise UserError(f"{path}: not a file of text embeddings, or damaged ({first_line(error)}); {CURE}") from error
     listed = isinstance(names, list) and names[:1] == [EMPTY] and all(isinstance(name, str) for name in names)
@@ -80,20 +83,28 @@ def texts_of(config: TextConfig, tasks: Iterable[str] | None, count: int) -> np.
     """
     if not (config.file or config.tasks):
         return np.ones(count, np.int32)
-    wanted = [EMPTY if task in (None, UNKNOWN) else task for task in ([None] * count if tasks is None else tasks)]
+    wanted = [EMPTY] * count
+    if tasks is not None:
+        wanted = [EMPTY if task in (None, UNKNOWN) else task for task in tasks]
     check_tasks(config, wanted)
     rows = np.array([_names(config).index(task) for task in wanted], np.int32)
-    return _read(config).embeddings[rows] if config.file else rows
+    if config.file:
+        return read_texts(config.file, config.tokens, config.width).embeddings[rows]
+    return rows
 
 
 def empty_texts(config: TextConfig, count: int) -> np.ndarray:
     """Returns the network's input for the empty text, as :func:`texts_of` does."""
-    return texts_of(config, None, count) if config.file else np.zeros(count, np.int32)
+    if config.file:
+        return texts_of(config, None, count)
+    return np.zeros(count, np.int32)
 
 
 def known_tasks(config: TextConfig, tasks: Iterable[str] | None, count: int) -> list[str]:
     """Returns clips' tasks, with the empty text for tasks that have no text; prints one note for each such task."""
-    wanted = [UNKNOWN] * count if tasks is None else list(map(str, tasks))
+    wanted = [UNKNOWN] * count
+    if tasks is not None:
+        wanted = list(map(str, tasks))
     if not (config.file or config.tasks):
         return wanted
     names = _names(config)
@@ -105,11 +116,17 @@ def known_tasks(config: TextConfig, tasks: Iterable[str] | None, count: int) -> 
 @lru_cache
 def _note_empty(config: TextConfig, task: str) -> None:
     trained = bool(config.file) or config.dropout > 0
-    if task != UNKNOWN or not trained:
-        which = "a clip has no task" if task == UNKNOWN else _lacking(config, task)
-        how = "" if trained else ", which training without model.text.dropout shows only for clips without a task"
-        cure = f"; {config.file} can be made again with --task {task!r} too" if config.file else ""
-        note(f"{which}: it reads the empty text{how}{cure}")
+    if task == UNKNOWN and trained:
+        return
+    message = _lacking(config, task)
+    if task == UNKNOWN:
+        message = "a clip has no task"
+    message += ": it reads the empty text"
+    if not trained:
+        message += ", which training without model.text.dropout shows only for clips without a task"
+    if config.file:
+        message += f"; {config.file} can be made again with --task {task!r} too"
+    note(message)
 
 
 def check_store(config: TextConfig, store: Store) -> None:
@@ -122,8 +139,11 @@ def check_tasks(config: TextConfig, tasks: Iterable[str]) -> None:
     """Raises :class:`UserError` if a task has no text of its own, or the file is missing or does not fit."""
     if not (config.file or config.tasks):
         return
-    if missing := sorted(set(tasks) - {*_names(config), UNKNOWN}):
-        raise UserError(f"{_lacking(config, missing[0])}; {CURE if config.file else 'name it there'}")
+    missing = sorted(set(tasks) - {*_names(config), UNKNOWN})
+    if missing and config.file:
+        raise UserError(f"{_lacking(config, missing[0])}; {CURE}")
+    if missing:
+        raise UserError(f"{_lacking(config, missing[0])}; name it there")
 
 
 def _lacking(config: TextConfig, task: str) -> str:
@@ -132,8 +152,6 @@ def _lacking(config: TextConfig, task: str) -> str:
 
 
 def _names(config: TextConfig) -> tuple[str, ...]:
-    return _read(config).names if config.file else (EMPTY, *config.tasks)
-
-
-def _read(config: TextConfig) -> Texts:
-    return read_texts(config.file, config.tokens, config.width)
+    if config.file:
+        return read_texts(config.file, config.tokens, config.width).names
+    return (EMPTY, *config.tasks)

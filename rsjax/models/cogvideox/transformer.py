@@ -21,7 +21,8 @@ from rsjax.models.cogvideox.config import CogVideoXConfig, latent_frames
 from rsjax.models.diffusion.layers import PERIOD, TimeEmbedding, grid_positions, positions
 from rsjax.trainable import Params
 
-XAVIER, ZEROS = nn.initializers.xavier_uniform(), nn.initializers.zeros
+XAVIER = nn.initializers.xavier_uniform()
+ZEROS = nn.initializers.zeros
 Tokens = Float[Array, "B N D"]
 
 
@@ -54,7 +55,9 @@ class Architecture:
     def texts(self) -> int:
         """Sets of learned tokens: for the empty text, and for each task or for all together; 0 with a text file."""
         text = self.model.text
-        return 0 if text.file else 1 + max(1, len(text.tasks))
+        if text.file:
+            return 0
+        return 1 + max(1, len(text.tasks))
 
 
 class Rotation(NamedTuple):
@@ -68,7 +71,8 @@ def rotation(arch: Architecture) -> Rotation:
     """Returns the rotation for rotary positions: a quarter of a head's channels for time, then rows, then columns."""
     rows, columns = _stretched(arch)
     head = arch.model.width // arch.model.heads
-    sizes, grid = (head // 4, 3 * head // 8, 3 * head // 8), (np.arange(arch.frames), rows, columns)
+    sizes = (head // 4, 3 * head // 8, 3 * head // 8)
+    grid = (np.arange(arch.frames), rows, columns)
     at = [x.reshape(-1, 1) for x in np.meshgrid(*grid, indexing="ij")]
     angles = [x * PERIOD ** -(np.arange(0, size, 2) / size) for x, size in zip(at, sizes, strict=True)]
     whole = np.pad(np.concatenate(angles, axis=1), ((arch.model.text.tokens, 0), (0, 0)))
@@ -81,8 +85,9 @@ def _stretched(arch: Architecture) -> tuple[np.ndarray, np.ndarray]:
     if not arch.model.stretch:
         return np.arange(rows), np.arange(columns)
     high, wide = arch.model.stretch
-    tall = rows / columns > high / wide
-    size = (high, round(high / rows * columns)) if tall else (round(wide / columns * rows), wide)
+    size = (round(wide / columns * rows), wide)
+    if rows / columns > high / wide:
+        size = (high, round(high / rows * columns))
     begin = [round((whole - part) / 2) for whole, part in zip((high, wide), size, strict=True)]
     ends = [(b + s) * (n - 1) / n for b, s, n in zip(begin, size, (rows, columns), strict=True)]
     return np.linspace(begin[0], ends[0], rows), np.linspace(begin[1], ends[1], columns)
@@ -90,14 +95,17 @@ def _stretched(arch: Architecture) -> tuple[np.ndarray, np.ndarray]:
 
 def turned(x: Float[Array, "B N K e"], by: Rotation) -> Float[Array, "B N K e"]:
     """Rotates pairs of neighbouring channels."""
-    first, second = x[..., ::2], x[..., 1::2]
-    cos, sin = by.cos[:, None], by.sin[:, None]
+    first = x[..., ::2]
+    second = x[..., 1::2]
+    cos = by.cos[:, None]
+    sin = by.sin[:, None]
     return jnp.stack([first * cos - second * sin, second * cos + first * sin], axis=-1).reshape(x.shape)
 
 
 def fixed_positions(arch: Architecture) -> Float32[np.ndarray, "N D"]:
     """Returns sines and cosines: a quarter of the channels for time, the others for space; zeros for the text."""
-    width, cells = arch.model.width, int(np.prod(arch.grid))
+    width = arch.model.width
+    cells = int(np.prod(arch.grid))
     time = np.repeat(positions(arch.frames, width // 4), cells, axis=0)
     space = np.tile(grid_positions(*arch.grid, 3 * width // 4, arch.model.position_scale), (arch.frames, 1))
     return np.pad(np.concatenate([time, space], axis=1), ((arch.model.text.tokens, 0), (0, 0)))
@@ -107,7 +115,7 @@ def _norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:
     return nn.LayerNorm(epsilon=epsilon, use_fast_variance=False, name=name)
 
 
-class Block(nn.Module):
+class CogVideoXBlock(nn.Module):
     """Attention among all tokens, then an MLP. The step shifts, scales and gates text and video separately."""
 
     arch: Architecture
@@ -118,10 +126,12 @@ class Block(nn.Module):
         dense = partial(Dense, bf16=cfg.compute_dtype == "bfloat16", kernel_init=XAVIER)
         h, gate = self._modulated("norm1", x, time)
         q, k, v = (dense(cfg.width, name=f"to_{name}")(h).reshape(*x.shape[:2], cfg.heads, -1) for name in "qkv")
-        q, k = _norm("norm_q", 1e-6)(q), _norm("norm_k", 1e-6)(k)
+        q = _norm("norm_q", 1e-6)(q)
+        k = _norm("norm_k", 1e-6)(k)
         if cfg.positions == "rotary":
             by = rotation(self.arch)
-            q, k = turned(q, by), turned(k, by)
+            q = turned(q, by)
+            k = turned(k, by)
         out = attend_cells(q[:, None], k[:, None], v[:, None], cfg.compute_dtype == "bfloat16")
         x = x + gate * dense(cfg.width, name="to_out")(out.reshape(x.shape))
         h, gate = self._modulated("norm2", x, time)
@@ -159,7 +169,8 @@ class Transformer(nn.Module):
             text: embeddings, or numbers of learned ones: 0 is the empty text.
             image: the latents of the image, for the image's channels; None if the network has none.
         """
-        arch, cfg = self.arch, self.arch.model
+        arch = self.arch
+        cfg = arch.model
         if latents.shape[1:] != (arch.frames, arch.rows, arch.columns, arch.channels):
             raise ValueError(f"latents are {latents.shape[1:]}, not of {arch.frames}×{arch.rows}×{arch.columns} cells")
         if arch.texts:
@@ -171,7 +182,9 @@ class Transformer(nn.Module):
         if cfg.learned_positions:
             x = x + self.param("learned_positions", ZEROS, x.shape[1:])
         time = TimeEmbedding(cfg.time_width, cfg.width, name="time")(t)
-        block = nn.remat(Block, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Block
+        block: Any = CogVideoXBlock
+        if cfg.remat == "blocks":
+            block = nn.remat(CogVideoXBlock, prevent_cse=cfg.unroll > 1)
         scan = nn.scan(
             block,
             variable_axes={"params": 0},
@@ -193,23 +206,29 @@ class Transformer(nn.Module):
     def _video(self, latents: Float[Array, "B F h w C"], image: Float[Array, "B h w C"] | None) -> Tokens:
         cfg = self.arch.model
         if cfg.image == "channels":
-            given = jnp.zeros_like(latents) if image is None else jnp.zeros_like(latents).at[:, 0].set(image)
-            latents = jnp.concatenate([latents, given], axis=-1)
+            known = jnp.zeros_like(latents)
+            if image is not None:
+                known = known.at[:, 0].set(image)
+            latents = jnp.concatenate([latents, known], axis=-1)
         patch = (cfg.patch_size, cfg.patch_size)
         x = nn.Conv(cfg.width, patch, patch, "VALID", kernel_init=XAVIER, name="patches")(latents)
         return x.reshape(len(x), -1, cfg.width)
 
     def _unpatchify(self, x: Float[Array, "B S out"]) -> Float[Array, "B F h w C"]:
-        arch, p = self.arch, self.arch.model.patch_size
+        arch = self.arch
+        p = self.arch.model.patch_size
         x = x.reshape(len(x), arch.frames, *arch.grid, arch.channels, p, p).transpose(0, 1, 2, 5, 3, 6, 4)
         return x.reshape(len(x), arch.frames, arch.rows, arch.columns, arch.channels)
 
     def init_params(self, key: Key[Array, ""]) -> Params:
         """Returns initial parameters, with which the network predicts zeros."""
-        arch, text = self.arch, self.arch.model.text
+        arch = self.arch
+        text = self.arch.model.text
         latents = jnp.zeros((1, arch.frames, arch.rows, arch.columns, arch.channels))
-        given: Any = jnp.zeros(1, jnp.int32) if arch.texts else jnp.zeros((1, text.tokens, text.width))
-        return self.init(key, latents, jnp.zeros(1, jnp.int32), given)["params"]
+        shown: Any = jnp.zeros((1, text.tokens, text.width))
+        if arch.texts:
+            shown = jnp.zeros(1, jnp.int32)
+        return self.init(key, latents, jnp.zeros(1, jnp.int32), shown)["params"]
 
 
 def shapes(arch: Architecture) -> Params:
@@ -219,11 +238,13 @@ def shapes(arch: Architecture) -> Params:
 
 def forward_flops(arch: Architecture) -> int:
     """Returns the floating-point operations of one pass over a clip: its matrix products, 2·m·n·k each."""
-    cfg, width = arch.model, arch.model.width
+    cfg = arch.model
+    width = arch.model.width
     video = arch.frames * int(np.prod(arch.grid))
     tokens = cfg.text.tokens + video
     block = tokens * ((4 + 2 * cfg.mlp_ratio) * width + 2 * tokens) * width + 12 * cfg.time_width * width
     patch = cfg.patch_size**2 * arch.channels
-    ends = video * patch * width * (3 if cfg.image == "channels" else 2) + cfg.text.tokens * cfg.text.width * width
+    patches = 3 if cfg.image == "channels" else 2  # of latents at both ends, and of the image
+    ends = video * patch * width * patches + cfg.text.tokens * cfg.text.width * width
     time = cfg.time_width * (width + cfg.time_width) + 2 * cfg.time_width * width
     return 2 * (cfg.blocks * block + ends + time)

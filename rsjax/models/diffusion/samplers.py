@@ -22,7 +22,7 @@ RK_GROUPS = 3  # Runge-Kutta steps at the beginning of PNDM, of four calls each
 MULTISTEP = np.array([55, -59, 37, -9]) / 24  # Adams-Bashforth: this output, then the remembered ones, newest first
 
 
-class Plan(NamedTuple):
+class SamplerCoefficients(NamedTuple):
     """The coefficients of each network call, K calls in order.
 
     Attributes:
@@ -45,14 +45,17 @@ class Plan(NamedTuple):
     share: Float[np.ndarray, " K"]
 
 
-def make_plan(noise: NoiseConfig, sample: DenoiseConfig) -> Plan:
+def sampler_coefficients(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCoefficients:
     """Returns the sampler's table."""
-    return (_pndm if sample.sampler == "pndm" else _ddim)(noise, sample)
+    if sample.sampler == "pndm":
+        return _pndm(noise, sample)
+    return _ddim(noise, sample)
 
 
 def timesteps(noise: NoiseConfig, sample: DenoiseConfig) -> Int[np.ndarray, " steps"]:
     """Returns the visited steps of the forward process, ascending."""
-    every, count = noise.steps, sample.steps
+    every = noise.steps
+    count = sample.steps
     if sample.spacing == "linspace":
         return np.linspace(0, every - 1, count).round().astype(np.int32)
     if sample.spacing == "leading":
@@ -60,28 +63,32 @@ def timesteps(noise: NoiseConfig, sample: DenoiseConfig) -> Int[np.ndarray, " st
     return (np.round(np.arange(every, 0, -every / count))[:count].astype(np.int32) - 1)[::-1]
 
 
-def _ddim(noise: NoiseConfig, sample: DenoiseConfig) -> Plan:
+def _ddim(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCoefficients:
     t = timesteps(noise, sample)[::-1]
-    keep, add = _coefficients(noise, sample, t, t - noise.steps // sample.steps)
-    ones, zeros, only_this = np.ones(len(t)), np.zeros(len(t)), np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
-    return Plan(t, keep, add, ones, zeros, only_this, zeros, zeros)
+    keep, add = _moves(noise, sample, t, t - noise.steps // sample.steps)
+    ones = np.ones(len(t))
+    zeros = np.zeros(len(t))
+    only_this = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    return SamplerCoefficients(t, keep, add, ones, zeros, only_this, zeros, zeros)
 
 
-def _pndm(noise: NoiseConfig, sample: DenoiseConfig) -> Plan:
+def _pndm(noise: NoiseConfig, sample: DenoiseConfig) -> SamplerCoefficients:
     """Three Runge-Kutta steps of four calls each, then linear multistep."""
-    stride, descending = noise.steps // sample.steps, timesteps(noise, sample)[::-1]
-    half, later = stride // 2, descending[RK_GROUPS:]
+    stride = noise.steps // sample.steps
+    descending = timesteps(noise, sample)[::-1]
+    half = stride // 2
+    later = descending[RK_GROUPS:]
     pairs = list(pairwise(descending[: RK_GROUPS + 1]))
     t = np.concatenate([[s, r + half, r + half, r] for s, r in pairs] + [later])
     begin = np.concatenate([[s] * 4 for s, _ in pairs] + [later])
     end = np.concatenate([[s - half, r + half, r, r] for s, r in pairs] + [later - stride])
-    keep, add = _coefficients(noise, sample, begin, end)
+    keep, add = _moves(noise, sample, begin, end)
 
     def column(group: list[float], after: float) -> Float64[np.ndarray, " K"]:
         return np.array(group * RK_GROUPS + [after] * len(later))
 
     weights = np.stack([column([1, 1, 1, 1 / 6], MULTISTEP[0])] + [column([0] * 4, x) for x in MULTISTEP[1:]], axis=1)
-    return Plan(
+    return SamplerCoefficients(
         t=t,
         keep=keep,
         add=add,
@@ -93,24 +100,28 @@ def _pndm(noise: NoiseConfig, sample: DenoiseConfig) -> Plan:
     )
 
 
-def _coefficients(
+def _moves(
     noise: NoiseConfig, sample: DenoiseConfig, begin: Int[np.ndarray, " K"], end: Int[np.ndarray, " K"]
 ) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
     """Returns ``keep`` and ``add`` of moves between steps; an end below 0 is the last move, to clean latents."""
     left = alphas(noise)
-    a, b = left[begin], np.where(end >= 0, left[end], 1.0 if sample.end_clean else left[0])
+    last = left[0]
+    if sample.end_clean:
+        last = 1.0
+    a = left[begin]
+    b = np.where(end >= 0, left[end], last)
     if noise.prediction == "velocity":
         return np.sqrt(a * b) + np.sqrt((1 - a) * (1 - b)), np.sqrt(a * (1 - b)) - np.sqrt(b * (1 - a))
     return np.sqrt(b / a), -(b - a) / (a * np.sqrt(1 - b) + np.sqrt(a * (1 - a) * b))
 
 
 def denoise(
-    plan: Plan,
+    coefficients: SamplerCoefficients,
     predict: Callable[[Latents, Int[Array, ""]], Latents],
     start: Latents,
     restore: Callable[[Latents], Latents] = lambda x: x,
 ) -> Latents:
-    """Returns the clean latents that ``plan`` makes from noise.
+    """Returns the clean latents that the ``coefficients`` make from noise.
 
     Args:
         predict: the network, which maps noisy latents and their step to its output.
@@ -127,7 +138,8 @@ def denoise(
         past = jnp.where(row.remember > 0, jnp.concatenate([out[None], past[:-1]]), past)
         return (restore(row.keep * begin + row.add * e), begin, total, past), None
 
-    rows = {name: jnp.asarray(x, jnp.int32 if name == "t" else jnp.float32) for name, x in plan._asdict().items()}
+    rows = {name: jnp.asarray(x, jnp.float32) for name, x in coefficients._asdict().items()}
+    rows["t"] = jnp.asarray(coefficients.t, jnp.int32)
     start = restore(start)
     carry = (start, start, jnp.zeros_like(start), jnp.zeros((PAST, *start.shape), start.dtype))
-    return jax.lax.scan(call, carry, Plan(**rows))[0][0]  # type: ignore[arg-type]
+    return jax.lax.scan(call, carry, SamplerCoefficients(**rows))[0][0]  # type: ignore[arg-type]

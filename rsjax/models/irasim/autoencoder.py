@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,14 +26,14 @@ from rsjax.devices import divide
 from rsjax.models.diffusion import latents as distributions
 from rsjax.models.irasim import pretrained
 from rsjax.models.irasim.config import KLConfig
-from rsjax.models.irasim.sdxl_vae import Decoder, Encoder
-from rsjax.tokenizers import magvit2
+from rsjax.tokenizers import magvit2, vae_blocks
 from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.codec import images_per_pass, in_chunks
 from rsjax.tokenizers.flops import traced_flops
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import to_frames, to_unit
 from rsjax.tokenizers.training import TokenizerImages, image_batch, lpips_weights, require_no_adversarial
+from rsjax.tokenizers.vae_blocks import Map
 from rsjax.trainable import Extra, Params, StepContext, Term
 
 Images = Float[Array, "B H W 3"]
@@ -42,18 +43,46 @@ Latents = Float[Array, "B h w z"]
 SDXL_FACTOR = 0.13025  # the public code multiplies latents by it
 
 
+class SdxlEncoder(nn.Module):
+    """Maps images in [-1, 1] to the posterior's mean and log-variance, (B, h, w, 2 z), as ``diffusers`` does."""
+
+    config: KLConfig
+
+    @nn.compact
+    def __call__(self, images: Images) -> Map:
+        cfg = self.config
+        out = 2 * cfg.latent_channels
+        x = vae_blocks.encode(images, cfg.widths, cfg.res_blocks, cfg.norm_groups, out, True, cfg.compute_dtype)
+        return nn.Conv(out, (1, 1), name="quant_conv")(x)
+
+
+class SdxlDecoder(nn.Module):
+    """Maps unscaled latents to images, without clipping."""
+
+    config: KLConfig
+
+    @nn.compact
+    def __call__(self, latents: Latents) -> Images:
+        cfg = self.config
+        x = nn.Conv(cfg.latent_channels, (1, 1), name="post_quant_conv")(latents)
+        return vae_blocks.decode(x, cfg.widths, cfg.res_blocks, cfg.norm_groups, 3, True, cfg.compute_dtype)
+
+
 def networks(config: KLConfig) -> tuple[Any, Any]:
     """Returns the modules of the encoder and the decoder."""
     if config.network == "sdxl":
-        return Encoder(config), Decoder(config)
-    return magvit2.Encoder(config.convolutions), magvit2.Decoder(config.convolutions)
+        return SdxlEncoder(config), SdxlDecoder(config)
+    return magvit2.MagvitEncoder(config.convolutions), magvit2.MagvitDecoder(config.convolutions)
 
 
 def init(config: KLConfig, key: Key[Array, ""]) -> Params:
     """Returns initial parameters of "encoder", "decoder" and "latents"."""
     encoder, decoder = networks(config)
-    z, size = config.latent_channels, 2 * config.downsampling
-    scale = -math.log(SDXL_FACTOR) if config.network == "sdxl" else 0.0
+    z = config.latent_channels
+    size = 2 * config.downsampling
+    scale = 0.0
+    if config.network == "sdxl":
+        scale = -math.log(SDXL_FACTOR)
     return {
         "encoder": encoder.init(key, jnp.zeros((1, size, size, 3)))["params"],
         "decoder": decoder.init(jax.random.fold_in(key, 1), jnp.zeros((1, 2, 2, z)))["params"],

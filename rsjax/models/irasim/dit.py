@@ -6,6 +6,7 @@ action inputs.
 
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -50,7 +51,8 @@ class Architecture(DiTConfig):
 
 def architecture(config: Config) -> Architecture:
     """Returns the architecture of a configuration whose model is IRASim."""
-    model, clips = config.model, config.clips
+    model = config.model
+    clips = config.clips
     assert isinstance(model, IRASimConfig)
     side = clips.image_size // model.autoencoder.downsampling
     return Architecture(
@@ -63,7 +65,7 @@ def architecture(config: Config) -> Architecture:
     )
 
 
-class Block(nn.Module):
+class DiTBlock(nn.Module):
     """Attention along one axis of tokens, then an MLP, each with adaptive LayerNorm and gate (adaLN-Zero)."""
 
     config: Architecture
@@ -100,9 +102,9 @@ class Pair(nn.Module):
         self, x: Tokens, conditions: tuple[Condition, Condition], first: Bool[Array, ""]
     ) -> tuple[Tokens, None]:
         cfg = self.config
-        x = Block(cfg, over_time=False, name="spatial")(x, conditions[0])
+        x = DiTBlock(cfg, over_time=False, name="spatial")(x, conditions[0])
         x = x + jnp.where(first, positions(cfg.frames, cfg.width)[:, None], 0.0)
-        return Block(cfg, over_time=True, name="temporal")(x, conditions[1]), None
+        return DiTBlock(cfg, over_time=True, name="temporal")(x, conditions[1]), None
 
 
 class DiT(nn.Module):
@@ -138,8 +140,12 @@ class DiT(nn.Module):
         acted = time + self._action(actions, drop)[:, :, None]
         # In the public Frame-Ada model the last layer does not see the actions. This is an oversight, but the public
         # weights were trained so.
-        plain = acted if cfg.conditioning == "video" else time
-        pair = nn.remat(Pair, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Pair
+        plain = time
+        if cfg.conditioning == "video":
+            plain = acted
+        pair: Any = Pair
+        if cfg.remat == "blocks":
+            pair = nn.remat(Pair, prevent_cse=cfg.unroll > 1)
         pairs = cfg.blocks // 2
         scan = nn.scan(
             pair,
@@ -159,11 +165,14 @@ class DiT(nn.Module):
         if cfg.conditioning == "video":
             known = known.reshape(len(known), 1, -1)
         x = nn.Dense(cfg.mlp_ratio * cfg.width, kernel_init=XAVIER, name="action_fc1")(known)
-        x = nn.gelu(x, approximate=True) if cfg.action_activation == "gelu" else x
+        if cfg.action_activation == "gelu":
+            x = nn.gelu(x, approximate=True)
         x = nn.Dense(cfg.width, kernel_init=XAVIER, name="action_fc2")(x)
         if cfg.conditioning == "frame":
             x = jnp.concatenate([jnp.broadcast_to(unknown, (len(x), 1, cfg.width)), x], axis=1)
-        return x if drop is None else jnp.where(drop[:, None, None], unknown, x)
+        if drop is None:
+            return x
+        return jnp.where(drop[:, None, None], unknown, x)
 
     def _final(self, x: Tokens, condition: Condition) -> Float[Array, "B T S out"]:
         cfg = self.config
@@ -173,7 +182,8 @@ class DiT(nn.Module):
 
     def _unpatchify(self, x: Float[Array, "B T S out"]) -> Float[Array, "B T h w C"]:
         cfg = self.config
-        p, (rows, columns) = cfg.patch_size, cfg.grid
+        p = cfg.patch_size
+        rows, columns = cfg.grid
         x = x.reshape(*x.shape[:2], rows, columns, p, p, cfg.channels).swapaxes(3, 4)
         return x.reshape(*x.shape[:2], cfg.rows, cfg.columns, cfg.channels)
 
@@ -187,12 +197,20 @@ class DiT(nn.Module):
 
 def forward_flops(config: Architecture) -> int:
     """Returns the floating-point operations of one pass over a clip: its matrix products, 2·m·n·k each."""
-    width, cells, frames = config.width, config.grid[0] * config.grid[1], config.frames
+    width = config.width
+    cells = config.grid[0] * config.grid[1]
+    frames = config.frames
     linear = (4 + 2 * config.mlp_ratio) * width**2  # qkv, proj, fc1, fc2
     attention = (cells + frames) * width  # scores and weighted sums, averaged over both kinds of blocks
     patches = 2 * config.patch_size**2 * config.channels * width
-    acted = frames if config.conditioning == "frame" else 1
+    if config.conditioning == "frame":
+        acted = frames
+        rows = frames - 1  # of actions that the encoder takes one by one
+        inputs = config.action_inputs
+    else:
+        acted = 1
+        rows = 1
+        inputs = (frames - 1) * config.action_inputs
     conditions = config.blocks // 2 * (acted + 1) * 6 * width**2 + 2 * width**2 + (TIME_CHANNELS + width) * width
-    rows = (frames - 1, 1) if config.conditioning == "frame" else (1, frames - 1)
-    encoder = rows[0] * config.mlp_ratio * width * (rows[1] * config.action_inputs + width)
+    encoder = rows * config.mlp_ratio * width * (inputs + width)
     return 2 * (frames * cells * (config.blocks * (linear + attention) + patches) + conditions + encoder)

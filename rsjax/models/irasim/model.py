@@ -67,16 +67,15 @@ class IRASim(WorldModel[Batch]):
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns "error": the mean squared error of the predicted noise over the frames after the prompt."""
-        noise, latents, past = self.config.noise, batch["latents"], self.prompt_frames
+        noise = self.config.noise
+        latents = batch["latents"]
+        past = self.prompt_frames
 
         def draw(index: Int[Array, ""]) -> tuple[Array, Array, Array]:
             t_key, noise_key, drop_key = jax.random.split(jax.random.fold_in(key, index), 3)
+            t = jax.random.randint(t_key, (), 0, noise.steps)
             dropped = jax.random.bernoulli(drop_key, self.config.action_dropout)
-            return (
-                jax.random.randint(t_key, (), 0, noise.steps),
-                jax.random.normal(noise_key, latents.shape[1:]),
-                dropped,
-            )
+            return t, jax.random.normal(noise_key, latents.shape[1:]), dropped
 
         t, drawn, drop = jax.vmap(draw)(batch["index"])
         noisy = add_noise(noise, latents, drawn, t).at[:, :past].set(latents[:, :past])
@@ -118,8 +117,10 @@ class IRASim(WorldModel[Batch]):
         index: Int[np.ndarray, " B"] | None = None,
         depth: bool = True,
     ) -> Video:
-        codec, numbers = self._codec(assets), np.arange(len(actions)) if index is None else np.asarray(index)
-        known, inputs = codec.encode(prompt)["mean"], assets.normalization.action_inputs(actions, False)
+        codec = self._codec(assets)
+        numbers = np.arange(len(actions)) if index is None else np.asarray(index)
+        known = codec.encode(prompt)["mean"]
+        inputs = assets.normalization.action_inputs(actions, False)
         made = rollout(self.architecture, self.config, self.prompt_frames, params, known, inputs, numbers)
         return codec.decode({"mean": made})
 

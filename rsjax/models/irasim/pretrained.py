@@ -19,7 +19,9 @@ from rsjax.models.saved import check_family
 from rsjax.progress import note
 from rsjax.trainable import Params
 
-AUTOENCODER, NETWORK = "kl_autoencoder", "irasim"  # sections of config.json
+# Sections of config.json.
+AUTOENCODER = "kl_autoencoder"
+NETWORK = "irasim"
 # Fields that may differ between the saved network and the one to train: parameters do not depend on them, or those
 # that do begin afresh.
 FREE = ("rows", "columns", "action_inputs", "compute_dtype", "unroll", "remat")
@@ -33,13 +35,17 @@ def saved_autoencoder(directory: Path) -> KLConfig:
         UserError: there is no autoencoder, or its settings are missing, damaged or of another family.
     """
     saved = _section(directory, AUTOENCODER, KLConfig, "tokenizer", "sdxl")
-    return saved.autoencoder if isinstance(saved, Config) else saved
+    if isinstance(saved, Config):
+        return saved.autoencoder
+    return saved
 
 
 def saved_network(directory: Path) -> Architecture:
     """Returns the architecture of a directory's transformer. Errors as in :func:`saved_autoencoder`."""
     saved = _section(directory, NETWORK, Architecture, "world_model", "irasim")
-    return architecture(saved) if isinstance(saved, Config) else saved
+    if isinstance(saved, Config):
+        return architecture(saved)
+    return saved
 
 
 def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
@@ -55,7 +61,9 @@ def check_autoencoder(directory: Path, own: KLConfig) -> KLConfig:
 def check_network(directory: Path, own: Architecture) -> Architecture:
     """Returns :func:`saved_network`; also raises UserError if its network differs from ``own``."""
     saved = saved_network(directory)
-    free = FREE if own.conditioning == "video" else (*FREE, "frames")
+    free: tuple[str, ...] = FREE
+    if own.conditioning == "frame":
+        free = (*FREE, "frames")
     if differing := differences(saved, own, free):
         raise UserError(f"{directory}: holds another network ({differing}); set these fields of model alike")
     if saved.action_inputs != own.action_inputs:
@@ -68,7 +76,8 @@ def check_network(directory: Path, own: Architecture) -> Architecture:
 
 def completed(fresh: Params, saved: Params) -> Params:
     """Returns the saved parameters; if actions have another length, the action encoder's first layer is a fresh one."""
-    own, there = flatten_dict(fresh, sep="/"), flatten_dict(saved, sep="/")
+    own = flatten_dict(fresh, sep="/")
+    there = flatten_dict(saved, sep="/")
     first = "action_fc1/kernel"
     if there[first].shape != own[first].shape:
         there |= {name: own[name] for name in (first, "action_fc1/bias")}
@@ -85,6 +94,8 @@ def _section(directory: Path, name: str, kind: type[C], stage: str, command: str
     if not settings.keys() & {name, "model"}:
         raise UserError(f"{path}: describes no network of IRASim but {', '.join(settings) or 'nothing'}; {cure}")
     try:
-        return from_dict(kind, settings[name]) if name in settings else from_dict(Config, settings)
+        if name in settings:
+            return from_dict(kind, settings[name])
+        return from_dict(Config, settings)
     except (ConfigError, TypeError) as error:
         raise UserError(f"{path}: the network's settings cannot be read ({error}); make it again") from error

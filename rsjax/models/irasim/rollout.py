@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from rsjax.data.normalization import with_sums
 from rsjax.devices import divide
-from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.models.diffusion.samplers import denoise, sampler_coefficients
 from rsjax.models.irasim.config import IRASimConfig
 from rsjax.models.irasim.dit import Architecture, DiT
 from rsjax.trainable import Params
@@ -34,7 +34,9 @@ def rollout(
         actions: normalised, without sums; row t leads to frame t.
         index: each clip's number, which determines its noise.
     """
-    frames, made, number = actions.shape[1], prompt, 0
+    frames = actions.shape[1]
+    made = prompt
+    number = 0
     shared = min(shared, prompt.shape[1])
     while made.shape[1] < frames:
         first = made.shape[1] - shared
@@ -42,7 +44,10 @@ def rollout(
         # As in the public code, the actions of a short last chunk are padded with its first action.
         rows = np.concatenate([rows, np.repeat(rows[:, 1:2], arch.frames - rows.shape[1], axis=1)], axis=1)
         rows[:, 0] = 0.0  # the sums begin here, as in a training clip
-        rows = with_sums(rows, np.cumsum(rows, axis=1) if arch.integrate_actions else None)
+        sums = None
+        if arch.integrate_actions:
+            sums = np.cumsum(rows, axis=1)
+        rows = with_sums(rows, sums)
         key = jax.random.fold_in(jax.random.key(config.sample.seed), number)
         batch = divide((made[:, first:], rows, index), params)
         chunk = _chunk(arch, config, params, key, *batch)
@@ -62,11 +67,12 @@ def _chunk(
     index: Int[Array, " B"],
 ) -> Float[Array, "B F h w C"]:
     """Returns a chunk whose first K frames are known and stay as they are."""
-    shape, past = (arch.frames, *known.shape[2:]), known.shape[1]
+    shape = (arch.frames, *known.shape[2:])
+    past = known.shape[1]
     start = jax.vmap(lambda number: jax.random.normal(jax.random.fold_in(key, number), shape))(index)
 
     def predict(x: Float[Array, "B F h w C"], t: Int[Array, ""]) -> Float[Array, "B F h w C"]:
         return DiT(arch).apply({"params": params}, x, jnp.full(len(x), t), actions)  # type: ignore[return-value]
 
-    plan = make_plan(config.noise, config.sample)
-    return denoise(plan, predict, start, lambda x: x.at[:, :past].set(known))
+    coefficients = sampler_coefficients(config.noise, config.sample)
+    return denoise(coefficients, predict, start, lambda x: x.at[:, :past].set(known))

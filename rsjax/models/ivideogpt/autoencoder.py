@@ -62,19 +62,24 @@ class ConditionalVQTraining(Autoencoder[Batch]):
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        names = ("l1", "l2", "perceptual") if self.train.lpips_weights else ("l1", "l2")
-        weights = {name: getattr(self.train, f"{name}_weight") for name in (*names, "commitment")}
+        names = ["l1", "l2", "commitment"]
+        if self.train.lpips_weights:
+            names.insert(2, "perceptual")
+        weights = {name: getattr(self.train, f"{name}_weight") for name in names}
         return {name: x for name, x in weights.items() if x} | {"codebook": self.config.codebook_weight}
 
     def init(self, key: Key[Array, ""]) -> Params:
         return ConditionalVQ(self.config).init_params(key, self.image_size)
 
     def init_extra(self) -> Extra:
-        return {"lpips": lpips_weights(self.train, self.image_size)} if "perceptual" in self.loss_weights else None
+        if "perceptual" not in self.loss_weights:
+            return None
+        return {"lpips": lpips_weights(self.train, self.image_size)}
 
     def loss_terms(self, params: Params, batch: Batch, key: Key[Array, ""], context: StepContext) -> dict[str, Term]:
         """Returns the terms; those of pixels are the mean over context frames plus the mean over later frames."""
-        frames, first = jnp.asarray(batch["frames"], jnp.float32) / 255, self.config.context_frames
+        frames = jnp.asarray(batch["frames"], jnp.float32) / 255
+        first = self.config.context_frames
         inputs = ({"params": params}, frames, batch["index"])
         made = cast(Reconstruction, ConditionalVQ(self.config).apply(*inputs, rngs={"dropout": key}))
         pairs = ((frames[:, :first], made.context), (frames[:, first:], made.future))
@@ -125,7 +130,8 @@ class ConditionalVQTraining(Autoencoder[Batch]):
         """
         saved = read_model(directory, IVideoGPTConfig, "tokenizer").autoencoder
         free = {"dropout", "codebook_scale", "codebook_weight", "compute_dtype"}
-        free |= {"context_frames"} if saved.context_frames >= self.config.context_frames else set()
+        if saved.context_frames >= self.config.context_frames:
+            free.add("context_frames")
         check_alike(directory, saved, self.config, free, "model.autoencoder")
         if (size := saved_inputs(directory).image_size) != self.image_size:
             raise UserError(f"{directory}: its tokenizer is for images of {size} pixels, these have {self.image_size}")
@@ -133,7 +139,8 @@ class ConditionalVQTraining(Autoencoder[Batch]):
 
     def start(self, fresh: Params, saved: Params, directory: Path) -> Params:
         """Returns the saved parameters; of more context frames, keeps the last positions, as the public code does."""
-        own, params = flatten_dict(fresh), flatten_dict(saved)
+        own = flatten_dict(fresh)
+        params = flatten_dict(saved)
         return unflatten_dict({path: x[-own[path].shape[0] :] if x.ndim else x for path, x in params.items()})
 
 
@@ -143,7 +150,9 @@ def _draw(context: int, count: int, flip: bool, record: Record, rng: np.random.G
     later = np.arange(context, len(rgb))
     drawn = np.sort(rng.choice(later, count - context, replace=count - context > len(later)))
     frames = rgb[np.concatenate([np.arange(context), drawn])]
-    return {"frames": np.ascontiguousarray(frames[:, :, ::-1]) if flip and rng.random() < 0.5 else frames}
+    if flip and rng.random() < 0.5:
+        frames = np.ascontiguousarray(frames[:, :, ::-1])
+    return {"frames": frames}
 
 
 @dataclass(frozen=True)
@@ -170,13 +179,15 @@ class ConditionalCodec:
         """Decodes tokens to frames; there is no depth."""
         context, future = (np.asarray(tokens[name]) for name in ("context", "future"))
         alone = future.shape[1] == 0  # if there are no later frames, a placeholder is decoded
-        future = np.zeros((len(future), 1, future.shape[2]), np.int32) if alone else future
+        if alone:
+            future = np.zeros((len(future), 1, future.shape[2]), np.int32)
         (frames,) = self._chunked("decode", context.shape[2] * self.config.downsampling, context, future)
         return Video(frames[:, : frames.shape[1] - alone])
 
     def _chunked(self, method: Literal["encode", "decode"], side: int, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Applies the network to a power of two of clips at a time; their images have ``side`` pixels a side."""
-        total, frames = len(arrays[0]), sum(x.shape[1] for x in arrays)
+        total = len(arrays[0])
+        frames = sum(x.shape[1] for x in arrays)
         most = max(1, images_per_pass(side) // frames)
         size = min(2 ** (total - 1).bit_length(), 2 ** (most.bit_length() - 1))
 
@@ -184,13 +195,15 @@ class ConditionalCodec:
             chunk = [x[start : start + size] for x in arrays]
             padded = [np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) for x in chunk]
             made = _apply(self.config, method, self.params, *divide(padded, self.params))
-            return [np.asarray(x)[: len(chunk[0])] for x in (made if isinstance(made, tuple) else (made,))]
+            return [np.asarray(x)[: len(chunk[0])] for x in made]
 
         parts = each_pass(run, range(0, total, size))
         return tuple(np.concatenate(same) for same in zip(*parts, strict=True))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _apply(config: ConditionalVQConfig, method: str, params: Params, *arrays: Array) -> Any:
+def _apply(config: ConditionalVQConfig, method: str, params: Params, *arrays: Array) -> tuple[Array, ...]:
     made: Any = ConditionalVQ(config).apply({"params": params}, *arrays, method=method)
-    return jnp.round(made).astype(jnp.uint8) if method == "decode" else made
+    if method == "decode":
+        return (jnp.round(made).astype(jnp.uint8),)
+    return made

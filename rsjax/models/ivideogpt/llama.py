@@ -46,7 +46,7 @@ class Architecture:
         return cls(config, Layout.create(config, clips.image_size), inputs)
 
 
-class Block(nn.Module):
+class LlamaBlock(nn.Module):
     """x += Attention(norm x); x += SwiGLU(norm x). Norms are RMSNorms, linear layers have no bias."""
 
     config: IVideoGPTConfig
@@ -62,9 +62,11 @@ class Block(nn.Module):
             first: position of the first token.
             keys: of the dropout of each clip; None: no dropout.
         """
-        cfg, (cache, number) = self.config, scanned
+        cfg = self.config
+        cache, number = scanned
         dense = partial(Dense, bf16=cfg.compute_dtype == "bfloat16", use_bias=False, kernel_init=NORMAL)
-        norm, positions = partial(nn.RMSNorm, epsilon=1e-6), first + jnp.arange(x.shape[1])
+        norm = partial(nn.RMSNorm, epsilon=1e-6)
+        positions = first + jnp.arange(x.shape[1])
         h = norm(name="input_layernorm")(x)
         q, k, v = (
             dense(cfg.width, name=f"{name}_proj")(h).reshape(*h.shape[:2], cfg.heads, cfg.width // cfg.heads)
@@ -136,7 +138,9 @@ class LLaMA(nn.Module):
         Returns:
             The logits, and the cache with these tokens written to it (None without a cache).
         """
-        arch, cfg, layout = self.architecture, self.architecture.config, self.architecture.layout
+        arch = self.architecture
+        cfg = arch.config
+        layout = arch.layout
         x = nn.Embed(layout.vocabulary, cfg.width, embedding_init=NORMAL, name="embed_tokens")(tokens)
         if arch.action_inputs:
             if actions is None:
@@ -145,7 +149,9 @@ class LLaMA(nn.Module):
             added = nn.Dense(cfg.width, kernel_init=zeros, bias_init=zeros, name="action_linear")(actions)
             frame, place = jnp.divmod(first + jnp.arange(tokens.shape[1]) - layout.first_slot, layout.per_frame)
             x = x + jnp.where(((frame >= 0) & (place == 0))[:, None], added[:, jnp.maximum(frame, 0)], 0.0)
-        block = nn.remat(Block, prevent_cse=cfg.unroll > 1) if cfg.remat == "blocks" else Block
+        block: Any = LlamaBlock
+        if cfg.remat == "blocks":
+            block = nn.remat(LlamaBlock, prevent_cse=cfg.unroll > 1)
         blocks = nn.scan(
             block,
             variable_axes={"params": 0},
@@ -158,7 +164,9 @@ class LLaMA(nn.Module):
         x, new = blocks(cfg, name="blocks")(x, (together(cache), jnp.arange(cfg.blocks)), first, keys)
         x = nn.RMSNorm(epsilon=1e-6, name="norm")(x[:, skip:])
         head = Dense(layout.vocabulary, cfg.compute_dtype == "bfloat16", False, NORMAL, name="lm_head")
-        return head(x), None if cache is None else put_frames(cache, new, first, ring=False)
+        if cache is None:
+            return head(x), None
+        return head(x), put_frames(cache, new, first, ring=False)
 
     def init_params(self, key: Array) -> Params:
         """Returns initial parameters; blocks are stacked along a leading axis."""

@@ -78,8 +78,12 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         Each clip's index determines its dropout, also in validation, so that a step gives the same result however the
         batch is split over devices.
         """
-        arch, tokens, index = self.architecture, batch["tokens"], batch["index"]
-        keys = folded(jnp.broadcast_to(key, index.shape), index) if self.config.dropout else None
+        arch = self.architecture
+        tokens = batch["tokens"]
+        index = batch["index"]
+        keys = None
+        if self.config.dropout:
+            keys = folded(jnp.broadcast_to(key, index.shape), index)
         first = arch.layout.first_slot
         inputs = (tokens[:, :-1], batch["actions"])
         logits, _ = LLaMA(arch).apply({"params": params}, *inputs, keys=keys, skip=first)
@@ -101,7 +105,8 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         return partial(_arrays, self.architecture.layout, normalization, self.config.integrate_actions)
 
     def example(self, rng: np.random.Generator) -> Record:
-        layout, clips = self.architecture.layout, self.clips
+        layout = self.architecture.layout
+        clips = self.clips
         later = clips.frames - layout.context
         return {
             "context": rng.integers(0, layout.codes, (layout.context, layout.cells), np.int32),
@@ -135,10 +140,12 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
         """
         saved = read_model(directory, IVideoGPTConfig, "world_model")
         check_alike(directory, saved, self.config, FREE, "model")
-        codes, own = saved.autoencoder.codes, self.config.autoencoder.codes
+        codes = saved.autoencoder.codes
+        own = self.config.autoencoder.codes
         if codes != own:
             raise UserError(f"{directory}: knows {codes} codes, this tokenizer has {own}; set model.autoencoder.codes")
-        arch, actions = self.architecture, saved_inputs(directory).action_dim * (1 + saved.integrate_actions)
+        arch = self.architecture
+        actions = saved_inputs(directory).action_dim * (1 + saved.integrate_actions)
         if saved.use_actions and actions != arch.action_inputs:
             raise UserError(
                 f"{directory}: its model reads actions of {actions} numbers, this one of {arch.action_inputs}; only a "
@@ -157,7 +164,8 @@ class IVideoGPT(WorldModel[dict[str, Array]]):
 
     def flops(self, frames: int) -> dict[str, int]:
         """Counts matrix products, 2 per multiply-add; attention in full, because masked products are computed too."""
-        cfg, layout = self.config, self.architecture.layout
+        cfg = self.config
+        layout = self.architecture.layout
         length = layout.length(frames) - 1
         block = 2 * length * cfg.width * (4 * cfg.width + 3 * cfg.mlp_width) + 4 * length**2 * cfg.width
         head = 2 * (length - layout.first_slot) * cfg.width * layout.vocabulary

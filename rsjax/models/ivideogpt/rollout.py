@@ -38,15 +38,20 @@ def generate(
         actions: inputs of the network; row t led to frame t. T may exceed the frames of a sequence.
         index: each clip's number, which determines its random draws.
     """
-    layout, past = arch.layout, prompt.shape[1]
+    layout = arch.layout
+    past = prompt.shape[1]
     lacking = max(0, layout.context - past)  # a prompt shorter than the context is padded with its first frame
     frames = np.concatenate([np.repeat(prompt[:, :1], lacking, axis=1), prompt], axis=1)
     rows = np.concatenate([np.repeat(actions[:, :1], lacking, axis=1), actions], axis=1)
-    count = rows.shape[1] if rows.shape[1] <= layout.most_frames else layout.most_frames  # frames of a sequence
-    given = frames.shape[1] if frames.shape[1] < count else layout.context
+    count = min(rows.shape[1], layout.most_frames)  # frames of a sequence
+    given = layout.context
+    if frames.shape[1] < count:
+        given = frames.shape[1]
     begin = frames.shape[1] - given
+    made = []
     # The first sequence is decoded as a whole and usually has all frames of the prompt.
-    made = [codec.decode(codec.encode(Video(frames))).rgb] if begin or frames.shape[1] == rows.shape[1] else []
+    if begin or frames.shape[1] == rows.shape[1]:
+        made.append(codec.decode(codec.encode(Video(frames))).rgb)
     window = frames[:, begin:]
     keys = folded(jnp.broadcast_to(jax.random.key(arch.config.sample.seed), index.shape), jnp.asarray(index))
     while begin + given < rows.shape[1]:
@@ -59,8 +64,12 @@ def generate(
         inputs = (sequence, used, folded(keys, jnp.full(len(index), begin)))
         drawn = sample(arch, params, *divide(inputs, params))
         whole = codec.decode({"context": tokens["context"], "future": layout.future(np.asarray(drawn))}).rgb
-        made.append(whole[:, given if made else 0 :])
-        begin, given = begin + count - layout.context, layout.context
+        if made:
+            made.append(whole[:, given:])
+        else:
+            made.append(whole)
+        begin = begin + count - layout.context
+        given = layout.context
         window = whole[:, -layout.context :]
     return np.concatenate(made, axis=1)[:, lacking : rows.shape[1]]
 
@@ -80,11 +89,14 @@ def sample(
         actions: actions of all later frames.
         keys: keys of each clip's draws.
     """
-    layout, (clips, begin) = arch.layout, given.shape
-    network, later = LLaMA(arch), actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
+    layout = arch.layout
+    clips, begin = given.shape
+    network = LLaMA(arch)
+    later = actions.shape[1] - (begin - layout.first_slot) // layout.per_frame
     end = layout.length(layout.context + actions.shape[1])
 
-    blocks, unroll = arch.config.blocks, arch.config.unroll
+    blocks = arch.config.blocks
+    unroll = arch.config.unroll
     parts = apart(params["blocks"], blocks, unroll)
 
     def forward(cache: KeyValues, tokens: Int[Array, "B K"], first: Array | int) -> tuple[KeyValues, Array]:

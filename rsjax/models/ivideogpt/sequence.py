@@ -36,7 +36,8 @@ class Layout:
     def create(cls, config: IVideoGPTConfig, image_size: int) -> "Layout":
         """Returns the layout for clips of this size."""
         vq = config.autoencoder
-        cells, tokens = vq.grid(image_size) ** 2, vq.future_tokens(image_size)
+        cells = vq.grid(image_size) ** 2
+        tokens = vq.future_tokens(image_size)
         return cls(vq.codes, vq.context_frames, cells, tokens, config.positions)
 
     @property

@@ -51,7 +51,8 @@ def video(config: Config, size: int, frames: int) -> Video:
 
 def arrays(model: WorldModel[Any], config: Config, size: int) -> Arrays:
     """Returns the stacked arrays of ``size`` random records."""
-    rng, transform = np.random.default_rng(0), model.transform(normalization(config))
+    rng = np.random.default_rng(0)
+    transform = model.transform(normalization(config))
     rows = [transform(model.example(rng), rng) for _ in range(size)]
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 

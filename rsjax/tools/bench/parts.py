@@ -40,10 +40,13 @@ ACCELERATOR_PRODUCTS = ((4096, 256, 1024), (8192, 8192, 8192), (16384, 4096, 163
 PRODUCTS_PER_RUN = 10  # to hide the cost of a launch
 PROMPT_FRAMES = 1  # of each rollout, as in the paper, for every preset
 UNCACHED_FRAMES = 2  # frames decoded without the cache; all cost the same, so few are enough
-LOADER_CLIPS, LOADER_BATCHES = 64, 16
+LOADER_CLIPS = 64
+LOADER_BATCHES = 16
 FEED_CLIPS = 256
 ENVIRONMENTS = (1, 64)  # numbers of environments that are stepped at once
-WARM_UP, LEAST, MOST = 3, 10, 200  # steps of the part "feed"
+WARM_UP = 3
+LEAST = 10
+MOST = 200  # steps of the part "feed"
 
 
 def matmul(dtype: str, budget: float) -> Numbers:
@@ -107,20 +110,24 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
     Without the cache, only the last frames of a rollout are decoded, since each step on each of them passes over all
     frames. Families other than RoboScape and Genie are measured from pixels to pixels.
     """
-    model, key = create_model(config), jax.random.key(0)
+    model = create_model(config)
+    key = jax.random.key(0)
     if not isinstance(model, RoboScape):
         return _sample_pixels(config, batch, budget, horizons)
-    arch, settings = model.architecture, model.config.sample
+    arch = model.architecture
+    settings = model.config.sample
     params = jax.jit(model.init)(jax.random.key(0))
     numbers: Numbers = {"sample_steps": settings.steps, "sample_prompt_frames": PROMPT_FRAMES}
     for frames in horizons:
-        actions, late = inputs.actions(arch, batch, frames), max(PROMPT_FRAMES, frames - UNCACHED_FRAMES)
+        actions = inputs.actions(arch, batch, frames)
+        late = max(PROMPT_FRAMES, frames - UNCACHED_FRAMES)
         for name, start, cached in (("cached", PROMPT_FRAMES, True), ("uncached", late, False)):
             prompt = inputs.prompt(arch, batch, start)
             run = partial(rollout, arch, settings, params, prompt, actions, key, cached=cached)
             numbers[f"sample_s_per_frame_{name}_{frames}"] = median_seconds(run, budget) / (frames - start)
         numbers[f"sample_uncached_frames_measured_{frames}"] = frames - late
-    first, last = horizons[0], horizons[-1]
+    first = horizons[0]
+    last = horizons[-1]
     for name in ("s_per_frame_cached", "s_per_frame_uncached", "uncached_frames_measured"):
         numbers[f"sample_{name}"] = numbers[f"sample_{name}_{first}"]
     if last != first:
@@ -130,7 +137,8 @@ def sample(config: Config, batch: int, budget: float, horizons: tuple[int, ...])
 
 
 def _sample_pixels(config: Config, batch: int, budget: float, horizons: tuple[int, ...]) -> Numbers:
-    model, assets = create_model(config), inputs.assets(config)
+    model = create_model(config)
+    assets = inputs.assets(config)
     params = jax.jit(model.init)(jax.random.key(0))
     numbers: Numbers = {"sample_prompt_frames": PROMPT_FRAMES}
     for frames in horizons:
@@ -148,8 +156,10 @@ def tokenizer(config: Config, batch: int, budget: float) -> Numbers:
     assets = inputs.assets(config)
     assert assets.tokenizer is not None
     codec = create_autoencoder(config).codec(assets.tokenizer, assets.normalization)
-    video, no_depth = inputs.video(config, batch, config.clips.frames), np.zeros(batch, bool)
-    tokens, frames = codec.encode(video), batch * config.clips.frames
+    video = inputs.video(config, batch, config.clips.frames)
+    no_depth = np.zeros(batch, bool)
+    tokens = codec.encode(video)
+    frames = batch * config.clips.frames
     return {
         "tokenizer_encode_frames_per_s": frames / median_seconds(lambda: codec.encode(video), budget),
         "tokenizer_decode_frames_per_s": frames / median_seconds(lambda: codec.decode(tokens, no_depth).rgb, budget),
@@ -163,7 +173,8 @@ def environment(config: Config, budget: float) -> Numbers:
     A step goes from an action on the host to a frame on the host, with depth if the model has it, in windows that are
     on average half full. The result is empty for a model that takes no actions or cannot generate frame by frame.
     """
-    model, size = create_model(config), config.clips.image_size
+    model = create_model(config)
+    size = config.clips.image_size
     trained = TrainedModel(config, model, jax.jit(model.init)(jax.random.key(0)), inputs.assets(config))
     first = {"rgb": np.zeros((size, size, 3), np.uint8), "depth": np.ones((size, size), np.float32)}
     numbers: Numbers = {}
@@ -173,7 +184,8 @@ def environment(config: Config, budget: float) -> Numbers:
         except UserError:
             return {}
         env.reset(seed=0, options=first if config.model.uses_depth else {"rgb": first["rgb"]})
-        steps, actions = config.clips.frames, np.zeros((count, config.clips.action_dim), np.float32)
+        steps = config.clips.frames
+        actions = np.zeros((count, config.clips.action_dim), np.float32)
         seconds = median_seconds(lambda: [env.step(actions)[0]["rgb"] for _ in range(steps)], budget)  # noqa: B023
         numbers[f"environment_steps_per_s_{count}"] = count * steps / seconds
     return numbers
@@ -181,12 +193,14 @@ def environment(config: Config, budget: float) -> Numbers:
 
 def load(config: Config, batch: int, budget: float) -> Numbers:
     """Measures clips a second from a store to batches on the host, through the loader that training uses."""
-    model, rng = create_model(config), np.random.default_rng(0)
+    model = create_model(config)
+    rng = np.random.default_rng(0)
     records = [model.example(rng) for _ in range(LOADER_CLIPS)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": records}, {})
-        source, transform = open_store(path).source("train"), model.transform(inputs.normalization(config))
+        source = open_store(path).source("train")
+        transform = model.transform(inputs.normalization(config))
         with loader.batches(source, transform, batch, config.train.seed) as clips:
             seconds = median_seconds(lambda: [model.batch(next(clips)) for _ in range(LOADER_BATCHES)], budget)
     return {"loader_clips_per_s": batch * LOADER_BATCHES / seconds}
@@ -213,16 +227,20 @@ def feed(config: Config, budget: float) -> Numbers:
         step = sharding.compile(train_step, model, loop)
         state = jax.jit(lambda: create_state(model, loop))()
         with Prefetch(make(None), lambda arrays: sharding.put_batch(model.batch(arrays))) as batches:
-            steps, began, waited = 0, 0.0, 0.0
+            steps = 0
+            began = 0.0
+            waited = 0.0
             while steps < WARM_UP + MOST:
                 if steps == WARM_UP:
-                    began, waited = time.monotonic(), batches.waited
+                    began = time.monotonic()
+                    waited = batches.waited
                 state, metrics = step(state, next(batches).batch)
                 jax.block_until_ready(metrics)
                 steps += 1
                 if steps >= WARM_UP + LEAST and time.monotonic() - began > budget:
                     break
-            seconds, waited = time.monotonic() - began, batches.waited - waited
+            seconds = time.monotonic() - began
+            waited = batches.waited - waited
     return {
         "feed_batch": loop.batch_size,
         "feed_workers": loop.workers,

@@ -100,16 +100,22 @@ def _rows(prefix: str, rows: dict[str, tuple[float, float]]) -> dict[str, float]
 
 def bandwidth(budget: float) -> float:
     """Returns the bytes a second that adding two large arrays reads and writes."""
-    x, y = jnp.ones(STREAM), jnp.ones(STREAM)
+    x = jnp.ones(STREAM)
+    y = jnp.ones(STREAM)
     add = jax.jit(jnp.add)
     return 3 * FLOAT * STREAM / median_seconds(lambda: add(x, y), budget)
 
 
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
     """Returns the operations of a training step's forward pass, without rematerialisation and without embeddings."""
-    width, hidden, heads, frames = arch.width, arch.mlp_ratio * arch.width, arch.heads, config.clips.frames
-    cells, blocks = arch.grid**2, arch.blocks * len(arch.branches)
-    rows, bf16 = batch * frames * cells, arch.compute_dtype == "bfloat16"
+    width = arch.width
+    hidden = arch.mlp_ratio * arch.width
+    heads = arch.heads
+    frames = config.clips.frames
+    cells = arch.grid**2
+    blocks = arch.blocks * len(arch.branches)
+    rows = batch * frames * cells
+    bf16 = arch.compute_dtype == "bfloat16"
     norms = blocks * ((4 if arch.qk_norm else 2) + arch.departures.temporal_norm) + arch.departures.final_norm * len(
         arch.branches
     )
@@ -145,7 +151,8 @@ def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operatio
 
 def tokenizer_operations(config: TokenizerConfig, image_size: int) -> dict[str, tuple[Operation, ...]]:
     """Returns the distinct convolutions and linear layers that "encode" and "decode" one image."""
-    network, side = Tokenizer(replace(config, compute_dtype="float32")), config.grid(image_size)
+    network = Tokenizer(replace(config, compute_dtype="float32"))
+    side = config.grid(image_size)
     bf16 = config.compute_dtype == "bfloat16"
     params = jax.eval_shape(network.init_params, jax.random.key(0))
     images = jax.ShapeDtypeStruct((1, image_size, image_size, 3), "float32")
@@ -171,7 +178,8 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
             yield from _traced(inner, bf16)
         if eqn.primitive.name not in ("conv_general_dilated", "dot_general"):
             continue
-        shapes, out = tuple(x.aval.shape for x in eqn.invars), eqn.outvars[0].aval.shape
+        shapes = tuple(x.aval.shape for x in eqn.invars)
+        out = eqn.outvars[0].aval.shape
         name = f"linear_{shapes[1][0]}_to_{out[-1]}"
         if eqn.primitive.name == "conv_general_dilated":
             rows, columns, inputs, outputs = shapes[1]
@@ -185,8 +193,10 @@ def _traced(jaxpr: Any, bf16: bool) -> Iterator[Operation]:
 
 def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
     """Returns a pass over the last frame of a full window; it takes parameters and the cache of the earlier frames."""
-    arch, sample = model.architecture, model.config.sample
-    actions, hidden = inputs.actions(arch, batch, 1), jnp.ones((batch, 1, arch.grid**2), bool)
+    arch = model.architecture
+    sample = model.config.sample
+    actions = inputs.actions(arch, batch, 1)
+    hidden = jnp.ones((batch, 1, arch.grid**2), bool)
     tokens = {name: cells.reshape(hidden.shape) for name, cells in inputs.prompt(arch, batch, 1).items()}
 
     def run(params: Params, cache: Cache) -> Any:

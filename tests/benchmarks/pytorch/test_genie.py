@@ -82,14 +82,15 @@ def test_logits_are_those_of_the_rgb_branch(action_inputs: int) -> None:
 
 @pytest.mark.parametrize("changes", [{"adaptive_norm": True}, {"patch_size": 2, "local_codes": True}])
 def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
-    from benchmarks.pytorch.magvit2 import Decoder, Encoder
+    from benchmarks.pytorch.magvit2 import MagvitDecoderTorch, MagvitEncoderTorch
     from benchmarks.pytorch.measure import to_channels_last
 
     config = TokenizerConfig(
         channels=8, channel_multipliers=(1, 2), res_blocks=1, norm_groups=4, code_bits=6, **changes
     )
     drawn = noisy(Tokenizer(config).init_params(jax.random.key(0)))
-    encoder, decoder = Encoder(config), Decoder(config)
+    encoder = MagvitEncoderTorch(config)
+    decoder = MagvitDecoderTorch(config)
     tensors = {name: torch.tensor(np.ascontiguousarray(x)) for name, x in to_tensors(drawn, table(config)).items()}
     for name, half in (("encoder", encoder), ("decoder", decoder)):
         half.load_state_dict({key[8:]: x for key, x in tensors.items() if key.startswith(name)})
@@ -97,10 +98,10 @@ def test_the_tokenizer_is_magvit2(changes: dict[str, Any]) -> None:
     with torch.no_grad():
         latents = encoder(torch.tensor(images).permute(0, 3, 1, 2))
         made = decoder(latents.sign()).permute(0, 2, 3, 1)
-    own: Any = magvit2.Encoder(config).apply({"params": drawn["encoder"]}, images)
+    own: Any = magvit2.MagvitEncoder(config).apply({"params": drawn["encoder"]}, images)
     np.testing.assert_allclose(own, latents.permute(0, 2, 3, 1), atol=2e-5)
     codes = latents.sign().permute(0, 2, 3, 1).numpy()
-    decoded: Any = magvit2.Decoder(config).apply({"params": drawn["decoder"]}, codes)
+    decoded: Any = magvit2.MagvitDecoder(config).apply({"params": drawn["decoder"]}, codes)
     np.testing.assert_allclose(decoded, made, atol=2e-5)
     to_channels_last([encoder, decoder])
     with torch.no_grad():

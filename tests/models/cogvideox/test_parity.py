@@ -11,7 +11,7 @@ import pytest
 from rsjax.models.cogvideox import autoencoder
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 from rsjax.models.cogvideox.transformer import Architecture, Transformer, shapes
-from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.models.diffusion.samplers import denoise, sampler_coefficients
 from rsjax.models.diffusion.schedule import alphas
 from rsjax.tokenizers import causal_vae as vae
 from rsjax.tools.convert import cogvideox as convert
@@ -133,7 +133,7 @@ def test_schedule_and_sampler_are_those_of_diffusers(shift: float) -> None:
     x = torch.from_numpy(start)
     for t in scheduler.timesteps:
         x = scheduler.step(torch.tanh(x * (1 + t / 1000)), t, x).prev_sample
-    plan = make_plan(noise, GuidedDenoiseConfig())
+    plan = sampler_coefficients(noise, GuidedDenoiseConfig())
     np.testing.assert_array_equal(plan.t, scheduler.timesteps)
     made = denoise(plan, lambda x, t: jnp.tanh(x * (1 + t / 1000)), jnp.asarray(start))
     np.testing.assert_allclose(made, x.numpy(), atol=1e-5)

@@ -9,7 +9,7 @@ import pytest
 
 from rsjax.config import ConfigError
 from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig
-from rsjax.models.diffusion.samplers import denoise, make_plan
+from rsjax.models.diffusion.samplers import denoise, sampler_coefficients
 from rsjax.models.diffusion.schedule import add_noise, alphas, target
 
 LEFT = alphas(NoiseConfig())
@@ -51,7 +51,7 @@ def test_latents_are_those_of_diffusers(sampler: Any, spacing: Any, prediction: 
         x = scheduler.step(torch.from_numpy(np.array(network(x.numpy(), int(t)))), t, x).prev_sample
 
     sample = DenoiseConfig(sampler, steps=20, spacing=spacing, end_clean=sampler == "ddim")
-    plan = make_plan(NoiseConfig(betas=betas, prediction=prediction), sample)
+    plan = sampler_coefficients(NoiseConfig(betas=betas, prediction=prediction), sample)
     np.testing.assert_array_equal(plan.t, scheduler.timesteps)
     np.testing.assert_allclose(denoise(plan, network, jnp.asarray(start)), x.numpy(), atol=1e-5)
 
@@ -65,7 +65,7 @@ def test_a_network_that_knows_the_clean_latents_leads_ddim_to_them(prediction: A
         drawn = (x - SIGNAL[t] * clean) / SPREAD[t]
         return target(noise, clean, drawn, jnp.full(len(x), t))
 
-    plan = make_plan(noise, DenoiseConfig("ddim", steps=12, end_clean=True))
+    plan = sampler_coefficients(noise, DenoiseConfig("ddim", steps=12, end_clean=True))
     np.testing.assert_allclose(denoise(plan, knows, start), clean, atol=1e-4)
 
 
@@ -78,7 +78,9 @@ def test_pndm_makes_fewer_errors_than_ddim() -> None:
 
     exact = deviation * start / jnp.sqrt(deviation**2 * SIGNAL[-1] ** 2 + SPREAD[-1] ** 2)
     errors = {
-        sampler: float(jnp.abs(denoise(make_plan(NoiseConfig(), DenoiseConfig(sampler)), best, start) - exact).max())  # type: ignore[arg-type]
+        sampler: float(
+            jnp.abs(denoise(sampler_coefficients(NoiseConfig(), DenoiseConfig(sampler)), best, start) - exact).max()
+        )  # type: ignore[arg-type]
         for sampler in ("ddim", "pndm")
     }
     assert errors["pndm"] < errors["ddim"] / 2
@@ -86,8 +88,8 @@ def test_pndm_makes_fewer_errors_than_ddim() -> None:
 
 
 def test_network_calls_are_the_steps_and_nine_more_for_pndm() -> None:
-    assert len(make_plan(NoiseConfig(), DenoiseConfig("ddim")).t) == 50
-    assert len(make_plan(NoiseConfig(), DenoiseConfig("pndm")).t) == 59
+    assert len(sampler_coefficients(NoiseConfig(), DenoiseConfig("ddim")).t) == 50
+    assert len(sampler_coefficients(NoiseConfig(), DenoiseConfig("pndm")).t) == 59
 
 
 def test_known_latents_stay_as_they_are_and_are_what_the_network_sees() -> None:
@@ -99,7 +101,7 @@ def test_known_latents_stay_as_they_are_and_are_what_the_network_sees() -> None:
     def predict(x: Any, t: Any) -> Any:
         return jnp.broadcast_to(jnp.where(jnp.all(x[:, 0] == known), 0.0, jnp.nan), x.shape)
 
-    made = denoise(make_plan(NoiseConfig(), DenoiseConfig(steps=5)), predict, jnp.ones((2, 4, 3)), restore)
+    made = denoise(sampler_coefficients(NoiseConfig(), DenoiseConfig(steps=5)), predict, jnp.ones((2, 4, 3)), restore)
     np.testing.assert_array_equal(made[:, 0], np.broadcast_to(known, (2, 3)))
     assert np.isfinite(made).all()
 
