@@ -47,7 +47,7 @@ def test_depth_goes_through_its_colours_and_comes_back_in_metres(codec: Codec, m
     np.testing.assert_array_equal(tokens, codec.encode_rgb(colors))
     monkeypatch.setattr(module, "passes_at_once", lambda: 1)
     # With a tokenizer that keeps everything, metres are right to half of one of the map's 766 levels.
-    monkeypatch.setattr(module, "_apply", lambda config, method, params, x: np.resize(colors, (len(x), 64, 64, 3)))
+    monkeypatch.setattr(module, "_run", lambda config, method, mesh, params, x: np.resize(colors, (len(x), 64, 64, 3)))
     metres = codec.decode_depth(tokens)
     assert metres.shape == depth.shape
     level = (1 / NEAR_FAR[0] - 1 / NEAR_FAR[1]) / 765
