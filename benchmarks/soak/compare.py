@@ -11,8 +11,7 @@ import orbax.checkpoint as ocp
 from benchmarks.soak.attempt import checkpoints
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import Store, encode, open_store
-from rsjax.training.log import read_curve
-from rsjax.training.skipped import NAME as SKIPPED
+from rsjax.training.log import SKIPPED, read_curve
 
 
 def compare_stages(one: Path, two: Path) -> list[str]:

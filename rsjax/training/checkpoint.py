@@ -1,13 +1,19 @@
-"""Checkpoints: the whole training state with its position in the data, and the final weights that later stages read."""
+"""Checkpoints: the whole training state with its position in the data, and the final weights that later stages read.
+
+Sizes and checksums of a checkpoint's files are kept in it, so that a damaged one is found before it is restored.
+"""
 
 import errno
+import json
 import logging
 import math
 import os
 import resource
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,18 +21,19 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
+from orbax.checkpoint import checkpoint_managers as ocm
 
 from rsjax.errors import UserError, first_line
-from rsjax.files import FileError, disk_guard, placeholder, replace_directory
+from rsjax.files import FileError, disk_guard, parse_json, placeholder, replace_directory
 from rsjax.progress import note
-from rsjax.training.checksums import find_fault, read_metric, write_checksums
 from rsjax.training.distributed import agree, is_lead, on_lead
-from rsjax.training.retention import retention
 
 # Orbax logs every step of every save, and each error at length in each of its threads. Users see the progress line,
 # and the error is raised as well.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
+CHECKSUMS = "checksums.json"  # written before a checkpoint gets its name, so one without it is damaged
+CHUNK_BYTES = 2**22
 MOST_FILE = 2**31  # bytes after which orbax begins another file
 UNFINISHED = ".orbax-checkpoint-tmp"  # what orbax adds to the name of a checkpoint while it writes it
 
@@ -298,3 +305,100 @@ def _misfit(path: Path, error: Exception) -> CheckpointError:
         f"{path}: does not fit this configuration or is damaged ({first_line(error)}); use the configuration it was "
         f"made with, or another run directory, or delete it"
     )
+
+
+def write_checksums(checkpoint: Path, metric: float | None) -> None:
+    """Reads all files of a finished checkpoint and writes their sizes and checksums, and the checkpoint's metric.
+
+    Raises:
+        OSError: a file cannot be read or written.
+    """
+    # Only files in folders: at the top are orbax's own notes, which it changes later and which no restore reads.
+    paths = sorted(path for path in checkpoint.glob("*/**/*") if path.is_file())
+    files = {str(path.relative_to(checkpoint)): _size_and_checksum(path) for path in paths}
+    content = {"metric": metric, "files": files}
+    (checkpoint / CHECKSUMS).write_text(json.dumps(content | {"crc32": _checksum(content)}))
+
+
+def read_metric(checkpoint: Path) -> float | None:
+    """Returns the metric that a checkpoint was written with; None if it has none, or none that can be read."""
+    try:
+        return _read_checksums(checkpoint)["metric"]
+    except (OSError, ValueError):
+        return None
+
+
+def find_fault(checkpoint: Path) -> str | None:
+    """Returns a few words that name a checkpoint's first bad file and its fault, or None if all files are intact."""
+    name = CHECKSUMS
+    try:
+        for name, written in _read_checksums(checkpoint)["files"].items():
+            if _size_and_checksum(checkpoint / name) != written:
+                return f"{name}: not what was written"
+    except OSError as error:
+        return f"{name}: {error.strerror}"
+    except ValueError:
+        return f"{name}: not what was written"
+    return None
+
+
+def _size_and_checksum(path: Path) -> list[int]:
+    size = checksum = 0
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            size, checksum = size + len(chunk), zlib.crc32(chunk, checksum)
+    return [size, checksum]
+
+
+def _checksum(content: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(content).encode())
+
+
+def _read_checksums(checkpoint: Path) -> dict[str, Any]:
+    """Reads the metric and the files' sizes and checksums.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: the file is damaged.
+    """
+    path = checkpoint / CHECKSUMS
+    content = parse_json(path.read_bytes())
+    if content.pop("crc32", None) != _checksum(content):
+        raise ValueError(f"{path}: its checksum is wrong")
+    return content
+
+
+@dataclass
+class Best(ocm.PreservationPolicy):
+    """Keeps the checkpoint with the lowest metric, the newest of equal ones; keeps none if none has a metric.
+
+    Orbax's BestN reads the metrics from the checkpoints, where a damaged one stops it from opening the others.
+
+    Attributes:
+        metrics: by step.
+    """
+
+    metrics: Mapping[int, float]
+
+    def should_preserve(
+        self, checkpoints: Sequence[ocm.PolicyCheckpointInfo], *, context: ocm.PreservationContext
+    ) -> list[bool]:
+        judged = [(self.metrics[info.step], -info.step) for info in checkpoints if info.step in self.metrics]
+        best = -min(judged)[1] if judged else None
+        return [info.step == best for info in checkpoints]
+
+
+def retention(keep_last: int, keep_every: int, metrics: Mapping[int, float] | None) -> ocm.PreservationPolicy:
+    """Returns the policy that keeps every checkpoint to which one of three rules applies.
+
+    Args:
+        keep_last: number of newest checkpoints to keep.
+        keep_every: keep those whose step is a multiple of this; 0: no such rule.
+        metrics: keep the one with the lowest of these, by step; None: no such rule.
+    """
+    policies: list[ocm.PreservationPolicy] = [ocm.LatestN(keep_last)]
+    if keep_every:
+        policies.append(ocm.EveryNSteps(keep_every))
+    if metrics is not None:
+        policies.append(Best(metrics))
+    return ocm.AnyPreservationPolicy(policies)

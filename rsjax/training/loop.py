@@ -5,31 +5,26 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 
 from rsjax.config import LoopConfig
-from rsjax.data.loader import Loader
+from rsjax.data.loader import DeviceBatch, Loader, Prefetch
 from rsjax.data.order import Arrays
-from rsjax.data.prefetch import DeviceBatch, Prefetch
 from rsjax.errors import Preempted, UserError
 from rsjax.progress import Progress, note
 from rsjax.trainable import Params, Trainable
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.distributed import agree, barrier, is_lead
-from rsjax.training.log import ScalarLog
-from rsjax.training.memory import memory_scalars
+from rsjax.training.log import SKIPPED, ScalarLog, SkippedSteps, memory_scalars
 from rsjax.training.preemption import StopRequest
 from rsjax.training.profile import Profile
 from rsjax.training.sharding import Sharding
-from rsjax.training.skipped import NAME as SKIPPED
-from rsjax.training.skipped import SkippedSteps
 from rsjax.training.state import TrainState
-from rsjax.training.step import Metrics, train_step
-from rsjax.training.validation import Validate, Validation
+from rsjax.training.step import Metrics, as_numbers, train_step
+from rsjax.training.validation import Validate
 
 B = TypeVar("B")
 
@@ -38,17 +33,12 @@ class DivergedError(UserError):
     """More steps were skipped than ``skip_budget`` allows."""
 
 
-@dataclass(frozen=True)
-class Monitor:
-    """Settings of progress display and validation, which do not affect the results of training.
+class DispatchedStep(NamedTuple):
+    """A step that the device may still be computing."""
 
-    Attributes:
-        per_step: the unit and amount of a step's work, such as ("frames", 64), for rates.
-        validate: scores the weights every ``loop.eval_every`` steps.
-    """
-
-    per_step: tuple[str, float] | None = None
-    validate: Validate | None = None
+    step: int
+    batch: DeviceBatch
+    metrics: Metrics
 
 
 def fit(
@@ -62,7 +52,8 @@ def fit(
     start: Callable[[Params], Params] | None = None,
     resume: bool = True,
     stop_at: int | None = None,
-    monitor: Monitor = Monitor(),
+    validate: Validate | None = None,
+    per_step: tuple[str, float] | None = None,
 ) -> TrainState:
     """Trains for ``loop.steps`` steps in total, resuming from the newest checkpoint in ``directory``.
 
@@ -77,6 +68,8 @@ def fit(
         start: makes the initial parameters from fresh ones; not called on resuming from a checkpoint.
         resume: False deletes earlier checkpoints.
         stop_at: stop (and save) after this step, as if interrupted.
+        validate: scores the weights every ``loop.eval_every`` steps; it does not affect training.
+        per_step: the unit and amount of a step's work, such as ("frames", 64), for the rates that are shown and logged.
 
     Returns:
         The final state on this process's first device; only its weights if it is sharded (``loop.fsdp``).
@@ -95,14 +88,71 @@ def fit(
         checkpoints = Checkpoints(directory / "checkpoints", loop.keep_last, loop.keep_every, loop.keep_best)
         stack.callback(checkpoints.close)
         if agree(checkpoints.latest(), f"{name}: newest checkpoint") is None:
-            state, data = sharding.init(model, loop, start), None
+            state = sharding.init(model, loop, start)
+            data = None
         else:
             state, data = checkpoints.restore(sharding.template(model, loop))
             state = sharding.adopt(state)
-        training = _Training(model, loop, directory, sharding, checkpoints, monitor)
+        first = int(state.step)
         last = min(stop_at or loop.steps, loop.steps)
+        skips = int(state.skipped)
+        step_fn = sharding.compile(train_step, model, loop)
+
         batches = stack.enter_context(Prefetch(loader(data), lambda arrays: sharding.put_batch(to_batch(arrays))))
-        state = training.steps(state, batches, last, name)
+        log = progress = skipped_steps = None
+        if is_lead():
+            skipped_steps = SkippedSteps(directory, first)
+            log = stack.enter_context(ScalarLog(directory, first, loop.wandb, resume=first > 0))
+            progress = stack.enter_context(Progress(name, loop.steps, "steps", first, per_unit=per_step))
+        profile = stack.enter_context(Profile.after(directory / "profile", first, last, loop.profile))
+        stop = stack.enter_context(StopRequest())
+        clock = _Clock(batches, first)
+        pending: DispatchedStep | None = None
+        for step in range(first + 1, last + 1):
+            profile.at(step, state)
+            batch = next(batches)
+            with jax.profiler.StepTraceAnnotation("train", step_num=step):
+                state, metrics = step_fn(state, batch.batch)
+            if pending is not None:  # only one step is computed while the next is prepared
+                skips = _count_skips(pending, skips, loop, directory, batches, skipped_steps)
+            pending = DispatchedStep(step, batch, metrics)
+            if progress is not None:
+                progress.update(step, **{term: metrics[term] for term in ("loss", *model.loss_weights)})
+
+            stopping = stop.asked(step)
+            log_due = _is_due(step, loop.log_every, last)
+            validation_due = validate is not None and _is_due(step, loop.eval_every, last)
+            checkpoint_due = stopping or _is_due(step, loop.checkpoint_every, last)
+            if not (log_due or validation_due or checkpoint_due):
+                continue
+            skips = _count_skips(pending, skips, loop, directory, batches, skipped_steps)
+            pending = None
+            if log is not None and log_due:
+                measured = clock.lap(step, per_step) | memory_scalars()
+                log.write(step, as_numbers(metrics) | measured)
+            metric = None
+            if validate is not None and validation_due:
+                with clock.stopped(), stop.impatient():
+                    weights = sharding.gather(state.weights)
+                    score = 0.0
+                    if log is not None:
+                        validation = validate(step, weights)
+                        score = validation.metric
+                        log.write(step, validation.scalars)
+                        for picture, pixels in validation.pictures.items():
+                            log.image(step, picture, pixels)
+                    metric = agree(score, f"validation {step}")  # the lead's, in all processes
+            if checkpoint_due or (metric is not None and loop.keep_best):
+                checkpoints.save(step, sharding.portable(state), batches.state(), metric)
+            if stopping and step < last:
+                checkpoints.wait()
+                raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
+        # Here SIGTERM is only recorded; after this block it may keep the caller from closing the checkpoints.
+        checkpoints.wait()
+        profile.at(last + 1, state)
+        damaged = batches.quarantined()
+        if damaged and is_lead():
+            note(f"{damaged} damaged records were replaced; {directory / 'quarantine.jsonl'} lists them")
     if sharding.shares:  # the whole state need not fit one device
         kept = "params" if state.ema is None else "ema"
         rest: dict[str, Any] = dict.fromkeys(("params", "opt_state", "ema", "extra"))
@@ -110,118 +160,43 @@ def fit(
     return sharding.gather(state)
 
 
-class _Dispatched(NamedTuple):
-    """A step that the device may still be computing."""
-
-    step: int
-    batch: DeviceBatch
-    metrics: Metrics
+def _is_due(step: int, every: int, last: int) -> bool:
+    """Returns whether something is due at this step that happens every so many steps (0: never) and at the end."""
+    return every > 0 and (step % every == 0 or step == last)
 
 
-class _Training:
-    """One call of :func:`fit`."""
+def _count_skips(
+    done: DispatchedStep,
+    before: int,
+    loop: LoopConfig,
+    directory: Path,
+    batches: Prefetch,
+    record: SkippedSteps | None,
+) -> int:
+    """Waits for a step, records it if it was skipped, and returns the number of skipped steps so far.
 
-    def __init__(
-        self,
-        model: Trainable[Any],
-        loop: LoopConfig,
-        directory: Path,
-        sharding: Sharding,
-        checkpoints: Checkpoints,
-        monitor: Monitor,
-    ) -> None:
-        self.model, self.loop, self.directory = model, loop, directory
-        self.sharding, self.checkpoints, self.monitor = sharding, checkpoints, monitor
+    Args:
+        before: the number of skipped steps before it.
+        record: where the lead process records it.
 
-    def steps(self, state: TrainState, batches: Prefetch, last: int, name: str) -> TrainState:
-        """Trains from the state's step to step ``last``."""
-        loop, first = self.loop, int(state.step)
-        step_fn = self.sharding.compile(train_step, self.model, loop)
-        self._skips = int(state.skipped)
-        self._skipped_steps = SkippedSteps(self.directory, first) if is_lead() else None
-        with ExitStack() as stack:
-            log = stack.enter_context(self._log(first)) if is_lead() else None
-            shown = (name, loop.steps, "steps", first)
-            progress = stack.enter_context(Progress(*shown, per_unit=self.monitor.per_step)) if is_lead() else None
-            traces = (self.directory / "profile", first, last, self.loop.profile)
-            profile = stack.enter_context(Profile.after(*traces))
-            stop = stack.enter_context(StopRequest())
-            clock, before = _Clock(batches, first), None
-            for step in range(first + 1, last + 1):
-                profile.at(step, state)
-                batch = next(batches)
-                with jax.profiler.StepTraceAnnotation("train", step_num=step):
-                    state, metrics = step_fn(state, batch.batch)
-                if before is not None:  # only one step is computed while the next is prepared
-                    self._check(before, batches)
-                before = _Dispatched(step, batch, metrics)
-                if progress is not None:
-                    progress.update(step, **{term: metrics[term] for term in ("loss", *self.model.loss_weights)})
-                stopping = stop.asked(step)
-                due = {every: at > 0 and (step % at == 0 or step == last) for every, at in self._schedule().items()}
-                if stopping or any(due.values()):
-                    self._check(before, batches)
-                    before = None
-                    if log is not None and due["log"]:
-                        measured = clock.lap(step, self.monitor.per_step) | memory_scalars()
-                        log.write(step, self.sharding.scalars(metrics) | measured)
-                    scored = None
-                    if due["validation"]:
-                        with clock.stopped(), stop.impatient():
-                            scored = self._validate(state, step, log)
-                    if due["checkpoint"] or stopping or (scored is not None and loop.keep_best):
-                        metric = None if scored is None else scored.metric
-                        self.checkpoints.save(step, self.sharding.portable(state), batches.state(), metric)
-                if stopping and step < last:
-                    self.checkpoints.wait()
-                    raise Preempted(f"{name}: stopped by SIGTERM and saved after step {step}; the same command resumes")
-            # Here SIGTERM is only recorded; after this block it may keep the caller from closing the checkpoints.
-            self.checkpoints.wait()
-            profile.at(last + 1, state)
-            damaged = batches.quarantined()
-            if damaged and is_lead():
-                note(f"{damaged} damaged records were replaced; {self.directory / 'quarantine.jsonl'} lists them")
-        return state
-
-    def _schedule(self) -> dict[str, int]:
-        loop = self.loop
-        validation = loop.eval_every if self.monitor.validate is not None else 0
-        return {"log": loop.log_every, "checkpoint": loop.checkpoint_every, "validation": validation}
-
-    def _log(self, first: int) -> ScalarLog:
-        return ScalarLog(self.directory, first, self.loop.wandb, resume=first > 0)
-
-    def _check(self, done: _Dispatched, batches: Prefetch) -> None:
-        """Waits for a step and records it if it was skipped.
-
-        Raises:
-            DivergedError: too many steps were skipped.
-        """
-        skips, allowed = int(done.metrics["skipped"]), self.loop.skip_budget
-        if skips == self._skips:
-            return
-        self._skips, scalars = skips, self.sharding.scalars(done.metrics)
-        if self._skipped_steps is not None:
-            self._skipped_steps.add(done.step, scalars, batches.identify(done.batch), done.batch.before)
-            norms = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
-            note(f"step {done.step} is skipped ({norms}): {skips} of at most {allowed}")
-        if skips > allowed:
-            raise DivergedError(
-                f"{self.directory}: {skips} steps were not finite, more than {allowed} (the last was "
-                f"step {done.step}, loss {scalars['loss']}); {SKIPPED} lists their batches; "
-                f"train anew with a lower optimizer.learning-rate and --overwrite"
-            )
-
-    def _validate(self, state: TrainState, step: int, log: ScalarLog | None) -> Validation:
-        """Scores the weights on the lead process, and sends the metric to the others."""
-        assert self.monitor.validate is not None
-        weights = self.sharding.gather(state.weights)
-        scored = self.monitor.validate(step, weights) if log is not None else Validation(0.0, {})
-        if log is not None:
-            log.write(step, scored.scalars)
-            for name, picture in scored.pictures.items():
-                log.image(step, name, picture)
-        return Validation(agree(scored.metric, f"validation {step}"), scored.scalars)
+    Raises:
+        DivergedError: too many steps were skipped.
+    """
+    skips = int(done.metrics["skipped"])
+    if skips == before:
+        return skips
+    scalars = as_numbers(done.metrics)
+    if record is not None:
+        record.add(done.step, scalars, batches.identify(done.batch), done.batch.before)
+        norms = f"loss {scalars['loss']:.4g}, gradient {scalars['grad_norm']:.4g}"
+        note(f"step {done.step} is skipped ({norms}): {skips} of at most {loop.skip_budget}")
+    if skips > loop.skip_budget:
+        raise DivergedError(
+            f"{directory}: {skips} steps were not finite, more than {loop.skip_budget} (the last was "
+            f"step {done.step}, loss {scalars['loss']}); {SKIPPED} lists their batches; "
+            f"train anew with a lower optimizer.learning-rate and --overwrite"
+        )
+    return skips
 
 
 class _Clock:
@@ -229,7 +204,9 @@ class _Clock:
 
     def __init__(self, batches: Prefetch, first: int) -> None:
         self._batches = batches
-        self._began, self._waited, self._step = time.monotonic(), batches.waited, first
+        self._began = time.monotonic()
+        self._waited = batches.waited
+        self._step = first
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
@@ -240,11 +217,14 @@ class _Clock:
 
     def lap(self, step: int, per_step: tuple[str, float] | None) -> dict[str, float]:
         """Returns scalars for the time since the last lap or the start; ``step`` is the last finished step."""
-        now, waited = time.monotonic(), self._batches.waited
+        now = time.monotonic()
+        waited = self._batches.waited
         steps = step - self._step
         seconds = now - self._began
         scalars = {"seconds_per_step": seconds / steps, "data_wait_share": (waited - self._waited) / seconds}
         if per_step is not None:
             scalars[f"{per_step[0]}_per_second"] = per_step[1] * steps / seconds
-        self._began, self._waited, self._step = now, waited, step
+        self._began = now
+        self._waited = waited
+        self._step = step
         return scalars

@@ -70,6 +70,11 @@ def train_step(
     return TrainState(state.step + 1, params, opt_state, ema, extra, skipped), metrics
 
 
+def as_numbers(metrics: Metrics) -> dict[str, float]:
+    """Returns a step's metrics as numbers, after waiting for the step."""
+    return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
 def _is_schedule(path: tuple[object, ...], value: object) -> bool:
     return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
 

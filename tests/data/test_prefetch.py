@@ -7,9 +7,8 @@ import grain
 import numpy as np
 import pytest
 
-from rsjax.data import prefetch
-from rsjax.data.loader import Loader, batches
-from rsjax.data.prefetch import Prefetch
+from rsjax.data import loader as module
+from rsjax.data.loader import Loader, Prefetch, batches
 from rsjax.data.store import StoreError
 from rsjax.errors import Preempted
 from tests.data.toy import Numbers, assert_same, jitter
@@ -74,7 +73,7 @@ def test_the_wait_for_a_slow_batch_is_counted(monkeypatch: pytest.MonkeyPatch) -
         asked.acquire()
         seconds[0] += 5
 
-    monkeypatch.setattr(prefetch, "time", SimpleNamespace(monotonic=monotonic))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=monotonic))
     with Prefetch(loader(), put) as ahead:
         for _ in range(2):
             next(ahead)

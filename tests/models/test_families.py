@@ -27,9 +27,8 @@ from rsjax.tools.studies.ablation.grid import expand, parse_axes
 from rsjax.trainable import StepContext, combine
 from rsjax.training import loop as loop_module
 from rsjax.training.checkpoint import load_weights
-from rsjax.training.log import read_log
-from rsjax.training.sharding_rules import cut_elements, table
-from rsjax.training.skipped import SkippedSteps
+from rsjax.training.log import SkippedSteps, read_log
+from rsjax.training.sharding import cut_elements, table
 from rsjax.training.state import create_state
 from tests.models import families
 from tests.tools.pipeline import toy
@@ -102,7 +101,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     for stage, train in (("tokenizer", stages.train_tokenizer), ("world_model", stages.train_world_model)):
         for stop_at in (2, None):
             with monkeypatch.context() as patch:
-                changed = {"stop_at": stop_at, "monitor": loop_module.Monitor()}  # without validation
+                changed = {"stop_at": stop_at, "validate": None}  # without validation
                 patch.setattr(stages, "fit", lambda *args, more=changed, **own: loop_module.fit(*args, **(own | more)))
                 train(again, resume=True)
         shapes = create_autoencoder(run.config).shapes() if stage == "tokenizer" else create_model_shapes(run.config)

@@ -14,7 +14,7 @@ from benchmarks.soak.compare import compare_stages
 from benchmarks.soak.disk import can_mount, small_disk
 from benchmarks.soak.faults import FAILED, FULL_DISK, KILL_TRAINING, KILL_WRITING, SHARES, TERMINATE, damage_file
 from benchmarks.soak.rounds import Event, Target, run_round, run_without_faults
-from rsjax.training.skipped import read_skipped
+from rsjax.training.log import read_skipped
 from tests.reliability.conftest import EVERY, STEPS, Targets
 
 SEED = 0

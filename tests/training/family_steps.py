@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from rsjax.config import LoopConfig, OptimizerConfig
-from rsjax.training import sharding_rules
+from rsjax.training import sharding as sharding_rules
 from rsjax.training.state import create_state
 from tests.models import families
 from tests.training.devices import Training, moments, share

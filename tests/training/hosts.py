@@ -24,7 +24,7 @@ from rsjax.trainable import Trainable
 from rsjax.training import distributed
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.sharding import Sharding
-from rsjax.training.step import train_step
+from rsjax.training.step import as_numbers, train_step
 from tests.training.checkpoint_processes import save_together
 from tests.training.devices import CONFIG, LOOP, MODEL, SHARDINGS, STEPS, Small
 
@@ -61,7 +61,7 @@ def train(model: Trainable[Any], loop: LoopConfig, folder: Path) -> dict[str, An
         for _ in range(STEPS):
             batch = token_batch(next(loader))
             state, metrics = step(state, sharding.put_batch(batch))
-            losses.append(sharding.scalars(metrics)["loss"])
+            losses.append(as_numbers(metrics)["loss"])
         checkpoints = Checkpoints(folder)
         checkpoints.save(STEPS, sharding.portable(state), loader.state())
         checkpoints.close()

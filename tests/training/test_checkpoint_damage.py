@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.data.codec import encode
-from rsjax.training import checksums
-from rsjax.training.checkpoint import CheckpointError, Checkpoints
-from rsjax.training.checksums import find_fault
+from rsjax.training import checkpoint as checksums
+from rsjax.training.checkpoint import CheckpointError, Checkpoints, find_fault
 
 STEPS = (1, 2)
 
@@ -107,7 +105,7 @@ def test_damage_of_any_file_in_a_folder_is_detected(intact: Path, copy: Path) ->
 
 
 def test_every_flipped_bit_of_the_checksums_is_detected_or_harmless(copy: Path) -> None:
-    path = copy / "2" / checksums.NAME
+    path = copy / "2" / checksums.CHECKSUMS
     intact, content = path.read_bytes(), json.loads(path.read_text())
     for bit in range(0, 8 * len(intact), 31):
         damaged = bytearray(intact)
@@ -115,17 +113,6 @@ def test_every_flipped_bit_of_the_checksums_is_detected_or_harmless(copy: Path) 
         path.write_bytes(damaged)
         if find_fault(copy / "2") is None:
             assert json.loads(path.read_text()) == content
-
-
-def test_a_checkpoint_of_an_earlier_version_is_still_checked(copy: Path) -> None:
-    path = copy / "2" / checksums.NAME
-    files = json.loads(path.read_text())["files"]
-    path.unlink()
-    (copy / "2" / checksums.OLD_NAME).write_bytes(encode({"metric": 0.5, "files": files}))
-    assert checksums.read_metric(copy / "2") == 0.5
-    assert restored(copy)[0] == 2
-    truncate(copy / "2" / "data" / "metadata", 0.5)
-    assert restored(copy)[0] == 1
 
 
 def test_after_a_fall_back_the_same_step_can_be_saved_again(copy: Path) -> None:
@@ -171,7 +158,7 @@ def test_another_architecture_is_not_damage(copy: Path) -> None:
 
 
 def test_a_damaged_checkpoint_before_another_architecture_stays_where_it_is(copy: Path) -> None:
-    delete(copy / "2" / checksums.NAME, 0)
+    delete(copy / "2" / checksums.CHECKSUMS, 0)
     checkpoints = Checkpoints(copy)
     with pytest.raises(CheckpointError, match=rf"{copy}/1: does not fit this configuration"):
         checkpoints.restore({"w": jnp.zeros(3)})

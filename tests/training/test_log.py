@@ -11,7 +11,8 @@ from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.record_writer import masked_crc32c
 
 from rsjax.files import FileError
-from rsjax.training.log import MEASURED, NAME, ScalarLog, read_curve, read_log
+from rsjax.training.log import LOG as NAME
+from rsjax.training.log import MEASURED, ScalarLog, read_curve, read_log
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
 

@@ -14,12 +14,10 @@ import pytest
 from rsjax.config import LoopConfig, OptimizerConfig
 from rsjax.errors import Preempted
 from rsjax.runtime import patient, stop_signals
-from rsjax.training.checkpoint import Checkpoints
-from rsjax.training.checksums import write_checksums
-from rsjax.training.log import read_curve, read_log
-from rsjax.training.loop import DivergedError, Monitor
+from rsjax.training.checkpoint import Checkpoints, write_checksums
+from rsjax.training.log import read_curve, read_log, read_skipped
+from rsjax.training.loop import DivergedError
 from rsjax.training.preemption import StopRequest
-from rsjax.training.skipped import read_skipped
 from rsjax.training.state import TrainState, create_state
 from rsjax.training.validation import Validation
 from tests.training.toy import Regression, loader, records, train
@@ -151,7 +149,7 @@ def test_sigterm_saves_the_step_under_way_and_the_next_start_goes_on(
         return Validation(0.0, {})
 
     with pytest.raises(Preempted, match="saved after step 3; the same command resumes"):
-        train(replace(LOOP, eval_every=2), tmp_path, monitor=Monitor(validate=look))
+        train(replace(LOOP, eval_every=2), tmp_path, validate=look)
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert looked == [2] and checkpoints.latest() == 3
     checkpoints.close()
@@ -199,7 +197,7 @@ def test_validation_scores_are_logged_drawn_and_decide_which_checkpoints_are_kep
         )
 
     loop = replace(LOOP, eval_every=2, checkpoint_every=2, keep_last=1)
-    assert_same(train(loop, tmp_path, monitor=Monitor(("clips", 2), look)), whole[0])
+    assert_same(train(loop, tmp_path, per_step=("clips", 2), validate=look), whole[0])
     rows = [row for row in read_log(tmp_path) if "validation/loss" in row]
     assert [(row["step"], row["validation/loss"]) for row in rows] == [(2, 2), (4, 0), (6, 2), (8, 4), (9, 5)]
     assert len(list((tmp_path / "pictures").glob("seen-*.png"))) == 5

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rsjax.training import memory
-from rsjax.training.memory import GIB, memory_scalars
+from rsjax.training import log as memory
+from rsjax.training.log import GIB, memory_scalars
 from rsjax.training.profile import SKIPPED, Profile
 
 

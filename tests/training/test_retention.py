@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from orbax.checkpoint.checkpoint_managers import PreservationContext
 
-from rsjax.training.checkpoint import Checkpoints
-from rsjax.training.retention import retention
+from rsjax.training.checkpoint import Checkpoints, retention
 
 STEP = st.integers(0, 30)
 

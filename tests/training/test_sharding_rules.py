@@ -14,8 +14,7 @@ from rsjax.config import ConfigError, LoopConfig, OptimizerConfig, presets
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Trainable
-from rsjax.training.sharding import Sharding
-from rsjax.training.sharding_rules import FSDP, SMALL, Row, cut_elements, shown, spec_of, table
+from rsjax.training.sharding import FSDP, SMALL, Row, Sharding, cut_elements, shown, spec_of, table
 from rsjax.training.state import create_state
 
 

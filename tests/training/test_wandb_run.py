@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rsjax.training.log import ScalarLog, read_log
-from rsjax.training.wandb_run import WandbError, find_wandb
+from rsjax.training.log import ScalarLog, WandbError, find_wandb, read_log
 
 
 class Run:

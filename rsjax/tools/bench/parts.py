@@ -18,7 +18,7 @@ import numpy as np
 from rsjax.config import Config
 from rsjax.data import loader
 from rsjax.data.curriculum import plan
-from rsjax.data.prefetch import Prefetch
+from rsjax.data.loader import Prefetch
 from rsjax.data.store import open_store, write_store
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model

@@ -19,8 +19,8 @@ from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.setup import Setup, tokenizer_setup, world_model_setup
 from rsjax.trainable import Params, StepContext, Trainable, combine
 from rsjax.training.checkpoint import Checkpoints
+from rsjax.training.log import SKIPPED, read_skipped
 from rsjax.training.sharding import Sharding
-from rsjax.training.skipped import NAME, read_skipped
 from rsjax.training.state import TrainState
 
 
@@ -52,7 +52,7 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
     rows = {row["step"]: row for row in read_skipped(run.directory / stage)}
     if step not in rows:
         skipped = ", ".join(map(str, rows)) or "none"
-        raise UserError(f"{run.directory / stage / NAME}: step {step} was not skipped (skipped: {skipped})")
+        raise UserError(f"{run.directory / stage / SKIPPED}: step {step} was not skipped (skipped: {skipped})")
     setup = tokenizer_setup(run) if stage == "tokenizer" else world_model_setup(run)
     state, sources = _newest(setup, run.directory / stage), rows[step]["records"]
     batch = setup.to_batch(setup.loader.replay(rows[step]["data"]))

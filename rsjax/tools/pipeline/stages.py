@@ -23,9 +23,9 @@ from rsjax.tools.pipeline.validation import TokenizerValidation, WorldModelValid
 from rsjax.tools.sim.collect import collect
 from rsjax.training.checkpoint import save_weights
 from rsjax.training.distributed import agree, barrier, is_lead, on_lead
-from rsjax.training.loop import Monitor, fit
+from rsjax.training.log import find_wandb
+from rsjax.training.loop import fit
 from rsjax.training.sharding import Sharding
-from rsjax.training.wandb_run import find_wandb
 
 
 def run_all(run: Run, resume: bool = True, command: str = "") -> None:
@@ -144,7 +144,8 @@ def train_tokenizer(run: Run, resume: bool) -> None:
         to_batch=setup.to_batch,
         start=setup.start,
         resume=resume,
-        monitor=Monitor(("images", train.batch_size * train.frames_per_clip), TokenizerValidation(run)),
+        validate=TokenizerValidation(run),
+        per_step=("images", train.batch_size * train.frames_per_clip),
     )
     if is_lead():
         save_weights(run.output("tokenizer"), model.tokenizer_params(state.weights))
@@ -181,7 +182,8 @@ def train_world_model(run: Run, resume: bool) -> None:
         to_batch=setup.to_batch,
         start=setup.start,
         resume=resume,
-        monitor=Monitor(("frames", train.batch_size * cfg.clips.frames), WorldModelValidation(run)),
+        validate=WorldModelValidation(run),
+        per_step=("frames", train.batch_size * cfg.clips.frames),
     )
     if is_lead():
         save_weights(run.output("world_model"), state.weights)

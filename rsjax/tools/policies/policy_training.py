@@ -17,7 +17,7 @@ from rsjax.tools.policies.config import PolicyConfig
 from rsjax.tools.policies.demos import Demos
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy, Range, Windows
 from rsjax.tools.policies.policy import FILE, Policy, load_policy
-from rsjax.training.loop import Monitor, fit
+from rsjax.training.loop import fit
 
 OTHERS = "holds a policy of other settings or data; choose another directory or delete it"
 
@@ -88,8 +88,8 @@ def _fit(
     begin: Callable[[Any], Any] | None = (
         (lambda fresh: jax.tree.map(np.array, start.params)) if start else None
     )  # a copy, because training steps donate their parameters
-    monitor = Monitor(("samples", loop.batch_size))
-    options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "monitor": monitor}
+    per_step = ("samples", loop.batch_size)
+    options: dict[str, Any] = {"name": name, "to_batch": _batch, "start": begin, "stop_at": stop, "per_step": per_step}
     state = fit(model, loop, loader, directory, **options)
     if stop < loop.steps and state.step > stop:  # an earlier call with other stops trained past this one
         raise _other_stops(directory, stop)

@@ -12,7 +12,7 @@ from rsjax.errors import UserError
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.replay import replay, skipped_steps
 from rsjax.tools.pipeline.run import Run
-from rsjax.training.skipped import read_skipped
+from rsjax.training.log import read_skipped
 from tests.tools.pipeline import toy
 
 
