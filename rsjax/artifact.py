@@ -104,6 +104,7 @@ def make_once(
     refuse: str | None,
     wait: bool = False,
     again: bool = False,
+    keep: bool = False,
     temporary: bool = False,
     locked: bool = True,
 ) -> Iterator[Work]:
@@ -119,6 +120,7 @@ def make_once(
             that work is deleted.
         wait: if another process works on the folder, True waits for it and False raises.
         again: do finished work again, for example because its output was deleted.
+        keep: with ``refuse=None``, keep content of another key, because the body replaces each of its files.
         temporary: delete the folder when the body ends, because the result is elsewhere.
         locked: False if the caller holds a lock that covers the folder.
 
@@ -128,14 +130,12 @@ def make_once(
     """
     with making(folder, wait) if locked else nullcontext():
         mark = read_mark(folder)
-        if refuse is None and (mark is None or mark.key != key):
-            with disk_guard(folder):
-                if folder.exists():
+        if mark is None or mark.key != key:
+            if refuse is not None and (folder / MARK).exists():
+                raise OtherKeyError(f"{folder}: {refuse}")
+            if refuse is None and not keep and folder.exists():
+                with disk_guard(folder):
                     shutil.rmtree(folder)
-            mark = None
-        elif refuse is not None and (folder / MARK).exists() and (mark is None or mark.key != key):
-            raise OtherKeyError(f"{folder}: {refuse}")
-        if mark is None:
             mark = Mark(key, finished=False, seconds=0.0)
         work = Work(folder, key, mark.finished and not again, dict(mark.metadata))
         if work.finished:

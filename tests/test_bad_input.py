@@ -16,12 +16,13 @@ import pytest
 
 from experiments.cli import parse
 from experiments.train import Options
+from rsjax.artifact import MARK
 from rsjax.data.normalization import Normalization
 from rsjax.data.token_sets import tokenizer_key, tokens_key
 from rsjax.errors import UserError
 from rsjax.files import write_file, write_json
 from rsjax.runtime import HUGE_PAGES
-from rsjax.tools.pipeline.run import MARK, Run
+from rsjax.tools.pipeline.run import Run
 from rsjax.training.checkpoint import Checkpoints, save_weights
 from tests.tools.pipeline import toy
 
@@ -34,7 +35,7 @@ Command = Callable[..., Answer]
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Returns a function that runs a command's main as its module does; an error that is no exit fails the test."""
     monkeypatch.setenv("GLIBC_TUNABLES", HUGE_PAGES)  # otherwise the process would restart itself
-    monkeypatch.setattr("rsjax.tools.pipeline.stages._do", lambda run, name, work: None)  # nothing is trained
+    monkeypatch.setattr("rsjax.tools.pipeline.stages._do", lambda *_: None)  # nothing is trained
 
     def call(line: str, *arguments: object) -> Answer:
         name, *words = line.split()

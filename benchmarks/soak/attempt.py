@@ -34,7 +34,7 @@ def unfinished(folder: Path) -> bool:
 def finished(folder: Path) -> bool:
     """Whether the stage is marked as finished."""
     try:
-        return bool(json.loads((folder / "stage.json").read_text())["finished"])
+        return bool(json.loads((folder / "made.json").read_text())["finished"])
     except (OSError, ValueError, KeyError):
         return False
 
@@ -167,7 +167,7 @@ class Attempt:
 
 def _mark_time(folder: Path) -> int:
     try:
-        return (folder / "stage.json").stat().st_mtime_ns
+        return (folder / "made.json").stat().st_mtime_ns
     except OSError:
         return 0
 

@@ -141,7 +141,7 @@ def prepare(soak: Soak, place: Path) -> Target:
     reference = Run(soak.config, soak.reference, soak.options.data_dir)
     return Target(
         command=soak.command(run, place / "data" if whole else soak.options.data_dir, *flags),
-        stages=tuple(Stage(run / stage, stage in TRAINED, reference.mark(stage)["seconds"]) for stage in soak.stages),
+        stages=tuple(Stage(run / stage, stage in TRAINED, reference.seconds(stage)) for stage in soak.stages),
         output=place / "output.log",
         interval=every * seconds,
         step_seconds=seconds,

@@ -54,9 +54,7 @@ class LoaderFactory:
         return lines
 
 
-def plan(
-    loop: LoopConfig, own: Store, transform: Callable[[Store], Transform], directory: Path
-) -> tuple[LoopConfig, LoaderFactory]:
+def plan(loop: LoopConfig, own: Store, transform: Callable[[Store], Transform], directory: Path) -> LoaderFactory:
     """Resolves a loop's stages into records and steps.
 
     Args:
@@ -66,8 +64,8 @@ def plan(
         directory: where the list of damaged records is.
 
     Returns:
-        The loop with ``steps`` (of each stage, rounded up to whole batches) and ``restarts`` set, and the factory of
-        its loaders.
+        The factory of its loaders; its ``loop`` has ``steps`` (of each stage, rounded up to whole batches) and
+        ``restarts`` set.
 
     Raises:
         StoreError: a component's store cannot be read or mixed with ``own``, or no record passes its patterns.
@@ -80,7 +78,7 @@ def plan(
             first for first, stage in zip(firsts, loop.curriculum, strict=False) if stage.restart and first > 0
         )
         loop = replace(loop, steps=firsts[-1], restarts=restarts)
-    return loop, LoaderFactory(loop, tuple(resolved), directory / NAME)
+    return LoaderFactory(loop, tuple(resolved), directory / NAME)
 
 
 def check_stages(train: TrainConfig, own: Store) -> list[Store]:

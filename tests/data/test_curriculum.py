@@ -59,7 +59,7 @@ def test_a_number_of_clips_takes_the_first_that_pass(own: Store) -> None:
     assert all_of_them is not None and few is not None and few.tolist() == all_of_them[:3].tolist()
     enough = choose(ComponentConfig(clips=COUNT + 5), own)
     assert enough is not None and len(enough) == COUNT
-    assert plan(loop(stage(epochs=3.0, clips=8)), own, transform, own.path)[0].steps == 8 * 3 // 4
+    assert plan(loop(stage(epochs=3.0, clips=8)), own, transform, own.path).loop.steps == 8 * 3 // 4
 
 
 def test_an_empty_filter_lists_what_there_is(own: Store) -> None:
@@ -105,14 +105,16 @@ def test_steps_are_epochs_in_whole_batches_and_restarts_the_first_steps(
     entries = [replace(parts[part], epochs=tenths / 10, restart=restart) for part, tenths, restart in stages]
     steps = [-(-sizes[part] * tenths // (10 * batch_size)) for part, tenths, _ in stages]
     firsts = np.cumsum([0, *steps]).tolist()
-    planned, feed = plan(replace(loop(*entries), batch_size=batch_size), own, transform, own.path)
+    feed = plan(replace(loop(*entries), batch_size=batch_size), own, transform, own.path)
+    planned = feed.loop
     assert planned.steps == sum(steps)
     assert planned.restarts == tuple(f for f, (_, _, restart) in zip(firsts, stages, strict=False) if restart and f)
     assert len(feed.summary()) == len(stages)
 
 
 def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_difficult_one_three_times(own: Store) -> None:
-    planned, feed = plan(replace(loop(*PAPER), batch_size=5), own, transform, own.path)
+    feed = plan(replace(loop(*PAPER), batch_size=5), own, transform, own.path)
+    planned = feed.loop
     assert (planned.steps, planned.restarts) == (6 + 9, ())
     with feed(None) as loader:
         taken = take(loader, planned.steps)["i"]
@@ -126,9 +128,11 @@ def test_the_papers_curriculum_reads_each_simple_clip_twice_and_then_each_diffic
 
 
 def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
-    plain, feed = plan(loop(steps=7), own, transform, own.path)
+    feed = plan(loop(steps=7), own, transform, own.path)
+    plain = feed.loop
     assert plain == loop(steps=7) and feed.summary() == []
-    one, same = plan(loop(EVERYTHING), own, transform, own.path)
+    same = plan(loop(EVERYTHING), own, transform, own.path)
+    one = same.loop
     assert one.steps == 8
     with feed(None) as left, same(None) as right:
         assert_same(take(left, 10), take(right, 10))
@@ -137,7 +141,7 @@ def test_without_stages_the_loop_stays_and_all_is_read(own: Store) -> None:
 @settings(max_examples=5)
 @given(st.integers(0, 20))
 def test_a_batch_is_rebuilt_and_named_from_the_state_before_it_alone(own: Store, number: int) -> None:
-    _, feed = plan(loop(mixed({"simple": 1.0, "difficult": 2.0}), EVERYTHING), own, transform, own.path)
+    feed = plan(loop(mixed({"simple": 1.0, "difficult": 2.0}), EVERYTHING), own, transform, own.path)
     with feed(None) as loader:
         for _ in range(number):
             next(loader)
@@ -152,7 +156,7 @@ def test_a_mixture_of_two_stores_names_each_clips_own(own: Store, tmp_path: Path
     other = toy.store(tmp_path / "other", 6, first=100, tokenizer="a")
     simple = ComponentConfig(difficulties=("simple",))
     parts = (simple, ComponentConfig(store=str(other.path), weight=3.0))
-    _, feed = plan(loop(CurriculumStageConfig(parts)), own, transform, tmp_path)
+    feed = plan(loop(CurriculumStageConfig(parts)), own, transform, tmp_path)
     with feed(None) as loader:
         for _ in range(5):
             arrays = next(loader)
@@ -183,7 +187,7 @@ def stretched(record: Record, rng: np.random.Generator) -> Arrays:
 def test_a_store_without_labels_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     write_store(tmp_path / "old", "numbers", {"train": map(toy.record, range(3))}, {})
     old = open_store(tmp_path / "old")
-    assert plan(loop(stage(epochs=4.0)), old, transform, tmp_path)[0].steps == 3
+    assert plan(loop(stage(epochs=4.0)), old, transform, tmp_path).loop.steps == 3
     check_stages(loop(SIMPLE), old)  # its tokens may have them
     with pytest.raises(StoreError, match="names no task and difficulty"):
         plan(loop(SIMPLE), old, transform, tmp_path)
@@ -192,13 +196,13 @@ def test_a_store_without_labels_is_read_whole_or_not_at_all(tmp_path: Path) -> N
 def test_damage_is_counted_once_over_stages_and_survives_a_restart(tmp_path: Path) -> None:
     own = toy.store(tmp_path / "own", 10)
     toy.damage(own.path, 4)
-    _, feed = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.1), own, transform, tmp_path / "stage")
+    feed = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.1), own, transform, tmp_path / "stage")
     for _ in range(2):
         with feed(None) as loader:
             assert 4 not in take(loader, 6)["i"]
             assert loader.quarantined() == 1
     (line,) = (tmp_path / "stage" / "quarantine.jsonl").read_text().splitlines()
     assert json.loads(line)["record"] == 4
-    _, strict = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, transform, tmp_path / "stage")
+    strict = plan(loop(SIMPLE, EVERYTHING, max_damaged=0.0), own, transform, tmp_path / "stage")
     with strict(None) as loader, pytest.raises(StoreError, match="1 of 10 records are damaged"):
         take(loader, 6)

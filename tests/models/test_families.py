@@ -21,7 +21,6 @@ from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.replay import replay
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
-from rsjax.tools.pipeline.setup import tokenizer_setup, world_model_setup
 from rsjax.tools.pipeline.videos import Request, write_videos
 from rsjax.tools.studies.ablation.grid import expand, parse_axes
 from rsjax.trainable import StepContext, combine
@@ -118,8 +117,8 @@ def create_model_shapes(config: Config) -> Any:
 def test_clips_replay_alone_as_in_their_batch(run: Run) -> None:
     """The batch of a step, as if it had been skipped: every clip has a loss of its own."""
     for stage in TRAINED:
-        setup = tokenizer_setup(run) if stage == "tokenizer" else world_model_setup(run)
-        with setup.loader(None) as batches:
+        loader = stages.tokenizer_loader(run) if stage == "tokenizer" else stages.world_model_loader(run)
+        with loader(None) as batches:
             before = batches.state()
             arrays = next(batches)
             SkippedSteps(run.directory / stage, 0).add(

@@ -98,7 +98,7 @@ def slowly(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def mark(folder: Path, finished: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "stage.json", json.dumps({"finished": finished}).encode())
+    write_atomically(folder / "made.json", json.dumps({"finished": finished}).encode())
 
 
 if __name__ == "__main__":

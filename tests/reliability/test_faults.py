@@ -95,7 +95,7 @@ def begun(target: Target, whole: Path) -> Target:
     """Gives the target all that the whole run has except the final weights."""
     folder = target.trained[0]
     shutil.copytree(whole, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("weights"))
-    (folder / "stage.json").write_text(json.dumps({"finished": False}))
+    (folder / "made.json").write_text(json.dumps({"finished": False}))
     return target
 
 

@@ -222,7 +222,8 @@ def feed(config: Config, budget: float) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "store"
         write_store(path, "tokens", {"train": (model.example(rng) for _ in range(FEED_CLIPS))}, {})
-        loop, make = plan(loop, open_store(path), lambda store: transform, Path(folder))
+        make = plan(loop, open_store(path), lambda store: transform, Path(folder))
+        loop = make.loop
         sharding = Sharding.create(loop)
         step = sharding.compile(train_step, model, loop)
         state = jax.jit(lambda: create_state(model, loop))()

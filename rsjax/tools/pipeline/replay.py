@@ -5,7 +5,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -15,13 +14,13 @@ import optax
 from jaxtyping import Array
 
 from rsjax.errors import UserError
+from rsjax.models.base import create_autoencoder, create_model
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.pipeline.setup import Setup, tokenizer_setup, world_model_setup
+from rsjax.tools.pipeline.stages import pretrained_start, tokenizer_loader, world_model_loader
 from rsjax.trainable import Params, StepContext, Trainable, combine
 from rsjax.training.checkpoint import Checkpoints
 from rsjax.training.log import SKIPPED, read_skipped
 from rsjax.training.sharding import Sharding
-from rsjax.training.state import TrainState
 
 
 @dataclass(frozen=True)
@@ -53,25 +52,29 @@ def replay(run: Run, stage: Literal["tokenizer", "world_model"], step: int) -> I
     if step not in rows:
         skipped = ", ".join(map(str, rows)) or "none"
         raise UserError(f"{run.directory / stage / SKIPPED}: step {step} was not skipped (skipped: {skipped})")
-    setup = tokenizer_setup(run) if stage == "tokenizer" else world_model_setup(run)
-    state, sources = _newest(setup, run.directory / stage), rows[step]["records"]
-    batch = setup.to_batch(setup.loader.replay(rows[step]["data"]))
+    model: Any
+    if stage == "tokenizer":
+        model = create_autoencoder(run.config)
+        loader = tokenizer_loader(run)
+    else:
+        model = create_model(run.config)
+        loader = world_model_loader(run)
+    loop = replace(loader.loop, sharding="jit", fsdp=1)
+    sharding = Sharding.create(loop)
+    with closing(Checkpoints(run.directory / stage / "checkpoints", read_only=True)) as checkpoints:
+        if checkpoints.latest() is None and not (run.directory / stage / "weights").exists():
+            state = sharding.init(model, loop, pretrained_start(model, loop.start_from, stage))
+        else:
+            state, _ = checkpoints.restore(sharding.template(model, loop))
+    sources = rows[step]["records"]
+    batch = model.batch(loader.replay(rows[step]["data"]))
     clips = jax.tree.map(lambda x: x.reshape(len(sources), -1, *x.shape[1:]), batch)
-    key = jax.random.fold_in(jax.random.key(setup.loop.seed + 1), step - 1)
+    key = jax.random.fold_in(jax.random.key(loop.seed + 1), step - 1)
     for number, source in enumerate(sources):
         part = jax.tree.map(itemgetter(number), clips)
         context = StepContext(jnp.int32(step - 1), state.extra, None)
-        scalars = _measure(setup.model, state.params, part, key, context)
+        scalars = _measure(model, state.params, part, key, context)
         yield Clip(source, {name: float(value) for name, value in scalars.items()})
-
-
-def _newest(setup: Setup, directory: Path) -> TrainState:
-    loop = replace(setup.loop, sharding="jit", fsdp=1)
-    sharding = Sharding.create(loop)
-    with closing(Checkpoints(directory / "checkpoints", read_only=True)) as checkpoints:
-        if checkpoints.latest() is None and not (directory / "weights").exists():
-            return sharding.init(setup.model, loop, setup.start)
-        return checkpoints.restore(sharding.template(setup.model, loop))[0]
 
 
 @partial(jax.jit, static_argnums=0)

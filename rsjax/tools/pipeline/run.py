@@ -1,20 +1,19 @@
 """A run directory: its stages, the configuration that made them, and their durations.
 
-The content key of a stage covers everything that its output depends on. A stage is skipped if its mark (``stage.json``)
-has this key and says "finished"; a mark with another key was made by another configuration.
+The content key of a stage covers everything that its output depends on. A stage is skipped if its folder is finished
+under this key (:mod:`rsjax.artifact`); a folder with another key was made by another configuration.
 """
 
-import math
 import os
 import shutil
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from rsjax.artifact import Mark, is_finished, make_once, read_mark
 from rsjax.config import Config, ConfigError, EvalConfig, content_key, from_dict, sampling_settings, to_dict
 from rsjax.data.store import MANIFEST, Store, StoreError, open_store
 from rsjax.data.token_sets import tokenizer_key, tokens_key
@@ -35,7 +34,6 @@ OUTPUTS = {  # in the run directory; clips are elsewhere, and "tokens" is a link
     "evaluation": "evaluation/result.msgpack",
     "report": "report.html",
 }
-MARK = "stage.json"
 RECIPE = 1  # increase it when the same configuration gives new results
 
 
@@ -164,8 +162,8 @@ class Run:
 
     def _key_of_content(self, stage: str) -> str | None:
         """Returns the key of the trained stage in the directory, from its mark, or from config.json without a mark."""
-        if key := self.mark(stage).get("key"):
-            return str(key)
+        if mark := self.mark(stage):
+            return mark.key
         if not (self.directory / stage / "checkpoints").exists():
             return None
         try:
@@ -197,9 +195,7 @@ class Run:
 
     def finished(self, stage: str) -> bool:
         """Returns whether the stage's output exists and was made by this configuration."""
-        mark = self.mark(stage)
-        marked = mark.get("key") == self.keys()[stage] and mark.get("finished", False)
-        done = marked and self.output(stage).exists()
+        done = is_finished(self.directory / stage, self.keys()[stage]) and self.output(stage).exists()
         if not done or stage != "tokens":
             return done
         try:
@@ -208,36 +204,25 @@ class Run:
             return True  # the stage that reads the clips reports the damage
         return self._made_of_these_clips(manifest)
 
-    def mark(self, stage: str) -> dict[str, Any]:
-        """Reads a stage's mark: key, finished, seconds. Empty if the stage was never started or the mark is damaged."""
-        with suppress(FileError):
-            mark = read_json(self.directory / stage / MARK)
-            seconds = mark.get("seconds")
-            sound = type(mark.get("key")) is str and type(mark.get("finished")) is bool
-            if sound and type(seconds) in (int, float) and math.isfinite(seconds):
-                return mark
-        return {}
+    def mark(self, stage: str) -> Mark | None:
+        """Reads what is known of a stage; None if it was never started, or if its mark is damaged."""
+        return read_mark(self.directory / stage)
+
+    def seconds(self, stage: str) -> float:
+        """Returns how long a stage has taken, over all interruptions; 0 if it was never started."""
+        mark = self.mark(stage)
+        return 0.0 if mark is None else mark.seconds
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Path]:
         """Marks a stage as begun and, after its work, as finished, with its duration; yields its directory.
 
-        Durations add up over interruptions, except those of killed processes.
+        The caller holds the run's lock. A trained stage of another configuration is gone (:meth:`prepare`); of the
+        other stages, the work replaces each file.
         """
-        folder, began = self.directory / stage, time.monotonic()
-        mark = self.mark(stage)
-        before = mark.get("seconds", 0.0) if mark.get("key") == self.keys()[stage] else 0.0
-        finished = False
-        self._write_mark(stage, before, finished)
-        try:
+        folder = self.directory / stage
+        with make_once(folder, self.keys()[stage], refuse=None, again=True, keep=True, locked=False):
             yield folder
-            finished = True
-        finally:
-            self._write_mark(stage, before + time.monotonic() - began, finished)
-
-    def _write_mark(self, stage: str, seconds: float, finished: bool) -> None:
-        content = {"key": self.keys()[stage], "finished": finished, "seconds": round(seconds, 1)}
-        write_json(self.directory / stage / MARK, content)
 
 
 def _by_content(settings: EvalConfig) -> EvalConfig:

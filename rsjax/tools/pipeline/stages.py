@@ -1,12 +1,16 @@
 """The stages of the pipeline. Each reads the output of the previous one and can be run again."""
 
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
-from rsjax.config import Config, LoopConfig
-from rsjax.data.curriculum import check_stages
+from rsjax.config import Config
+from rsjax.data.curriculum import LoaderFactory, check_stages, plan
 from rsjax.data.normalization import Normalization
+from rsjax.data.order import Transform
 from rsjax.data.quarantine import NAME as QUARANTINE
+from rsjax.data.store import Store
 from rsjax.evaluation.results import save_evaluation
 from rsjax.files import disk_guard
 from rsjax.models.base import Assets, create_autoencoder, create_model
@@ -17,11 +21,11 @@ from rsjax.tools.pipeline.limits import check_batch, check_episodes
 from rsjax.tools.pipeline.metric_files import check_metric_files
 from rsjax.tools.pipeline.provenance import record_data, record_start
 from rsjax.tools.pipeline.run import TRAINED, Run, link
-from rsjax.tools.pipeline.setup import note_curriculum, starting, tokenizer_setup, world_model_setup
 from rsjax.tools.pipeline.summary import write_summary
 from rsjax.tools.pipeline.validation import TokenizerValidation, WorldModelValidation
 from rsjax.tools.sim.collect import collect
-from rsjax.training.checkpoint import save_weights
+from rsjax.trainable import Params
+from rsjax.training.checkpoint import load_weights, save_weights
 from rsjax.training.distributed import agree, barrier, is_lead, on_lead
 from rsjax.training.log import find_wandb
 from rsjax.training.loop import fit
@@ -37,30 +41,39 @@ def run_all(run: Run, resume: bool = True, command: str = "") -> None:
         resume: False restarts an unfinished training stage instead of resuming from its checkpoint.
         command: the command that repeats the run, for ``run.json`` and the report.
     """
-    _check_starts(run)
-    on_lead("run.json", lambda: _record_start(run, command))
-    works: dict[str, tuple[str, Callable[[], None]]] = {
-        "collect": (_collecting(run), lambda: collect_clips(run)),
-        "tokenizer": ("training the tokenizer", lambda: train_tokenizer(run, resume)),
-        "tokens": ("preparing all clips for the model", lambda: prepare(run)),
-        "world_model": ("training the world model", lambda: train_world_model(run, resume)),
-        "evaluation": ("evaluating on the test split", lambda: evaluate(run)),
-        "report": ("writing the report", lambda: write_summary(run, command)),
-    }
-    for number, name in enumerate(run.stages, 1):
-        title, work = works[name]
-        finished = agree(run.finished(name), name)
-        if is_lead():
-            seconds = f" ({duration(run.mark(name)['seconds'])} when it ran)" if finished else ""
-            stage(number, len(run.stages), name, f"up to date, skipped{seconds}" if finished else title)
-        if not finished:
-            _do(run, name, work)
+    check_before_start(run)
+    on_lead("run.json", partial(note_changes, run, command))
+    if _begins(run, "collect", _where_clips_come_from(run)):
+        _do(run, "collect", collect_clips)
+    if _begins(run, "tokenizer", "training the tokenizer"):
+        _do(run, "tokenizer", train_tokenizer, resume)
+    if _begins(run, "tokens", "preparing all clips for the model"):
+        _do(run, "tokens", prepare)
+    if _begins(run, "world_model", "training the world model"):
+        _do(run, "world_model", train_world_model, resume)
+    if _begins(run, "evaluation", "evaluating on the test split"):
+        _do(run, "evaluation", evaluate)
+    if _begins(run, "report", "writing the report"):
+        _do(run, "report", write_summary, command)
 
 
-def _do(run: Run, name: str, work: Callable[[], None]) -> None:
+def _begins(run: Run, name: str, title: str) -> bool:
+    """Prints a stage's headline, and returns whether it is still to be done."""
+    if name not in run.stages:
+        return False
+    finished = agree(run.finished(name), name)
+    if is_lead():
+        headline = f"up to date, skipped ({duration(run.seconds(name))} when it ran)" if finished else title
+        stage(run.stages.index(name) + 1, len(run.stages), name, headline)
+    return not finished
+
+
+def _do(run: Run, name: str, work: Callable[..., None], *arguments: Any) -> None:
+    """Does a stage's work: a training in all processes, everything else in the lead, which also marks the stage."""
+
     def marked() -> None:
         with run.stage(name):
-            work()
+            work(run, *arguments)
         record_data(run)
 
     if name not in TRAINED:
@@ -68,25 +81,26 @@ def _do(run: Run, name: str, work: Callable[[], None]) -> None:
     elif is_lead():
         marked()
     else:
-        work()
+        work(run, *arguments)
     barrier(name)
 
 
-def _check_starts(run: Run) -> None:
+def check_before_start(run: Run) -> None:
     """Raises for a wrong path, a missing file or package, or a batch that does not fit, before hours of work."""
     cfg = run.config
     if not cfg.data.key and not run.finished("collect"):
         check_episodes(cfg.sim, run.clips)
-    trained: dict[Literal["tokenizer", "world_model"], tuple[LoopConfig, Callable[[Config], Any]]] = {
-        "tokenizer": (cfg.loop("tokenizer"), create_autoencoder),
-        "world_model": (cfg.loop("world_model"), create_model),
+    trained: dict[Literal["tokenizer", "world_model"], Callable[[Config], Any]] = {
+        "tokenizer": create_autoencoder,
+        "world_model": create_model,
     }
-    for name, (loop, create) in trained.items():
+    for name, create in trained.items():
         if name not in run.stages or run.finished(name):
             continue
+        loop = cfg.loop(name)
         Sharding.create(loop)
         check_batch(cfg, loop, name)
-        starting(create(cfg), loop.start_from, name)
+        pretrained_start(create(cfg), loop.start_from, name)
         if loop.wandb:
             find_wandb()
     if "world_model" in run.stages and not run.finished("world_model"):
@@ -95,18 +109,20 @@ def _check_starts(run: Run) -> None:
         check_metric_files(cfg.eval)
 
 
-def _collecting(run: Run) -> str:
-    if run.config.data.key:
-        return f"the clips of {run.clips}"
-    sim = run.config.sim
-    what = "Lift episodes" if sim.env == "lift" else f"Meta-World episodes of {len(sim.train_tasks)} tasks"
-    return f"simulating {sim.episodes} {what} into {run.clips}"
-
-
-def _record_start(run: Run, command: str) -> None:
+def note_changes(run: Run, command: str) -> None:
+    """Records this start in ``run.json``, and says what has changed since the last one."""
     changed = " and ".join(record_start(run, command))
     if changed and not all(run.finished(name) for name in TRAINED if name in run.stages):
         note(f"since the last start {changed} changed (run.json); results may differ from those of one unbroken run")
+
+
+def _where_clips_come_from(run: Run) -> str:
+    if run.config.data.key:
+        return f"the clips of {run.clips}"
+    sim = run.config.sim
+    if sim.env == "lift":
+        return f"simulating {sim.episodes} Lift episodes into {run.clips}"
+    return f"simulating {sim.episodes} Meta-World episodes of {len(sim.train_tasks)} tasks into {run.clips}"
 
 
 def collect_clips(run: Run) -> None:
@@ -125,24 +141,26 @@ def collect_clips(run: Run) -> None:
 
 def train_tokenizer(run: Run, resume: bool) -> None:
     """Stage 2: trains the tokenizer, or the model's own autoencoder."""
-    train, directory = run.config.tokenizer_train, run.directory / "tokenizer"
+    cfg = run.config
+    train = cfg.tokenizer_train
     if train.lpips_missing:
         note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
     # Checks the world model's curriculum and clips before the tokenizer is trained.
-    for store in check_stages(run.config.train, run.open_clips()):
-        create_model(run.config).check_clips(store)
-    setup, model = tokenizer_setup(run), create_autoencoder(run.config)
-    note_curriculum(setup.loader)
-    for line in model.notes() if is_lead() else ():
-        note(line)
+    for store in check_stages(cfg.train, run.open_clips()):
+        create_model(cfg).check_clips(store)
+    model = create_autoencoder(cfg)
+    loader = tokenizer_loader(run)
+    if is_lead():
+        for line in (*loader.summary(), *model.notes()):
+            note(line)
     state = fit(
         model,
-        setup.loop,
-        setup.loader,
-        directory,
+        loader.loop,
+        loader,
+        run.directory / "tokenizer",
         name="tokenizer",
-        to_batch=setup.to_batch,
-        start=setup.start,
+        to_batch=model.batch,
+        start=pretrained_start(model, train.start_from, "tokenizer"),
         resume=resume,
         validate=TokenizerValidation(run),
         per_step=("images", train.batch_size * train.frames_per_clip),
@@ -165,22 +183,26 @@ def prepare(run: Run) -> None:
 
 def train_world_model(run: Run, resume: bool) -> None:
     """Stage 4: trains the world model."""
-    cfg, train = run.config, run.config.train
+    cfg = run.config
+    train = cfg.train
     if cfg.model.uses_tokenizer and train.start_from and train.start_from != cfg.tokenizer_train.start_from:
         note(
             f"train.start_from {train.start_from} is not tokenizer_train.start_from; "
             f"its model has to know the tokens of this run's tokenizer"
         )
-    setup = world_model_setup(run)
-    note_curriculum(setup.loader)
+    model = create_model(cfg)
+    loader = world_model_loader(run)
+    if is_lead():
+        for line in loader.summary():
+            note(line)
     state = fit(
-        setup.model,
-        setup.loop,
-        setup.loader,
+        model,
+        loader.loop,
+        loader,
         run.directory / "world_model",
         name="world model",
-        to_batch=setup.to_batch,
-        start=setup.start,
+        to_batch=model.batch,
+        start=pretrained_start(model, train.start_from, "world_model"),
         resume=resume,
         validate=WorldModelValidation(run),
         per_step=("frames", train.batch_size * cfg.clips.frames),
@@ -193,3 +215,60 @@ def evaluate(run: Run) -> None:
     """Stage 5: computes the scores, and the arrays of the report."""
     with disk_guard(run.directory):
         save_evaluation(run.output("evaluation"), evaluate_own(run))
+
+
+def tokenizer_loader(run: Run) -> LoaderFactory:
+    """Returns what makes the loaders of the tokenizer's training, on the run's clips.
+
+    Raises:
+        StoreError: the clips are missing, or the curriculum of ``tokenizer_train`` does not fit them.
+    """
+    transform = create_autoencoder(run.config).transform()
+    loop = run.config.loop("tokenizer")
+    return plan(loop, run.open_clips(), lambda store: transform, run.directory / "tokenizer")
+
+
+def world_model_loader(run: Run) -> LoaderFactory:
+    """Returns what makes the loaders of the world model's training, on the prepared store.
+
+    Raises:
+        StoreError: the prepared store is missing, or the curriculum of ``train`` does not fit it.
+    """
+    prepared = run.open_prepared()
+    transform = create_model(run.config).transform(Normalization.create(prepared))
+
+    def transform_of(store: Store) -> Transform:
+        ours = _depth_range(prepared)
+        theirs = _depth_range(store)
+        if theirs and theirs != ours and is_lead():
+            note(f"{store.path}: its depth covers {theirs}, this run's {ours}; the model does not see the difference")
+        return transform
+
+    return plan(run.config.loop("world_model"), prepared, transform_of, run.directory / "world_model")
+
+
+def _depth_range(store: Store) -> str:
+    near_far = store.manifest.get("depth_range")
+    if not near_far:
+        return ""
+    return f"{near_far[0]:g} to {near_far[1]:g} {store.manifest.get('depth_unit') or 'metres'}"
+
+
+def pretrained_start(model: Any, start_from: str, part: str) -> Callable[[Params], Params] | None:
+    """Returns a function that makes initial parameters from a directory's weights; None if ``start_from`` is empty.
+
+    Args:
+        part: "tokenizer" or "world_model".
+
+    Raises:
+        UserError: the weights are missing or of another network; the message names the differing fields.
+    """
+    if not start_from:
+        return None
+    directory = Path(start_from)
+    shapes = model.pretrained_shapes(directory)
+
+    def start(fresh: Params) -> Params:
+        return model.start(fresh, load_weights(directory / part / "weights", shapes), directory)
+
+    return start

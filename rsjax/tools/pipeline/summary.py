@@ -24,7 +24,7 @@ def write_summary(run: Run, command: str) -> None:
         command: the command that repeats the run.
     """
     result = load_evaluation(run.output("evaluation"))
-    seconds = {stage: run.mark(stage)["seconds"] for stage in STAGES[:-1] if run.mark(stage)}
+    seconds = {stage: run.seconds(stage) for stage in STAGES[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
     report = Report(

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from rsjax.artifact import make_once
 from rsjax.config import SimConfig, content_key, to_dict
 from rsjax.data.store import Record, complete_key, decode, encode, encode_clip, write_store
 from rsjax.errors import UserError
-from rsjax.files import disk_guard, making, write_atomically
+from rsjax.files import disk_guard, write_atomically
 from rsjax.processes import WorkerDied, count_cores, run_items
 from rsjax.tools.sim import expert, metaworld
 from rsjax.tools.sim.episode import EpisodePlan, Simulators, run_episode, source_name, task_of
@@ -89,38 +90,21 @@ def make_store(what: Collection, out: Path, report: Report) -> None:
     choose_gl()
     if what.config.env == "metaworld":
         metaworld.load_metaworld()
-    with making(out, wait=True):
+    partial = out.with_name(f"{out.name}.partial")
+    with make_once(partial, what.key, refuse=None, wait=True, temporary=True):
         if complete_key(out) == what.key:  # another process made it in the meantime
             report(total, total)
-        else:
-            _make(what, out, report)
-
-
-def _make(what: Collection, out: Path, report: Report) -> None:
-    partial = out.with_name(f"{out.name}.partial")
-    with disk_guard(partial):
-        _prepare(partial, what.key)
-    todo = [
-        plan
-        for plan in what.plans
-        if not (_clip_file(partial, plan.name).exists() or _error_file(partial, plan.name).exists())
-    ]
-    total = len(what.plans)
-    report(total - len(todo), total)
-    if todo:
-        with disk_guard(partial):
-            _simulate(what.config, partial, todo, total, report)
-    _pack(what, partial, out)
-    shutil.rmtree(partial)
-
-
-def _prepare(partial: Path, key: str) -> None:
-    """Creates the directory of finished episodes and removes episodes of another configuration."""
-    marker = partial / "key"
-    if not marker.exists() or marker.read_text() != key:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        write_atomically(marker, key.encode())
+            return
+        todo = [
+            plan
+            for plan in what.plans
+            if not (_clip_file(partial, plan.name).exists() or _error_file(partial, plan.name).exists())
+        ]
+        report(total - len(todo), total)
+        if todo:
+            with disk_guard(partial):
+                _simulate(what.config, partial, todo, total, report)
+        _pack(what, partial, out)
 
 
 def _simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: int, report: Report) -> None:

@@ -26,7 +26,7 @@ def main(folder: Path, fault: str) -> None:
     if fault == "broken" and saved.exists():
         sys.exit("cannot go on")
     saved.mkdir(parents=True, exist_ok=True)
-    write(folder / "stage.json", json.dumps({"finished": False}))
+    write(folder / "made.json", json.dumps({"finished": False}))
     time.sleep(0.05)
     first = max((int(path.name) for path in saved.iterdir() if path.name.isdigit()), default=0)
     log = folder / "log.jsonl"
@@ -43,7 +43,7 @@ def main(folder: Path, fault: str) -> None:
             half.rename(saved / str(step))
         if stopped:
             sys.exit(1 if fault == "deaf" else os.EX_TEMPFAIL)
-    write(folder / "stage.json", json.dumps({"finished": True}))
+    write(folder / "made.json", json.dumps({"finished": True}))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rsjax.artifact import MARK, Mark
 from rsjax.config import (
     ComponentConfig,
     Config,
@@ -113,27 +115,27 @@ def test_an_interrupted_stage_is_not_finished_and_its_seconds_add_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [0.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     run = Run(DEBUG, tmp_path, tmp_path)
     run.output("tokenizer").mkdir(parents=True)
 
     def interrupted() -> None:
         with run.stage("tokenizer"):
-            assert run.mark("tokenizer") == {"key": run.keys()["tokenizer"], "finished": False, "seconds": 0.0}
+            assert run.mark("tokenizer") == Mark(run.keys()["tokenizer"], finished=False, seconds=0.0)
             clock[0] = 5.0
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert not run.finished("tokenizer")
-    assert run.mark("tokenizer")["seconds"] == 5.0
+    assert run.seconds("tokenizer") == 5.0
     with run.stage("tokenizer"):
         clock[0] = 7.0
     assert run.finished("tokenizer")
-    assert run.mark("tokenizer")["seconds"] == 7.0
+    assert run.seconds("tokenizer") == 7.0
     with Run(changed("tokenizer.channels", 32), tmp_path, tmp_path).stage("tokenizer"):
         clock[0] = 8.0
-    assert run.mark("tokenizer")["seconds"] == 1.0, "another configuration's seconds do not count"
+    assert run.seconds("tokenizer") == 1.0, "another configuration's seconds do not count"
 
 
 def test_another_configurations_training_is_refused_by_name_and_nothing_changes(tmp_path: Path) -> None:
@@ -231,7 +233,7 @@ def test_checkpoints_without_a_mark_are_of_the_configuration_beside_them(tmp_pat
     run.prepare(overwrite=False)
     make(run, "tokenizer")
     (tmp_path / "tokenizer" / "checkpoints").mkdir()
-    path = tmp_path / "tokenizer" / module.MARK
+    path = tmp_path / "tokenizer" / MARK
     path.unlink() if mark is None else path.write_text(mark)
     run.prepare(overwrite=False)
     other = Run(changed("tokenizer_train.seed", 9), tmp_path, tmp_path)

@@ -12,7 +12,7 @@ from rsjax.data.store import Store, StoreError, encode_clip, open_store, write_s
 from rsjax.tokenizers.tokenize import fingerprint
 from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import Run, link
-from rsjax.tools.pipeline.setup import note_curriculum, world_model_setup
+from rsjax.tools.pipeline.stages import world_model_loader
 from tests.curricula import stage
 from tests.tools.pipeline import toy
 from tests.tools.pipeline.damage import damage
@@ -23,9 +23,7 @@ def with_stages(config: Config, *stages: CurriculumStageConfig) -> Config:
     return replace(config, train=train)
 
 
-def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(tmp_path: Path) -> None:
     run = Run(with_stages(toy.config()), tmp_path / "run", tmp_path / "data")
     clips = toy.store(run.clips)
     damage(clips, "train", 1)
@@ -44,11 +42,10 @@ def test_tokens_are_labelled_as_their_clips_and_lack_the_damaged_one(
     (line,) = (run.directory / "tokens" / "quarantine.jsonl").read_text().splitlines()
     assert '"record": 1' in line
     with pytest.raises(StoreError, match="it has difficulty 'unknown' 2×"):
-        world_model_setup(replace(run, config=with_stages(run.config, stage("simple", 2.0))))
-    setup = world_model_setup(replace(run, config=with_stages(run.config, stage("unknown", 3.0, tasks=("dri*",)))))
-    assert setup.loop.steps == 3
-    note_curriculum(setup.loader)
-    assert "note: stage 1 of the curriculum: 2 clips, steps 1 to 3" in capsys.readouterr().out
+        world_model_loader(replace(run, config=with_stages(run.config, stage("simple", 2.0))))
+    loader = world_model_loader(replace(run, config=with_stages(run.config, stage("unknown", 3.0, tasks=("dri*",)))))
+    assert loader.loop.steps == 3
+    assert loader.summary() == ["stage 1 of the curriculum: 2 clips, steps 1 to 3"]
 
 
 @pytest.mark.parametrize(
@@ -63,8 +60,8 @@ def test_tokens_of_another_store_are_normalized_as_the_runs_own(
     other = small_store(tmp_path / "other", changes)
     run.output("tokens").parent.mkdir(parents=True)
     link(tmp_path / "own", run.output("tokens"))
-    setup = world_model_setup(run)
-    (component,) = setup.loader.stages[0].components
+    loader = world_model_loader(run)
+    (component,) = loader.stages[0].components
     made = component.transform(other.source("train")[0], np.random.default_rng(0))
     np.testing.assert_allclose(made["actions"], np.array([[0], [0.25], [1.25]]))
     assert capsys.readouterr().out.count("the model does not see the difference") == noted

@@ -86,5 +86,5 @@ def test_changed_code_is_noted_for_a_family_without_a_tokenizer_too(
 ) -> None:
     run = Run(replace(toy.config(), model=ToyConfig()), tmp_path / "run", tmp_path / "data")
     monkeypatch.setattr(stages, "record_start", lambda run, command: ["the code"])
-    stages._record_start(run, "")
+    stages.note_changes(run, "")
     assert "since the last start the code changed" in capsys.readouterr().out

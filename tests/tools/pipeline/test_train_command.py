@@ -66,7 +66,7 @@ def test_the_whole_job_leaves_a_report_and_metrics(debug: Path) -> None:
     assert [scores.pop(name) for name in reasons] == [None] * len(reasons)
     assert set(WANTED.split()) <= scores.keys()
     assert all(isinstance(value, float) and np.isfinite(value) for value in scores.values())
-    seconds = [json.loads((debug / stage / "stage.json").read_text())["seconds"] for stage in STAGES[:-1]]
+    seconds = [json.loads((debug / stage / "made.json").read_text())["seconds"] for stage in STAGES[:-1]]
     assert scores["seconds_total"] == pytest.approx(sum(seconds), abs=0.1)
     assert not list(debug.rglob("*.tmp")) + list(debug.rglob("*.building"))
     page = (debug / "report.html").read_text()
@@ -91,7 +91,7 @@ def test_killed_twice_and_run_again_it_gives_the_same_weights(debug: Path, tmp_p
     for place, finished in (("tokens", STAGES[:2]), ("world_model", STAGES[:3])):
         done = command("tests.tools.pipeline.killed", place, "debug", "--run-dir", run)
         assert done.returncode == -signal.SIGKILL, done.stderr
-        marks = {stage: run / stage / "stage.json" for stage in STAGES}
+        marks = {stage: run / stage / "made.json" for stage in STAGES}
         assert [s for s, mark in marks.items() if mark.exists() and json.loads(mark.read_text())["finished"]] == list(
             finished
         )
@@ -188,7 +188,7 @@ def test_without_opengl_one_line_says_what_to_install(
     assert "apt-get install" in line
     assert line.count("\n") == 1
     assert not (tmp_path / "data").exists()
-    assert not json.loads((tmp_path / "run" / "collect" / "stage.json").read_text())["finished"]
+    assert not json.loads((tmp_path / "run" / "collect" / "made.json").read_text())["finished"]
 
 
 def test_a_run_that_left_no_step_out_says_so(debug: Path, command: Commands) -> None:

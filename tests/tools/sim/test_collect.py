@@ -1,13 +1,14 @@
 import errno
 import multiprocessing
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rsjax.artifact import make_once
 from rsjax.clip import Clip
 from rsjax.config import ConfigError, SimConfig
 from rsjax.data.store import complete_key, encode, encode_clip, open_store
@@ -137,7 +138,8 @@ def test_collect_resumes_survives_a_killed_worker_and_packs(sim: LiftSim, tmp_pa
 def prepared(tmp_path: Path, config: SimConfig, failed: range) -> Path:
     """A collection of which all episodes are done, some of them failed in the simulator."""
     out, partial = tmp_path / "lift", tmp_path / "lift.partial"
-    collect_module._prepare(partial, collection_key(config))
+    with suppress(KeyboardInterrupt), make_once(partial, collection_key(config), refuse=None):
+        raise KeyboardInterrupt
     for i in range(config.episodes):
         clip = Clip(
             rgb=np.zeros((2, 4, 4, 3), np.uint8),
@@ -163,7 +165,7 @@ def test_a_collection_waits_for_the_process_that_makes_the_same_and_uses_its_sto
     monkeypatch.setattr(collect_module, "choose_gl", lambda: None)
     monkeypatch.setattr(collect_module, "complete_key", lambda path: collection_key(CONFIG) if path.exists() else None)
     first = ExitStack()
-    first.enter_context(making(out, wait=False))
+    first.enter_context(making(tmp_path / "store.partial", wait=False))
 
     def finish(line: str) -> None:
         out.mkdir()
@@ -191,16 +193,25 @@ def test_many_failed_episodes_are_an_error(gl: str, tmp_path: Path) -> None:
     out = prepared(tmp_path, config, range(3))
     with pytest.raises(CollectError, match=r"3 of 20 episodes failed.*it diverged"):
         collect(config, out, lambda done, total: None)
-    assert [path.name for path in tmp_path.iterdir()] == [".lift.lock"]
+    assert [path.name for path in tmp_path.iterdir()] == [".lift.partial.lock"]
 
 
-def test_episodes_of_another_configuration_are_not_reused(tmp_path: Path) -> None:
-    prepared(tmp_path, CONFIG, range(0))
-    partial = tmp_path / "lift.partial"
-    collect_module._prepare(partial, collection_key(CONFIG))
-    assert len(list(partial.glob("*.clip"))) == 4
-    collect_module._prepare(partial, collection_key(replace(CONFIG, seed=7)))
-    assert not list(partial.glob("*.clip"))
+def test_episodes_of_another_configuration_are_not_reused(
+    gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = prepared(tmp_path, CONFIG, range(0))
+    assert len(list((tmp_path / "lift.partial").glob("*.clip"))) == 4
+    missing = []
+
+    def simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], *_: object) -> None:
+        missing.append(len(todo))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(collect_module, "_simulate", simulate)
+    with pytest.raises(KeyboardInterrupt):
+        collect(replace(CONFIG, seed=7), out, lambda done, total: None)
+    assert missing == [4]
+    assert not list((tmp_path / "lift.partial").glob("*.clip"))
 
 
 def test_a_simulator_failure_costs_one_episode_but_a_full_disk_stops(

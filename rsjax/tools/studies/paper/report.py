@@ -82,7 +82,7 @@ def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     base = plan.scale.base
     results = {result.name: result for outcome in outcomes for arm in outcome.arms for result in arm.results}
     runs = [result.run for result in results.values()]  # cells that share a stage have the same mark for it
-    spent = {key: run.mark(stage).get("seconds", 0.0) for run in runs for stage, key in run.keys().items()}
+    spent = {key: run.seconds(stage) for run in runs for stage, key in run.keys().items()}
     states = Counter(result.state for result in results.values())
     return {
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {jax.local_devices()[0].device_kind}, {os.cpu_count()} cores",
@@ -188,7 +188,7 @@ def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, An
 
 
 def _trained(result: Result) -> dict[str, float]:
-    return {stage: result.run.mark(stage).get("seconds", 0.0) for stage in ("tokenizer", "world_model")}
+    return {stage: result.run.seconds(stage) for stage in ("tokenizer", "world_model")}
 
 
 def _spread(arm: Trained, column: Metric) -> str:

@@ -294,7 +294,7 @@ def test_weights_of_metrics_that_come_later_train_nothing_again(tmp_path: Path, 
     assert not first.cells.keys() & later.cells.keys()
     run(first, tmp_path)
     for there in runs_of(first, tmp_path / "out", tmp_path / "data").values():
-        mark, key = there.directory / "world_model" / "stage.json", there.keys()["world_model"]
+        mark, key = there.directory / "world_model" / "made.json", there.keys()["world_model"]
         mark.write_text(mark.read_text().replace(key, key if sound else "0" * 16))
     run(later, tmp_path)
     counts = Counter(line.split()[0] for line in made(tmp_path))
