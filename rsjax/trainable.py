@@ -3,7 +3,6 @@
 The tokenizer and every family of world models implement :class:`Trainable`.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
@@ -16,6 +15,7 @@ Params: TypeAlias = dict[str, Any]  # a tree of arrays
 Extra: TypeAlias = dict[str, Any] | None  # a tree of arrays that is carried from step to step with the parameters
 
 B = TypeVar("B", contravariant=True)
+Tree = TypeVar("Tree")
 
 
 class StepContext(NamedTuple):
@@ -60,8 +60,13 @@ class Trainable(Protocol[B]):
         return extra
 
 
+def over_devices(tree: Tree, axis_name: str | None) -> Tree:
+    """Adds each array over pmap's axis; without one, XLA already sees the whole batch."""
+    return tree if axis_name is None else jax.lax.psum(tree, axis_name)
+
+
 def combine(
-    terms: dict[str, Term], weights: dict[str, float], total: Callable[[Scalar], Scalar] = lambda x: x
+    terms: dict[str, Term], weights: dict[str, float], axis_name: str | None = None
 ) -> tuple[Scalar, dict[str, Scalar]]:
     """Returns this device's share of the loss, the sum of λ·sum/weight over the terms (paper Eq. 8).
 
@@ -70,7 +75,7 @@ def combine(
     Args:
         terms: by name; the names must equal those of ``weights``, so that no term is misspelt or forgotten.
         weights: λ by name.
-        total: adds a scalar over devices.
+        axis_name: pmap's axis over which the batch is split; None if XLA sees the whole batch.
 
     Returns:
         This device's share of the loss (the shares of all devices add up to the loss), and each term's share without λ.
@@ -80,7 +85,10 @@ def combine(
     """
     if terms.keys() != weights.keys():
         raise KeyError(f"loss terms {sorted(terms)} are not the configured weights {sorted(weights)}")
-    shares = {
-        name: value / jnp.maximum(total(jax.lax.stop_gradient(weight)), 1e-8) for name, (value, weight) in terms.items()
-    }
-    return sum((weights[name] * share for name, share in shares.items()), start=jnp.float32(0)), shares
+    shares = {}
+    loss = jnp.float32(0)
+    for name, (value, weight) in terms.items():
+        whole = over_devices(jax.lax.stop_gradient(weight), axis_name)
+        shares[name] = value / jnp.maximum(whole, 1e-8)
+        loss += weights[name] * shares[name]
+    return loss, shares

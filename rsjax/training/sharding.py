@@ -6,6 +6,7 @@ A state is an ordinary tree of arrays in all three cases, so checkpoints do not 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import Any, Literal, TypeVar
 
@@ -32,7 +33,7 @@ SMALL = 2**14  # arrays of fewer elements stay whole, since gathering them costs
 
 Kind = Literal["jit", "pmap", "mesh"]
 Step = Callable[[TrainState, PyTree], tuple[TrainState, Metrics]]
-TrainStep = Callable[[Trainable[Any], LoopConfig, TrainState, PyTree, str | None], tuple[TrainState, Metrics]]
+TrainStep = Callable[..., tuple[TrainState, Metrics]]  # (model, loop, state, batch, axis_name) -> (state, metrics)
 
 
 def choose(loop: LoopConfig, local: int, processes: int) -> tuple[Kind, int]:
@@ -128,11 +129,7 @@ class Sharding:
         Args:
             train_step: :func:`rsjax.training.step.train_step`.
         """
-        axis = AXIS if self.kind == "pmap" else None
-
-        def step(state: TrainState, batch: PyTree) -> tuple[TrainState, Metrics]:
-            return train_step(model, loop, state, batch, axis)
-
+        step = partial(train_step, model, loop, axis_name=AXIS if self.kind == "pmap" else None)
         if self.kind == "jit":
             return jax.jit(step, donate_argnums=0)
         if self.kind == "pmap":

@@ -1,14 +1,14 @@
 """The train step of the tokenizer and the world model, on one device or many."""
 
-from collections.abc import Callable
 from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Key
 
 from rsjax.config import LoopConfig
-from rsjax.trainable import Params, Scalar, StepContext, Term, Trainable, combine
+from rsjax.trainable import Params, Scalar, StepContext, Trainable, combine, over_devices
 from rsjax.training.state import TrainState, learning_rate, make_optimizer
 
 Metrics: TypeAlias = dict[str, Scalar]
@@ -36,14 +36,10 @@ def train_step(
     """
     # Keys depend only on the step, so a resumed run draws the same numbers as an uninterrupted one.
     key = jax.random.fold_in(jax.random.key(loop.seed + 1), state.step)
-    total = (lambda x: jax.lax.psum(x, axis_name)) if axis_name else (lambda x: x)
     context = StepContext(state.step, state.extra, axis_name)
-
-    def terms(params: Params, part: B) -> dict[str, Term]:
-        return model.loss_terms(params, part, key, context)
-
-    grads, metrics = _gradients(terms, model.loss_weights, total, state.params, batch, loop.accumulate)
-    grads, metrics = total(grads), total(metrics)
+    grads, metrics = gradient_share(model, state.params, batch, key, context, loop.accumulate)
+    grads = over_devices(grads, axis_name)
+    metrics = over_devices(metrics, axis_name)
     grad_norm = optax.global_norm(grads)
     finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(grad_norm)
 
@@ -79,13 +75,28 @@ def _is_schedule(path: tuple[object, ...], value: object) -> bool:
     return getattr(path[-1], "tuple_name", "") == "ScaleByScheduleState"
 
 
-def _gradients(
-    terms: Callable[[Params, B], dict[str, Term]],
-    weights: dict[str, float],
-    total: Callable[[Scalar], Scalar],
+def loss_share(
     params: Params,
+    model: Trainable[B],
     batch: B,
-    parts: int,
+    key: Key[Array, ""],
+    context: StepContext,
+    weights: dict[str, Scalar] | None = None,
+) -> tuple[Scalar, Metrics]:
+    """Returns this device's share of the loss, and of the loss and its terms (paper Eq. 8).
+
+    Args:
+        weights: the terms' weights over the whole batch, if ``batch`` is a part of it.
+    """
+    terms = model.loss_terms(params, batch, key, context)
+    if weights is not None:
+        terms = {name: (value, weights[name]) for name, (value, _) in terms.items()}
+    loss, shares = combine(terms, model.loss_weights, context.axis_name)
+    return loss, {"loss": loss, **shares}
+
+
+def gradient_share(
+    model: Trainable[B], params: Params, batch: B, key: Key[Array, ""], context: StepContext, parts: int
 ) -> tuple[Params, Metrics]:
     """Returns this device's share of the gradient, and of the loss and its terms.
 
@@ -93,27 +104,21 @@ def _gradients(
     are computed first (XLA removes the network from that computation). Exceptions are the tokenizer's batch statistics,
     which are computed for each part: its codes' entropy, the discriminator's batch norm, LeCAM's averages.
     """
-
-    def share(params: Params, part: B, whole: dict[str, Scalar] | None) -> tuple[Scalar, Metrics]:
-        values = terms(params, part)
-        if whole is not None:
-            values = {name: (value, whole[name]) for name, (value, _) in values.items()}
-        loss, shares = combine(values, weights, total)
-        return loss, {"loss": loss, **shares}
-
-    gradient = jax.grad(share, has_aux=True)
+    gradient = jax.grad(loss_share, has_aux=True)
     if parts == 1:
-        return gradient(params, batch, None)
+        return gradient(params, model, batch, key, context)
     # A part takes every parts-th row, so that rows stay on their device of a mesh.
     stacked = jax.tree.map(lambda x: x.reshape(-1, parts, *x.shape[1:]).swapaxes(0, 1), batch)
-    of_parts = jax.lax.map(lambda part: {name: weight for name, (_, weight) in terms(params, part).items()}, stacked)
-    whole = jax.tree.map(lambda x: jnp.sum(x, axis=0), of_parts)
+
+    def weights_of(part: B) -> dict[str, Scalar]:
+        return {name: weight for name, (_, weight) in model.loss_terms(params, part, key, context).items()}
+
+    weights = jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.lax.map(weights_of, stacked))
 
     def add(carry: tuple[Params, Metrics], part: B) -> tuple[tuple[Params, Metrics], None]:
-        return jax.tree.map(jnp.add, carry, gradient(params, part, whole)), None
+        return jax.tree.map(jnp.add, carry, gradient(params, model, part, key, context, weights)), None
 
-    zeros = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype),
-        jax.eval_shape(gradient, params, jax.tree.map(lambda x: x[0], stacked), whole),
-    )
+    first = jax.tree.map(lambda x: x[0], stacked)
+    shapes = jax.eval_shape(lambda: gradient(params, model, first, key, context, weights))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return jax.lax.scan(add, zeros, stacked)[0]

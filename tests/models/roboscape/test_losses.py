@@ -193,7 +193,8 @@ def test_the_objective_is_equation_8() -> None:
 def test_shares_of_parts_add_up_to_the_whole_where_mean_of_ratios_would_not() -> None:
     parts = [(jnp.float32(90), jnp.float32(9)), (jnp.float32(1), jnp.float32(1))]
     whole, _ = combine({"rgb": (jnp.float32(91), jnp.float32(10))}, {"rgb": 2.0})
-    shares = [combine({"rgb": part}, {"rgb": 2.0}, lambda _: jnp.float32(10))[0] for part in parts]
+    share = lambda value, weight: combine({"rgb": (value, weight)}, {"rgb": 2.0}, "devices")[0]  # noqa: E731
+    shares = jax.vmap(share, axis_name="devices")(*(jnp.stack(column) for column in zip(*parts, strict=True)))
     np.testing.assert_allclose(sum(shares), whole, rtol=1e-6)
     np.testing.assert_allclose(whole, 2 * 9.1, rtol=1e-6)
 
