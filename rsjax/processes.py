@@ -88,7 +88,8 @@ def run_items(
             settle(item, work(item))
         return
     first_message = pickle.dumps(make)
-    fresh, again = ((item, 0) for item in items), deque[tuple[Item, int]]()
+    fresh = ((item, 0) for item in items)
+    again = deque[tuple[Item, int]]()
     started: list[_Worker] = []
     idle: list[_Worker] = []
     busy: dict[Connection, tuple[_Worker, Item, int]] = {}

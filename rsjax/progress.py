@@ -58,7 +58,10 @@ class Progress:
         per_unit: tuple[str, float] | None = None,
         settle: int = 0,
     ) -> None:
-        self.stage, self.total, self.unit, self.per_unit = stage, total, unit, per_unit
+        self.stage = stage
+        self.total = total
+        self.unit = unit
+        self.per_unit = per_unit
         self._settled = start + settle
         self._console = console or Console()
         self._clock = clock
@@ -94,7 +97,8 @@ class Progress:
         if now - self._shown < (PLAIN_SECONDS if self._bar is None else TERMINAL_SECONDS):
             return
         self._shown = now
-        parts, values = self._parts(), [f"{name}={float(value):.4g}" for name, value in scalars.items()]
+        parts = self._parts()
+        values = [f"{name}={float(value):.4g}" for name, value in scalars.items()]
         line = ", ".join(parts + values)
         if self._bar is None:
             self._print(line)
@@ -107,7 +111,8 @@ class Progress:
         if self._bar is not None:
             self._bar.stop()
         if kind is None:
-            seconds, done = self._clock() - self._began, self._done - self._first
+            seconds = self._clock() - self._began
+            done = self._done - self._first
             rates = f" ({', '.join(self._rates(done / seconds))})" if seconds > 0 and done else ""
             self._print(f"{self._done} {self.unit} in {duration(seconds)}{rates}")
 
@@ -115,7 +120,8 @@ class Progress:
         self._console.print(f"  {self.stage}: {line}", markup=False, highlight=False, soft_wrap=True)
 
     def _parts(self) -> list[str]:
-        (then, before), (now, done) = self._samples[0], self._samples[-1]
+        then, before = self._samples[0]
+        now, done = self._samples[-1]
         parts = [f"{done}/{self.total} {self.unit}"]
         if now > then and done > before:
             rate = (done - before) / (now - then)

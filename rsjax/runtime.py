@@ -154,7 +154,8 @@ def stop_signals() -> Iterator[list[int]]:
     watch = threading.Thread(target=_watch, args=(readable,), daemon=True)
     watch.start()
     descriptor = signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
-    report, sys.unraisablehook = sys.unraisablehook, raise_again
+    report = sys.unraisablehook
+    sys.unraisablehook = raise_again
     before = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield received
@@ -180,7 +181,8 @@ def _watch(pipe: int) -> None:
             os.kill(os.getpid(), signal.SIGTERM)  # the exception may have been swallowed before training began
             deadline = time.monotonic() + STOP_SECONDS
             continue
-        numbers, now = os.read(pipe, 64), time.monotonic()
+        numbers = os.read(pipe, 64)
+        now = time.monotonic()
         if not numbers:  # the other end is closed
             return
         if signal.SIGINT in numbers:

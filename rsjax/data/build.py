@@ -47,12 +47,14 @@ def write_clips(path: Path | str, clips: Iterable[Mapping[str, Any] | Clip], tes
         raise StoreError(f"{path}: exists and is not a store; move it away or choose another place")
     episodes: dict[str, _Episode] = {}
     first: dict[str, tuple[int, ...]] = {}
-    digest, scored = hashlib.sha256(), False
+    digest = hashlib.sha256()
+    scored = False
     with disk_guard(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.") as folder:
         spool = Path(folder) / "clips.array_record"
-        writer, count = ArrayRecordWriter(str(spool), WRITER_OPTIONS), 0
+        writer = ArrayRecordWriter(str(spool), WRITER_OPTIONS)
+        count = 0
         for clip in clips:
             given = encode_clip(clip) if isinstance(clip, Clip) else clip
             if not isinstance(given, Mapping):
@@ -152,7 +154,8 @@ def _record(clip: Mapping[str, Any], where: str, number: int) -> Record:
         depth = _array(clip, "depth", where, f"metres ({count}, {size}, {size})", np.float32, (count, size, size))
         if depth.min() <= 0:
             raise StoreError(f"{where}: depth is {depth.min():g} somewhere; it is in metres, above 0: fill its holes")
-    tracks, visible = np.zeros((TRACKS, count, 2), np.float32), np.zeros((TRACKS, count), bool)
+    tracks = np.zeros((TRACKS, count, 2), np.float32)
+    visible = np.zeros((TRACKS, count), bool)
     if clip.get("tracks") is not None:
         tracks = _array(clip, "tracks", where, f"numbers (N, {count}, 2)", np.float32, (None, count, 2))
         visible = _array(clip, "visible", where, f"bool {tracks.shape[:2]}", np.bool_, tracks.shape[:2])

@@ -133,7 +133,9 @@ def frame_rate(clip: Record, manifest: Mapping[str, Any]) -> float | None:
         manifest: the store's manifest; for simulated clips it has the control steps between two frames.
     """
     origin = clip["provenance"]
-    frames, fps, control = origin.get("frames", ()), origin.get("fps"), origin.get("control_hz")
+    frames = origin.get("frames", ())
+    fps = origin.get("fps")
+    control = origin.get("control_hz")
     if fps and len(frames) > 1:
         return float(fps) * (len(frames) - 1) / (frames[-1] - frames[0])
     steps = (manifest.get("config") or {}).get("control_steps") or origin.get("control_steps")

@@ -26,7 +26,8 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
         far: depth that becomes black.
         scale: "inverse" spaces levels evenly in 1/depth (finer near the camera), "linear" in depth.
     """
-    near_value, far_value = _scaled(near, scale), _scaled(far, scale)
+    near_value = _scaled(near, scale)
+    far_value = _scaled(far, scale)
     with np.errstate(divide="ignore"):
         position = ((_scaled(depth, scale) - far_value) / (near_value - far_value)).clip(0.0, 1.0) * (depth > 0)
     level = (position * 765.0).round()
@@ -36,7 +37,8 @@ def depth_to_color(depth: Float[Array, "*batch"], near: float, far: float, scale
 def color_to_depth(color: Float[Array, "*batch 3"], near: float, far: float, scale: Scale) -> Float[Array, "*batch"]:
     """Inverts :func:`depth_to_color` for any colours 0–255; returns metres in [near, far]."""
     position = color.astype(np.float32).mean(-1) / 255.0
-    near_value, far_value = _scaled(near, scale), _scaled(far, scale)
+    near_value = _scaled(near, scale)
+    far_value = _scaled(far, scale)
     return _scaled(far_value + position * (near_value - far_value), scale)
 
 

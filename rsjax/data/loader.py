@@ -71,7 +71,10 @@ class Loader:
             count = self._shard.shard_count
             raise ConfigError(f"batch_size {batch_size} does not divide over {count} processes; make it a multiple")
         self._dataset = ordered(stages, seed, quarantine)
-        self._stages, self._batch_size, self._seed, self._quarantine = stages, batch_size, seed, quarantine
+        self._stages = stages
+        self._batch_size = batch_size
+        self._seed = seed
+        self._quarantine = quarantine
         self._workers = workers
         self._place = 0 if state is None else int(state[PLACE])
         self._iterator: Any = None
@@ -230,7 +233,8 @@ class Prefetch:
     """
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any], ahead: int = 2) -> None:
-        self._loader, self._state = loader, loader.state()
+        self._loader = loader
+        self._state = loader.state()
         self._batches: Any = ThreadPrefetchDatasetIterator(_Batches(loader, put), ahead)
         self._batches.start_prefetch()
         self.waited = 0.0
@@ -287,7 +291,8 @@ class _Batches:
     """
 
     def __init__(self, loader: Loader, put: Callable[[Arrays], Any]) -> None:
-        self._loader, self._put = loader, put
+        self._loader = loader
+        self._put = put
         self._failure: BaseException | None = None
 
     def __iter__(self) -> Iterator[DeviceBatch | BaseException]:

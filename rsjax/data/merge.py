@@ -219,7 +219,8 @@ def _check_mergeable(stores: Sequence[Store], out: Path) -> None:
         raise StoreError(f"depth_unit: {units}; such depth does not mix: ingest one of them with --depth none")
     one = stores[0]
     fields = ("kind", "tokenizer", *(("depth_range",) if one.manifest.get("kind") == "tokens" else ()))
-    columns, ours = _columns(one), one.shapes()
+    columns = _columns(one)
+    ours = one.shapes()
     for other in stores[1:]:
         for name in fields:
             if other.manifest.get(name) != one.manifest.get(name):

@@ -130,7 +130,8 @@ class Statistics:
         """
         if len(self.mean) != len(other.mean):
             raise StoreError(f"actions of {len(other.mean)} dimensions among such of {len(self.mean)}; leave it out")
-        count, away = self.count + other.count, other.mean - self.mean
+        count = self.count + other.count
+        away = other.mean - self.mean
         return Statistics(
             count,
             self.mean + away * other.count / count,

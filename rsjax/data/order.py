@@ -58,13 +58,15 @@ class Readable:
     """
 
     def __init__(self, component: MixtureComponent, quarantine: Quarantine) -> None:
-        self._component, self._quarantine = component, quarantine
+        self._component = component
+        self._quarantine = quarantine
 
     def __len__(self) -> int:
         return len(self._component)
 
     def __getitem__(self, index: int) -> tuple[int, Record]:
-        source, chosen = self._component.source, self._component.chosen
+        source = self._component.source
+        chosen = self._component.chosen
         for place in range(index, index + len(self)):
             number = place % len(self) if chosen is None else int(chosen[place % len(self)])
             try:
@@ -86,7 +88,8 @@ def ordered(stages: Sequence[CurriculumStage], seed: int, quarantine: Quarantine
     The arrays are the transform's, ``record`` (the record's number in its source) and ``part`` (the component's number,
     counted over all stages).
     """
-    mixed, number = [], 0
+    mixed = []
+    number = 0
     for place, stage in enumerate(stages):
         datasets = []
         for component in stage.components:

@@ -31,7 +31,8 @@ class Quarantine:
     """
 
     def __init__(self, path: Path | None, records: int, share: float = MAX_DAMAGED) -> None:
-        self._path, self._records = path, records
+        self._path = path
+        self._records = records
         self._most = max(1, int(share * records)) if share else 0
         self._known: set[Key] = set()  # records that this process has met
 

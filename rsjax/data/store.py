@@ -57,8 +57,10 @@ class Source:
     """
 
     def __init__(self, store: Path, split: str, files: list[tuple[str, int]]) -> None:
-        self._store, self._split = store, split
-        self._paths, self._starts = [store / name for name, _ in files], np.cumsum([0, *(count for _, count in files)])
+        self._store = store
+        self._split = split
+        self._paths = [store / name for name, _ in files]
+        self._starts = np.cumsum([0, *(count for _, count in files)])
         self._reader: Any = None
 
     def __len__(self) -> int:
@@ -77,7 +79,8 @@ class Source:
                     reader = self._reader = ArrayRecordDataSource([str(path) for path in self._paths])
                 return decode(reader[index])
             except Exception as error:  # array_record reports damage with several exception types
-                self._reader, damage = None, error
+                self._reader = None
+                damage = error
         shard = self._shard(index)
         raise StoreError(
             f"{self._paths[shard]}: record {index - self._starts[shard]} (number {index} of the split) cannot be "
@@ -245,11 +248,14 @@ def _write_split(folder: Path, split: str, records: Iterable[Record], label: Lab
     payloads = map(encode, labels.noting(records, label) if label else records)
     payload = next(payloads, None)
     while payload is not None:
-        name, count, size = f"{split}-{len(files):05d}.array_record", 0, 0
+        name = f"{split}-{len(files):05d}.array_record"
+        count = 0
+        size = 0
         writer = ArrayRecordWriter(str(folder / name), WRITER_OPTIONS)
         while payload is not None and size < SHARD_BYTES:
             writer.write(payload)
-            count, size = count + 1, size + len(payload)
+            count += 1
+            size += len(payload)
             payload = next(payloads, None)
         writer.close()
         files.append({"name": name, "count": count, "bytes": (folder / name).stat().st_size})

@@ -94,7 +94,8 @@ class TrainedModel:
             ShapeError: the tokens have the wrong shape or type for this model.
             UserError: the model has no tokens.
         """
-        codec, grid = self._codec(), self.config.grid
+        codec = self._codec()
+        grid = self.config.grid
         arrays = {name: np.asarray(x) for name, x in tokens.items()}
         if not {"rgb"} <= arrays.keys() <= {"rgb", "depth"}:
             raise ShapeError(f"tokens are of {', '.join(arrays) or 'nothing'}; expected rgb, or rgb and depth")
@@ -119,7 +120,9 @@ class TrainedModel:
 
     def _actions(self, actions: Any, prompt: Video, lead: tuple[int | str, ...]) -> Float32[np.ndarray, "*B T A"]:
         """Checks and returns actions as float32; ``lead`` are the sizes of axes before T, "N" for any above 0."""
-        actions, width, past = np.asarray(actions), self.config.clips.action_dim, prompt.rgb.shape[1]
+        actions = np.asarray(actions)
+        width = self.config.clips.action_dim
+        past = prompt.rgb.shape[1]
         expected = ", ".join(map(str, (*lead, "T", width)))
         fits = actions.ndim == len(lead) + 2 and actions.shape[-1] == width and actions.shape[-2] > past
         if not fits or (lead and (not len(actions) if lead == ("N",) else len(actions) != lead[0])):
@@ -140,7 +143,8 @@ class TrainedModel:
 
     def _video(self, frames: Any, depth: Any) -> tuple[Video, bool]:
         """Checks and returns the arguments with a leading axis over clips, and whether that axis was added."""
-        frames, size = np.asarray(frames), self.config.clips.image_size
+        frames = np.asarray(frames)
+        size = self.config.clips.image_size
         if frames.ndim not in (4, 5) or frames.shape[-3:] != (size, size, 3) or frames.dtype != np.uint8:
             raise ShapeError(
                 f"frames have shape {frames.shape} and type {frames.dtype}; expected (P, {size}, {size}, 3) for one "

@@ -113,7 +113,8 @@ def _is_made(out: Path, key: str, clips: Store) -> bool:
 
 def _writable(out: Path) -> bool:
     """Returns whether this user may write the set at ``out``; the store may be another user's."""
-    parent, lock = next(folder for folder in out.parents if folder.exists()), lock_file(out)
+    parent = next(folder for folder in out.parents if folder.exists())
+    lock = lock_file(out)
     return os.access(parent, os.W_OK) and (not lock.exists() or os.access(lock, os.W_OK))
 
 

@@ -66,7 +66,8 @@ class Checkpoints:
         keep_best: bool = False,
         read_only: bool = False,
     ) -> None:
-        self.directory, self._read_only = directory.absolute(), read_only
+        self.directory = directory.absolute()
+        self._read_only = read_only
         self._keep = (keep_last, keep_every, keep_best)
         with disk_guard(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -346,7 +347,8 @@ def _size_and_checksum(path: Path) -> list[int]:
     size = checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(CHUNK_BYTES):
-            size, checksum = size + len(chunk), zlib.crc32(chunk, checksum)
+            size += len(chunk)
+            checksum = zlib.crc32(chunk, checksum)
     return [size, checksum]
 
 

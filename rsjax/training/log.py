@@ -171,7 +171,9 @@ def memory_scalars() -> dict[str, float]:
     device without such counts, such as a CPU, those of the process. ``host_gib`` is the process's resident set; 0 if
     the operating system is not Linux.
     """
-    host, host_peak, status = 0, 0, Path("/proc/self/status")
+    host = 0
+    host_peak = 0
+    status = Path("/proc/self/status")
     if status.exists():  # psutil has no peak
         fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
         host, host_peak = (int(fields[name].split()[0]) * 1024 for name in ("VmRSS", "VmHWM"))

@@ -24,7 +24,8 @@ class Profile:
 
     def __init__(self, directory: Path, first: int, count: int) -> None:
         self._directory = directory
-        self._first, self._end = first, first + (count if jax.process_index() == 0 else 0)
+        self._first = first
+        self._end = first + (count if jax.process_index() == 0 else 0)
         self._running = False
 
     @classmethod

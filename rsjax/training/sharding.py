@@ -141,7 +141,8 @@ class Sharding:
                 donate_argnums=0,
                 devices=list(self.mesh.devices.flat),
             )
-        places, whole = self._shardings(_shapes(model, loop)), NamedSharding(self.mesh, P())
+        places = self._shardings(_shapes(model, loop))
+        whole = NamedSharding(self.mesh, P())
         return jax.jit(step, donate_argnums=0, in_shardings=(places, self._rows), out_shardings=(places, whole))
 
     def put_batch(self, batch: PyTree) -> PyTree:
@@ -171,7 +172,8 @@ class Sharding:
 
     def gather(self, tree: Tree) -> Tree:
         """Returns a copy of a state, or of a part of one, on this process's first device, which it must fit on."""
-        first, whole = SingleDeviceSharding(jax.local_devices()[0]), NamedSharding(self.mesh, P())
+        first = SingleDeviceSharding(jax.local_devices()[0])
+        whole = NamedSharding(self.mesh, P())
 
         def one(x: jax.Array) -> jax.Array:
             return jax.device_put(x.addressable_data(0) if x.is_fully_replicated else x, first, may_alias=False)
@@ -191,7 +193,8 @@ class Sharding:
 
     def _shardings(self, tree: PyTree) -> PyTree:
         if self.kind == "mesh":
-            rows, parts = table(tree, self.mesh.shape[FSDP]), self.mesh.shape[FSDP]
+            rows = table(tree, self.mesh.shape[FSDP])
+            parts = self.mesh.shape[FSDP]
             large = any(np.prod(row.shape) >= SMALL for row in rows)
             require(
                 parts == 1 or not large or cut_elements(rows) > 0,

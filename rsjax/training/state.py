@@ -43,7 +43,8 @@ def learning_rate(loop: LoopConfig) -> optax.Schedule:
 
 
 def _schedule(opt: OptimizerConfig, steps: int) -> optax.Schedule:
-    peak, low = opt.learning_rate, opt.learning_rate * opt.final_share
+    peak = opt.learning_rate
+    low = opt.learning_rate * opt.final_share
     warmup = min(opt.warmup_steps, steps - 1)
     if opt.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(0.0, peak, warmup, max(steps, warmup + 1), low)

@@ -91,7 +91,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
         name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
         chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
         if request.retakes:
-            name, chosen = f"{name},second-takes", with_second_takes(chosen, config.sim.workers)
+            name = f"{name},second-takes"
+            chosen = with_second_takes(chosen, config.sim.workers)
         folder = directory / FOLDER / name
         evaluate_into(folder, name, trained, run, store, chosen, request.overwrite)
         yield folder
@@ -99,7 +100,8 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
 
 def evaluate_own(run: Run) -> Evaluation:
     """Evaluates a run by its own configuration, in its evaluation stage; only the lead process calls it."""
-    trained, store = load(run.directory), run.open_clips()
+    trained = load(run.directory)
+    store = run.open_clips()
     held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
     folder = run.directory / "evaluation"
     return _evaluate(folder, held_out.protocol.name, _key(trained, store, held_out), trained, run, store, held_out)
@@ -110,7 +112,8 @@ def evaluate_into(
 ) -> None:
     """Evaluates into a folder unless its result is up to date. Several processes share the work."""
     key = _key(trained, store, held_out)
-    parts, skipped = _parts(folder, key), f"{folder}: up to date, skipped (--overwrite evaluates again)"
+    parts = _parts(folder, key)
+    skipped = f"{folder}: up to date, skipped (--overwrite evaluates again)"
     alone = partial(lock, folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here")
     if not overwrite and _key_of(folder) == key:
         if is_lead():
@@ -160,7 +163,8 @@ def _evaluate(
 
 def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
     """Returns the entries of ``result.json`` on protocol, sampling, data, model and machine."""
-    config, (frames, size) = trained.config, held_out.clips.rgb.shape[1:3]
+    config = trained.config
+    frames, size = held_out.clips.rgb.shape[1:3]
     rate = frame_rate(held_out.records[0], held_out.store.manifest)
     data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
     return {

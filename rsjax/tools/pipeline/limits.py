@@ -34,7 +34,8 @@ def device_memory() -> int:
 def check_batch(config: Config, loop: TrainConfig, stage: Literal["tokenizer", "world_model"]) -> None:
     """Raises :class:`UserError` if a batch's activations cannot fit into the devices' memory."""
     clips = loop.batch_size / (loop.accumulate * jax.device_count())
-    needed, there = int(clips * _clip_bytes(config, stage)), device_memory()
+    needed = int(clips * _clip_bytes(config, stage))
+    there = device_memory()
     if needed > there:
         section = "tokenizer_train" if stage == "tokenizer" else "train"
         raise UserError(
@@ -59,7 +60,8 @@ def _clip_bytes(config: Config, stage: str) -> int:
 def check_rollout(config: Config, frames: int) -> None:
     """Raises :class:`UserError` if a generated video of one clip cannot fit into memory."""
     pixel_bytes = 3 + 4 * config.model.uses_depth
-    needed, there = frames * config.clips.image_size**2 * pixel_bytes, host_memory()
+    needed = frames * config.clips.image_size**2 * pixel_bytes
+    there = host_memory()
     if needed > there:
         raise UserError(
             f"--frames is {frames}, a video of {needed / GIB:,.0f} GiB; this machine has {there / GIB:,.0f} GiB of "
@@ -70,7 +72,8 @@ def check_rollout(config: Config, frames: int) -> None:
 def check_episodes(config: SimConfig, out: Path) -> None:
     """Raises :class:`UserError` if simulated episodes cannot fit onto the disk, at one byte per pixel or more."""
     place = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    needed, free = config.episodes * config.frames * config.image_size**2, shutil.disk_usage(place).free
+    needed = config.episodes * config.frames * config.image_size**2
+    free = shutil.disk_usage(place).free
     if needed > free:
         raise UserError(
             f"sim.episodes is {config.episodes}, which takes more than {needed / GIB:,.0f} GiB; {place} has "

@@ -122,7 +122,8 @@ def code_version(root: Path) -> dict[str, Any]:
     # rsjax may be installed inside another project's checkout.
     if _git(root, "rev-parse", "--show-toplevel") != str(root.resolve()):
         return code
-    status, diff = _git(root, "status", "--porcelain"), _git(root, "diff", "HEAD")
+    status = _git(root, "status", "--porcelain")
+    diff = _git(root, "diff", "HEAD")
     return code | {
         "revision": _git(root, "rev-parse", "HEAD"),
         "dirty": None if status is None else bool(status),

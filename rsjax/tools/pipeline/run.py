@@ -98,7 +98,8 @@ class Run:
 
     def keys(self) -> dict[str, str]:
         """Returns each stage's content key, a hash of its settings and the previous stage's key."""
-        cfg, key = self.config, self._collect_key
+        cfg = self.config
+        key = self._collect_key
         keys = {"collect": key}
         settings: dict[str, tuple[Any, ...]] = {
             "tokenizer": (cfg.autoencoder, cfg.tokenizer_train),

@@ -18,7 +18,8 @@ def on_store(config: Config, path: Path) -> Config:
         ConfigError: the model or the tokenizer does not fit the clips; the message names the fields.
     """
     store = open_store(path)
-    manifest, where = store.manifest, store.path / MANIFEST
+    manifest = store.manifest
+    where = store.path / MANIFEST
     if manifest.get("kind") != "clips" or not manifest.get("key"):
         raise StoreError(
             f"{where}: is of {manifest.get('kind')}, key {manifest.get('key')}; name a store of clips that "

@@ -171,7 +171,9 @@ def train_tokenizer(run: Run, resume: bool) -> None:
 
 def prepare(run: Run) -> None:
     """Stage 3: makes the store that the model trains on instead of clips, such as tokens, and links to it."""
-    clips, folder, cfg = run.open_clips(), run.directory / "tokens", run.config
+    clips = run.open_clips()
+    folder = run.directory / "tokens"
+    cfg = run.config
     (folder / QUARANTINE).unlink(missing_ok=True)
     assets = Assets(Normalization.create(clips), load_tokenizer(cfg, run.directory))
     prepared = create_model(cfg).prepare(clips, assets, folder, cfg.runtime.max_damaged) or clips

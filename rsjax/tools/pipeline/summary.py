@@ -52,7 +52,8 @@ def _figure(result: Evaluation, row: int, config: Config) -> ClipFigure:
     names += ["true_depth", "predicted_depth"] if shown["has_depth"][row] else []
     arrays: dict[str, Any] = {name: shown[name][row] for name in names if name in shown}
     if config.model.marked_keypoints:
-        tracks, visible = shown["tracks"][row], shown["visible"][row]
+        tracks = shown["tracks"][row]
+        visible = shown["visible"][row]
         chosen = np.argsort(-np.asarray(motion_magnitude(tracks, visible)))[: config.model.marked_keypoints]
         arrays |= {"tracks": tracks, "visible": visible, "selected": chosen}
     label = f"test clip {int(shown['clip'][row])}"
@@ -60,8 +61,10 @@ def _figure(result: Evaluation, row: int, config: Config) -> ClipFigure:
     if shown["success"].any():  # otherwise it may be unknown
         title += " (success)" if shown["success"][row] else " (failure)"
     if "rank" in shown:  # not in files of earlier versions
-        rank, score = _rank(int(shown["rank"][row]), int(result.metrics["clips"])), f"{shown['psnr'][row]:.1f} dB"
-        title, label = f"{title}, {rank}: {score}", f"{rank.split(' of ')[0]}, {score}"
+        rank = _rank(int(shown["rank"][row]), int(result.metrics["clips"]))
+        score = f"{shown['psnr'][row]:.1f} dB"
+        title = f"{title}, {rank}: {score}"
+        label = f"{rank.split(' of ')[0]}, {score}"
     unit = "metres" if shown.get("metric", shown["has_depth"])[row] else "relative"
     return ClipFigure(title=title, prompt_frames=config.prompt_frames, depth_unit=unit, label=label, **arrays)
 
@@ -76,7 +79,9 @@ def _rank(rank: int, clips: int) -> str:
 
 def _versions(run: Run) -> dict[str, str]:
     start = read_starts(run.directory)[-1]
-    machine, versions = start["machine"], start["packages"]  # may lack the simulator's packages
+    # may lack the simulator's packages
+    machine = start["machine"]
+    versions = start["packages"]
     return {name: versions[name] for name in LIBRARIES if name in versions} | {
         "python": machine["python"],
         "system": machine["system"],

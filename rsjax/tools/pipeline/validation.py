@@ -53,7 +53,8 @@ class WorldModelValidation:
         return Validation(loss["loss"], scalars, pictures)
 
     def _videos(self, step: int, weights: Params) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        cfg, clips = self.run.config, self._clips
+        cfg = self.run.config
+        clips = self._clips
         prompt = clips.video.frames(0, cfg.prompt_frames)
         made = self._model.generate(weights, self._assets, prompt, clips.actions, index=clips.index)
         scores = _watched(clips, made, cfg.prompt_frames)
@@ -95,7 +96,8 @@ class WorldModelValidation:
 
 def _watched(clips: Clips, made: Video, prompt_frames: int) -> dict[str, float]:
     """Computes the metrics whose ``watch`` is set."""
-    scores, scene = {}, Scene(clips.metric_video, made, prompt_frames)
+    scores = {}
+    scene = Scene(clips.metric_video, made, prompt_frames)
     for metric in metrics().values():
         if metric.watch and metric.function is not None:
             with suppress(Unavailable):
@@ -119,13 +121,15 @@ class TokenizerValidation:
         Raises:
             StoreError: the run's store is missing, or its test split has no readable clip.
         """
-        cfg, clips = self.run.config, self._clips
+        cfg = self.run.config
+        clips = self._clips
         autoencoder = create_autoencoder(cfg)
         codec = autoencoder.codec(autoencoder.tokenizer_params(weights), self._normalization)
         rgb = codec.decode(codec.encode(Video(clips.rgb)), np.zeros(len(clips.rgb), bool)).rgb
         shown = {number: [(clips.rgb[row], rgb[row])] for row, number in enumerate(clips.index)}
         of_rgb = _psnr(clips.rgb, rgb)
-        metric, scalars = -of_rgb, {"validation/psnr": of_rgb}
+        metric = -of_rgb
+        scalars = {"validation/psnr": of_rgb}
         if isinstance(codec, Codec) and clips.has_depth.any() and self._normalization.depth_range:
             true = clips.depth[clips.has_depth]
             colors = depth_to_color(true, *self._normalization.depth_range, cfg.tokenizer.depth_scale).astype(np.uint8)

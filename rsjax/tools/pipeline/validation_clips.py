@@ -43,7 +43,8 @@ def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
 
 def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
     """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
-    sim, needed = run.config.sim, protocol.prompt_frames + protocol.horizon
+    sim = run.config.sim
+    needed = protocol.prompt_frames + protocol.horizon
     if run.config.data.key:
         return store
     if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
@@ -67,7 +68,8 @@ def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
 
 def with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
     """Adds second takes of all clips, which are simulated if necessary."""
-    protocol, clips = held_out.protocol, held_out.clips
+    protocol = held_out.protocol
+    clips = held_out.clips
     if protocol.reference != "recorded":
         raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
 

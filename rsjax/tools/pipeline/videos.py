@@ -128,7 +128,8 @@ def _foreign_actions(request: Request, source: Source, config: Config) -> Float[
         raise UserError(f"{request.actions}: {instead}") from error
     if not isinstance(actions, np.ndarray):
         raise UserError(f"{request.actions}: an .npz archive of {len(actions.files)} arrays; save one of them as .npy")
-    width, shortest = config.clips.action_dim, config.prompt_frames + 1
+    width = config.clips.action_dim
+    shortest = config.prompt_frames + 1
     if actions.ndim != 2 or actions.shape[1] != width or len(actions) < shortest:
         fits = f"(T, {width}) with T at least {shortest}"
         raise UserError(f"{request.actions}: shape {actions.shape}; this model takes {fits}")

@@ -108,7 +108,8 @@ def make_store(what: Collection, out: Path, report: Report) -> None:
 
 
 def _simulate(config: SimConfig, partial: Path, todo: list[EpisodePlan], total: int, report: Report) -> None:
-    workers, done = min(config.workers or count_cores(), len(todo)), total - len(todo)
+    workers = min(config.workers or count_cores(), len(todo))
+    done = total - len(todo)
 
     def settle(plan: EpisodePlan, died: WorkerDied | None) -> None:
         nonlocal done
@@ -153,7 +154,8 @@ def _error_file(partial: Path, name: str) -> Path:
 
 def _pack(what: Collection, partial: Path, out: Path) -> None:
     """Writes the finished episodes as one store."""
-    failures, total = {path.stem: path.read_text() for path in sorted(partial.glob("*.error"))}, len(what.plans)
+    failures = {path.stem: path.read_text() for path in sorted(partial.glob("*.error"))}
+    total = len(what.plans)
     if len(failures) > MAX_FAILURES * total:
         shutil.rmtree(partial)
         raise CollectError(
@@ -164,7 +166,8 @@ def _pack(what: Collection, partial: Path, out: Path) -> None:
         split: [path for plan in plans if (path := _clip_file(partial, plan.name)).exists()]
         for split, plans in what.splits.items()
     }
-    source, config = source_name(what.config), to_dict(what.config)
+    source = source_name(what.config)
+    config = to_dict(what.config)
     meta = {"key": what.key, "source": source, "config": config, "quarantine": failures}
     meta |= _units(files["train"]) if "train" in files else {}
     meta |= _summary([path for paths in files.values() for path in paths]) | dict(what.meta)
@@ -190,18 +193,23 @@ def _units(train: list[Path]) -> dict[str, Any]:
 
     Frame 0 has no action.
     """
-    actions, depths = [], []
+    actions = []
+    depths = []
     for record in _clips(train):
         depths += [float(record["depth"].min()), float(record["depth"].max())]
         actions.append(record["actions"][1:])
     flat = np.concatenate(actions).astype(np.float64)
-    mean, std = flat.mean(0).tolist(), flat.std(0).tolist()
+    mean = flat.mean(0).tolist()
+    std = flat.std(0).tolist()
     return {"depth_range": [min(depths), max(depths)], "action_mean": mean, "action_std": std}
 
 
 def _summary(paths: list[Path]) -> dict[str, Any]:
     """Returns manifest fields: tasks, expert modes, and the shares of clips that end in success or ever succeed."""
-    modes, final, ever, tasks = Counter[str](), [], [], set[str]()
+    modes = Counter[str]()
+    final = []
+    ever = []
+    tasks = set[str]()
     for record in _clips(paths):
         tasks.add(record["task"])
         modes[record["provenance"]["expert"]["mode"]] += 1
