@@ -62,7 +62,7 @@ def check_files(settings: EvalConfig) -> None:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class EvaluationClips:
     """The clips of one split that a protocol scores.
 
     Attributes:
@@ -80,7 +80,7 @@ class HeldOut:
     retakes: Video | None = None
 
     @classmethod
-    def read(cls, store: Store, split: str, protocol: Protocol, shape: ClipShape) -> "HeldOut":
+    def read(cls, store: Store, split: str, protocol: Protocol, shape: ClipShape) -> "EvaluationClips":
         """Reads the clips.
 
         Args:
@@ -121,7 +121,7 @@ def evaluate(
     trained: TrainedModel,
     store: Store,
     protocol: Protocol | None = None,
-    held_out: HeldOut | None = None,
+    eval_clips: EvaluationClips | None = None,
     folder: Path | None = None,
     estimator: DepthEstimator | None = None,
 ) -> Evaluation:
@@ -130,7 +130,7 @@ def evaluate(
     Args:
         store: the clips of the run; the train split determines the range of uniform random actions.
         protocol: the protocol to evaluate by; None: that of the run's own configuration.
-        held_out: the clips to score; None: those of the store's test split.
+        eval_clips: the clips to score; None: those of the store's test split.
         folder: where generated batches are kept until the evaluation is finished; None: in memory.
         estimator: estimates depth from frames; None: no scores of estimated depth.
 
@@ -140,14 +140,14 @@ def evaluate(
     """
     settings = trained.config.eval
     check_files(settings)
-    if held_out is None:
-        held_out = HeldOut.read(store, "test", protocol or of_run(trained.config), trained.config.clips)
-    protocol = held_out.protocol
-    clips = held_out.clips
-    generation = plan(trained, store, held_out, folder)
+    if eval_clips is None:
+        eval_clips = EvaluationClips.read(store, "test", protocol or of_run(trained.config), trained.config.clips)
+    protocol = eval_clips.protocol
+    clips = eval_clips.clips
+    generation = plan(trained, store, eval_clips, folder)
     generation.make()
 
-    locate = locating(generation.trained, store, held_out.records, clips.rgb.shape[1] - 1)
+    locate = locating(generation.trained, store, eval_clips.records, clips.rgb.shape[1] - 1)
     predicted_tokens = teacher_forced(generation.trained, protocol, clips)
     repetitions: list[Scored] = []
     curves: list[Curves] = []
@@ -160,7 +160,7 @@ def evaluate(
             estimator,
             locate,
             predicted_tokens,
-            held_out.retakes,
+            eval_clips.retakes,
         )
         scored = score_all(scenes, protocol, trained.config.model.takes_actions)
         repetitions.append(with_best(scored, scenes[""], generation.samples(run), protocol))
@@ -172,7 +172,7 @@ def evaluate(
     per_clip = scored.per_clip()
     scores = summarised(scored)
     scores["clips"] = float(len(clips.rgb))
-    success_share = held_out.store.manifest.get("success_share")
+    success_share = eval_clips.store.manifest.get("success_share")
     if success_share is not None:
         scores["success_share"] = float(success_share)
     return Evaluation(
@@ -182,19 +182,19 @@ def evaluate(
         per_clip={name: values.tolist() for name, values in per_clip.items()},
         curves=mean_curves(curves),
         repetitions=[summarised(each, interval=False) for each in repetitions],
-        clips=held_out.ids(),
+        clips=eval_clips.ids(),
         kept=kept_frames(first, per_clip["psnr_repeat_first"]),
     )
 
 
-def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | None = None) -> Generation:
+def plan(trained: TrainedModel, store: Store, eval_clips: EvaluationClips, folder: Path | None = None) -> Generation:
     """Returns the generation of all videos of an evaluation; several processes can each make a share of them."""
     assets = trained.assets
     if assets.tokenizer is not None:
         assets = replace(assets, tokenizer=replicate(assets.tokenizer))
     trained = replace(trained, params=replicate(trained.params), assets=assets)
-    protocol = held_out.protocol
-    clips = held_out.clips
+    protocol = eval_clips.protocol
+    clips = eval_clips.clips
     draws = {OWN: clips.actions[None]}
     if protocol.action_draws and trained.config.model.takes_actions:
         draws |= _random_actions(clips.actions, protocol.action_draws, store)
@@ -207,7 +207,7 @@ def plan(trained: TrainedModel, store: Store, held_out: HeldOut, folder: Path | 
         protocol,
         clips,
         draws,
-        len(held_out.store.source(held_out.split)),
+        len(eval_clips.store.source(eval_clips.split)),
         lambda rows, video: sample_scores(truth[rows], video, protocol, trained.config.eval),
         folder,
     )

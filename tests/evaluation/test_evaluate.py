@@ -11,7 +11,7 @@ from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.evaluate import HeldOut, evaluate
+from rsjax.evaluation.evaluate import EvaluationClips, evaluate
 from rsjax.evaluation.generation import Batch, Generation, rolled_out
 from rsjax.evaluation.metrics.delta_psnr import other_clips
 from rsjax.evaluation.metrics.psnr import psnr as pixels
@@ -38,12 +38,12 @@ def result(trained: TrainedModel, clips: Store) -> Evaluation:
     return evaluate(trained, clips)
 
 
-def held_out() -> list[dict[str, np.ndarray]]:
+def eval_clips() -> list[dict[str, np.ndarray]]:
     return [vars(toy.clip(toy.TRAIN + i, toy.SUCCESS[i])) for i in range(toy.TEST)]
 
 
 PLACES = {"cube_error_widths", "gripper_error_widths", "lifted_accuracy"}
-TRUTH = {name: np.stack([clip[name] for clip in held_out()]) for name in ("rgb", "depth", "actions")}
+TRUTH = {name: np.stack([clip[name] for clip in eval_clips()]) for name in ("rgb", "depth", "actions")}
 
 
 def psnr(truth: np.ndarray, frames: np.ndarray) -> float:
@@ -159,9 +159,9 @@ def test_a_result_comes_back_as_it_was_saved_or_is_refused(result: Evaluation, t
 def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
     clips: Store, trained: TrainedModel, result: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held_out = HeldOut.read(clips, "test", of_run(trained.config), trained.config.clips)
+    eval_clips = EvaluationClips.read(clips, "test", of_run(trained.config), trained.config.clips)
     for process in range(2):  # two processes share the work; the second is killed over its last file
-        evaluation.plan(trained, clips, held_out, tmp_path).make(process, 2)
+        evaluation.plan(trained, clips, eval_clips, tmp_path).make(process, 2)
     files = sorted(tmp_path.iterdir())
     assert len(files) == 5 * 3  # own, 2 × other, 2 × uniform actions; 5 clips by 2
     files[4].write_bytes(files[4].read_bytes()[:-1])
@@ -174,7 +174,7 @@ def test_batches_on_disk_are_not_generated_again_and_damaged_ones_are(
     monkeypatch.setattr(Generation, "_generate", counted)
     monkeypatch.setattr("rsjax.evaluation.shown.KEPT_CLIPS", 2)
     # A second take that is the first one sets the limits 1, 1, 1 and 0.
-    again = evaluate(trained, clips, held_out=replace(held_out, retakes=held_out.clips.video), folder=tmp_path)
+    again = evaluate(trained, clips, eval_clips=replace(eval_clips, retakes=eval_clips.clips.video), folder=tmp_path)
     assert [batch.name for batch in made] == [files[4].name]
     score, own = "physics_iq_score", again.metrics
     assert ({k: v for k, v in own.items() if score not in k}, again.per_clip) == (result.metrics, result.per_clip)
@@ -192,17 +192,17 @@ def test_batches_for_other_devices_are_made_anew(
     clips: Store, trained: TrainedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     protocol = replace(of_run(trained.config), action_draws=0)
-    held_out, made = HeldOut.read(clips, "test", protocol, trained.config.clips), []
+    eval_clips, made = EvaluationClips.read(clips, "test", protocol, trained.config.clips), []
 
     def true_frames(self: Generation, batch: Batch) -> Record:
         made.append((batch.start, batch.clips))
         return {"rgb": self.clips.rgb[batch.start : batch.start + batch.clips], "depth": None}
 
     monkeypatch.setattr(Generation, "_generate", true_frames)
-    evaluation.plan(trained, clips, held_out, tmp_path).make(0, 2)  # stopped before the second of three batches
+    evaluation.plan(trained, clips, eval_clips, tmp_path).make(0, 2)  # stopped before the second of three batches
     monkeypatch.setattr(jax, "local_device_count", lambda: 4)
-    resumed = evaluation.plan(trained, clips, held_out, tmp_path).videos(0)["own"][0]
-    np.testing.assert_array_equal(resumed.rgb, held_out.clips.rgb)
+    resumed = evaluation.plan(trained, clips, eval_clips, tmp_path).videos(0)["own"][0]
+    np.testing.assert_array_equal(resumed.rgb, eval_clips.clips.rgb)
     assert made == [(0, 2), (4, 1), (0, 4)], "the last clip is a batch of both sizes"
 
 
@@ -215,8 +215,8 @@ def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: P
     assert first != second
     assert found.metrics["psnr"] == found.metrics["psnr_n1_pred_only"] == pytest.approx((first + second) / 2)
     assert "generates no videos under other actions" in found.reasons["delta_psnr"]
-    held_out = HeldOut.read(clips, "test", protocol, config.clips)
-    generation = evaluation.plan(trained, clips, held_out, tmp_path)  # reads what was generated
+    eval_clips = EvaluationClips.read(clips, "test", protocol, config.clips)
+    generation = evaluation.plan(trained, clips, eval_clips, tmp_path)  # reads what was generated
     best = []
     for run in range(2):
         own = np.asarray(pixels(TRUTH["rgb"], generation.videos(run)["own"][0].rgb)).mean(1)  # the prompt included
@@ -227,9 +227,9 @@ def test_repetitions_are_averaged_and_draw_differently(clips: Store, tmp_path: P
 
 def test_a_teacher_forced_frame_follows_true_frames(clips: Store, trained: TrainedModel) -> None:
     protocol = replace(of_run(trained.config), clips=2, teacher_forced=True, horizon=2, action_draws=0)
-    held_out = HeldOut.read(clips, "test", protocol, trained.config.clips)
-    made = evaluation.plan(trained, clips, held_out).videos(0)["own"][0]
-    rows, prompt = held_out.clips.index, trained.config.prompt_frames
+    eval_clips = EvaluationClips.read(clips, "test", protocol, trained.config.clips)
+    made = evaluation.plan(trained, clips, eval_clips).videos(0)["own"][0]
+    rows, prompt = eval_clips.clips.index, trained.config.prompt_frames
     whole = TRUTH["rgb"][rows], TRUTH["actions"][rows], TRUTH["depth"][rows]
     later = trained.generate(whole[0][:, : prompt + 1], whole[1][:, : prompt + 2], whole[2][:, : prompt + 1])
     np.testing.assert_array_equal(made.rgb[:, -1], later.rgb[:, -1])
@@ -256,10 +256,12 @@ def test_actions_into_recorded_frames_stay_the_clips_own(teacher_forced: bool) -
 def test_clips_that_are_too_short_or_small_are_refused(clips: Store, trained: TrainedModel) -> None:
     shape, long = trained.config.clips, find("horizon48", trained.config)
     with pytest.raises(UserError, match=f"predicts 48 frames after 1, so it takes clips of 49 .* have {shape.frames}"):
-        HeldOut.read(clips, "test", long, shape)
+        EvaluationClips.read(clips, "test", long, shape)
     with pytest.raises(UserError, match=f"scores frames of 99 pixels per side; .* have {shape.image_size}"):
-        HeldOut.read(clips, "test", replace(find("ivideogpt-bair", trained.config), horizon=1, resolution=99), shape)
+        EvaluationClips.read(
+            clips, "test", replace(find("ivideogpt-bair", trained.config), horizon=1, resolution=99), shape
+        )
     with pytest.raises(UserError, match="unknown protocol 'papr'; did you mean 'paper'"):
         find("papr", trained.config)
     with pytest.raises(StoreError, match="no split 'unseen'; it has train, test"):
-        HeldOut.read(clips, "unseen", of_run(trained.config), shape)
+        EvaluationClips.read(clips, "unseen", of_run(trained.config), shape)

@@ -16,7 +16,7 @@ from rsjax.config import Config, EvalConfig, content_key, to_dict
 from rsjax.data.clips import frame_rate
 from rsjax.data.store import Store, open_store
 from rsjax.evaluation import evaluate as evaluation
-from rsjax.evaluation.evaluate import HeldOut
+from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.metrics.physics_iq import THRESHOLD
 from rsjax.evaluation.protocols import Protocol, find, label, of_run
 from rsjax.evaluation.results import NAME, Evaluation, fingerprint, read_result, result_of, write_result
@@ -24,11 +24,11 @@ from rsjax.files import FileError, disk_guard, lock, safe_id
 from rsjax.models.load_run import load, load_config
 from rsjax.models.trained import TrainedModel
 from rsjax.progress import note
+from rsjax.tools.pipeline.evaluation_clips import chosen_splits, evaluation_store, with_second_takes
 from rsjax.tools.pipeline.metric_files import by_content, check_metric_files, load_estimator
 from rsjax.tools.pipeline.provenance import code_version, data_fingerprint, machine, training_settings
 from rsjax.tools.pipeline.run import RECIPE, Run
 from rsjax.tools.pipeline.run_clips import relocated
-from rsjax.tools.pipeline.validation_clips import chosen_splits, held_out_store, with_second_takes
 from rsjax.tools.pipeline.videos import resampled
 from rsjax.tools.sim import retakes
 from rsjax.training.distributed import barrier, is_lead, on_lead
@@ -84,12 +84,14 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
-    held_out = open_store(request.data) if request.data else held_out_store(run, store, protocol)
-    for split in chosen_splits(held_out, protocol.splits):
+    eval_clips = open_store(request.data) if request.data else evaluation_store(run, store, protocol)
+    for split in chosen_splits(eval_clips, protocol.splits):
         parts = [label(protocol, standard), *([split] if split != "test" else [])]
-        key = safe_id(str(held_out.manifest.get("key") or held_out.path.absolute()))  # a key may be unsafe as a path
+        key = safe_id(
+            str(eval_clips.manifest.get("key") or eval_clips.path.absolute())
+        )  # a key may be unsafe as a path
         name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
-        chosen = HeldOut.read(held_out, split, replace(protocol, splits=(split,)), config.clips)
+        chosen = EvaluationClips.read(eval_clips, split, replace(protocol, splits=(split,)), config.clips)
         if request.retakes:
             name = f"{name},second-takes"
             chosen = with_second_takes(chosen, config.sim.workers)
@@ -102,16 +104,18 @@ def evaluate_own(run: Run) -> Evaluation:
     """Evaluates a run by its own configuration, in its evaluation stage; only the lead process calls it."""
     trained = load(run.directory)
     store = run.open_clips()
-    held_out = HeldOut.read(store, "test", of_run(run.config), run.config.clips)
+    eval_clips = EvaluationClips.read(store, "test", of_run(run.config), run.config.clips)
     folder = run.directory / "evaluation"
-    return _evaluate(folder, held_out.protocol.name, _key(trained, store, held_out), trained, run, store, held_out)
+    return _evaluate(
+        folder, eval_clips.protocol.name, _key(trained, store, eval_clips), trained, run, store, eval_clips
+    )
 
 
 def evaluate_into(
-    folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut, overwrite: bool
+    folder: Path, name: str, trained: TrainedModel, run: Run, store: Store, eval_clips: EvaluationClips, overwrite: bool
 ) -> None:
     """Evaluates into a folder unless its result is up to date. Several processes share the work."""
-    key = _key(trained, store, held_out)
+    key = _key(trained, store, eval_clips)
     parts = _parts(folder, key)
     skipped = f"{folder}: up to date, skipped (--overwrite evaluates again)"
     alone = partial(lock, folder / ".lock", wait=f"{folder}: waiting for another process that evaluates here")
@@ -129,14 +133,14 @@ def evaluate_into(
         on_lead("old batches", clear)
     if jax.process_count() > 1:
         with disk_guard(parts):
-            plan = evaluation.plan(trained, store, held_out, parts)
+            plan = evaluation.plan(trained, store, eval_clips, parts)
             plan.make(jax.process_index(), jax.process_count())
         barrier("generation")
 
     def finish() -> None:
         with alone():
             if overwrite or _key_of(folder) != key:
-                _evaluate(folder, name, key, trained, run, store, held_out)
+                _evaluate(folder, name, key, trained, run, store, eval_clips)
             else:  # another process made it while this one waited
                 note(skipped)
                 shutil.rmtree(parts, ignore_errors=True)
@@ -145,7 +149,7 @@ def evaluate_into(
 
 
 def _evaluate(
-    folder: Path, name: str, key: str, trained: TrainedModel, run: Run, store: Store, held_out: HeldOut
+    folder: Path, name: str, key: str, trained: TrainedModel, run: Run, store: Store, eval_clips: EvaluationClips
 ) -> Evaluation:
     parts = _parts(folder, key)
     with disk_guard(folder):
@@ -153,25 +157,25 @@ def _evaluate(
             if old != parts:  # from an evaluation with other settings that never finished
                 shutil.rmtree(old, ignore_errors=True)
         estimator = load_estimator(trained.config.eval)
-        found = evaluation.evaluate(trained, store, held_out=held_out, folder=parts, estimator=estimator)
+        found = evaluation.evaluate(trained, store, eval_clips=eval_clips, folder=parts, estimator=estimator)
         about = {"label": name, "key": key, "code": code_version(Path(rsjax.__file__).resolve().parents[1])}
-        about |= _described(trained, run, store, held_out)
+        about |= _described(trained, run, store, eval_clips)
         write_result(folder, result_of(found, **about), found.kept)
         shutil.rmtree(parts, ignore_errors=True)
     return found
 
 
-def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut) -> dict[str, Any]:
+def _described(trained: TrainedModel, run: Run, store: Store, eval_clips: EvaluationClips) -> dict[str, Any]:
     """Returns the entries of ``result.json`` on protocol, sampling, data, model and machine."""
     config = trained.config
-    frames, size = held_out.clips.rgb.shape[1:3]
-    rate = frame_rate(held_out.records[0], held_out.store.manifest)
-    data = {name: value for name, value in data_fingerprint(held_out.store.path).items() if name != "splits"}
+    frames, size = eval_clips.clips.rgb.shape[1:3]
+    rate = frame_rate(eval_clips.records[0], eval_clips.store.manifest)
+    data = {name: value for name, value in data_fingerprint(eval_clips.store.path).items() if name != "splits"}
     return {
-        "protocol": held_out.protocol.described(),
+        "protocol": eval_clips.protocol.described(),
         "sampling": _sample_settings(config),
-        "settings": _settings(config.eval) | _take_settings(held_out),
-        "data": data | {"split": held_out.split, "frames": frames, "image_size": size, "fps": rate},
+        "settings": _settings(config.eval) | _take_settings(eval_clips),
+        "data": data | {"split": eval_clips.split, "frames": frames, "image_size": size, "fps": rate},
         "model": {
             "run": str(run.directory),
             "preset": config.name,
@@ -187,13 +191,13 @@ def _described(trained: TrainedModel, run: Run, store: Store, held_out: HeldOut)
     }
 
 
-def _key(trained: TrainedModel, store: Store, held_out: HeldOut) -> str:
+def _key(trained: TrainedModel, store: Store, eval_clips: EvaluationClips) -> str:
     """Returns a hash of everything that determines the scores, except the code."""
     data = [
-        (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, held_out.store)
+        (each.manifest.get("key"), data_fingerprint(each.path)["manifest_sha256"]) for each in (store, eval_clips.store)
     ]
-    protocol = json.dumps([held_out.protocol.described(), _sample_settings(trained.config), data, held_out.split])
-    takes = [] if held_out.retakes is None else [json.dumps([retakes.RECIPE, retakes.JITTER])]
+    protocol = json.dumps([eval_clips.protocol.described(), _sample_settings(trained.config), data, eval_clips.split])
+    takes = [] if eval_clips.retakes is None else [json.dumps([retakes.RECIPE, retakes.JITTER])]
     return content_key(RECIPE, "evaluation", protocol, _weights(trained), by_content(trained.config.eval), *takes)
 
 
@@ -218,8 +222,8 @@ def _settings(settings: EvalConfig) -> dict[str, Any]:
     return values | {"physics_iq_threshold": THRESHOLD}
 
 
-def _take_settings(held_out: HeldOut) -> dict[str, Any]:
-    return {} if held_out.retakes is None else {"second_take_jitter": retakes.JITTER}
+def _take_settings(eval_clips: EvaluationClips) -> dict[str, Any]:
+    return {} if eval_clips.retakes is None else {"second_take_jitter": retakes.JITTER}
 
 
 def _sample_settings(config: Config) -> dict[str, Any]:

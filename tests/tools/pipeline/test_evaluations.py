@@ -17,19 +17,19 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator
-from rsjax.evaluation.evaluate import HeldOut
+from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import Evaluation, read_frames, read_result
 from rsjax.files import write_json
 from rsjax.models.trained import TrainedModel
 from rsjax.runtime import HUGE_PAGES
 from rsjax.tokenizers.magvit2 import Tokenizer
+from rsjax.tools.pipeline import evaluation_clips as eval_clips
 from rsjax.tools.pipeline import evaluations
-from rsjax.tools.pipeline import validation_clips as held_out
+from rsjax.tools.pipeline.evaluation_clips import evaluation_store, longer_episodes
 from rsjax.tools.pipeline.evaluations import Request, evaluate_own, evaluate_run
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.pipeline.run_clips import on_store
-from rsjax.tools.pipeline.validation_clips import held_out_store, longer_episodes
 from rsjax.tools.sim import retakes
 from rsjax.training.checkpoint import save_weights
 from tests.tools.pipeline import toy
@@ -45,19 +45,19 @@ def scored(
     store: Store,
     protocol: Protocol | None = None,
     *,
-    held_out: HeldOut,
+    eval_clips: EvaluationClips,
     folder: Path,
     estimator: DepthEstimator | None = None,
 ) -> Evaluation:
     """Stands for an evaluation, whose scores other tests look at: PSNR rises by 1 dB from clip to clip."""
     MADE.append(folder)
     folder.mkdir(parents=True)
-    rgb = held_out.clips.rgb
+    rgb = eval_clips.clips.rgb
     per_clip = {f"psnr{suffix}": [20.0 + i for i in range(len(rgb))] for suffix in ("", "_repeat_first", "_tokenizer")}
     metrics = {name: float(np.mean(values)) for name, values in per_clip.items()}
     kept = {"rows": np.arange(len(rgb)), "truth": rgb, "prediction": rgb, "reconstruction": rgb}
-    shown = {"clip": held_out.clips.index}
-    return Evaluation(metrics, {"lpips_alex": "no weights"}, shown, per_clip, {}, [metrics], held_out.ids(), kept)
+    shown = {"clip": eval_clips.clips.index}
+    return Evaluation(metrics, {"lpips_alex": "no weights"}, shown, per_clip, {}, [metrics], eval_clips.ids(), kept)
 
 
 @pytest.fixture(scope="module")
@@ -233,10 +233,10 @@ def test_second_takes_are_a_result_of_their_own(run: Run, folder: Path, monkeypa
     whole = [{"rgb": np.full((FRAMES + 2, 8, 8, 3), i, np.uint8)} for i in range(toy.TEST)]
     monkeypatch.setattr(retakes, "collect_second_takes", lambda clips, split, numbers, *_: [whole[i] for i in numbers])
 
-    def evaluate(*inputs: Any, held_out: HeldOut, **more: Any) -> Evaluation:
-        assert held_out.retakes is not None
-        takes.append(held_out.retakes.rgb)
-        return scored(*inputs, held_out=held_out, **more)
+    def evaluate(*inputs: Any, eval_clips: EvaluationClips, **more: Any) -> Evaluation:
+        assert eval_clips.retakes is not None
+        takes.append(eval_clips.retakes.rgb)
+        return scored(*inputs, eval_clips=eval_clips, **more)
 
     monkeypatch.setattr(evaluation, "evaluate", evaluate)
     (with_takes,) = evaluate_run(run.directory, run.data_directory, Request("paper", CHANGES, retakes=True))
@@ -316,10 +316,10 @@ def test_only_splits_that_there_can_be_are_simulated(
     run: Run, splits: tuple[str, ...], frames: int, simulated: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulating = replace(run, config=toy.config())
-    monkeypatch.setattr(held_out, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
+    monkeypatch.setattr(eval_clips, "_simulated", lambda what, make: "unseen" if "never seen" in what else "longer")
     protocol = replace(find("paper", run.config), splits=splits, horizon=frames - 1)
     store = run.open_clips()
-    assert held_out_store(simulating, store, protocol) == (simulated or store)
+    assert evaluation_store(simulating, store, protocol) == (simulated or store)
 
 
 def test_longer_episodes_are_none_of_the_runs_own() -> None:

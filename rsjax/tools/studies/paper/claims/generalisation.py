@@ -5,14 +5,14 @@ from dataclasses import replace
 
 from rsjax.config import Config
 from rsjax.data.store import Store, open_store
-from rsjax.evaluation.evaluate import HeldOut, evaluate
+from rsjax.evaluation.evaluate import EvaluationClips, evaluate
 from rsjax.evaluation.protocols import PROTOCOLS
 from rsjax.evaluation.registry import Unavailable
 from rsjax.models.load_run import load
 from rsjax.progress import Progress
+from rsjax.tools.pipeline.evaluation_clips import longer_episodes
 from rsjax.tools.pipeline.metric_files import load_estimator
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.pipeline.validation_clips import longer_episodes
 from rsjax.tools.sim.collect import collect, collection_key
 from rsjax.tools.sim.unseen import collect_unseen, unseen_splits
 from rsjax.tools.studies.compare.published import published_by_metric
@@ -27,10 +27,10 @@ HORIZON = PROTOCOLS["horizon48"].horizon
 def _by_protocol(run: Run, name: str, store: Store, split: str, draws: int) -> Scores:
     """Evaluates a run on as many clips of a store as its own evaluation has, and returns the scores per clip."""
     protocol = replace(PROTOCOLS[name], clips=run.config.eval.clips, action_draws=draws, splits=(split,))
-    held_out = HeldOut.read(store, split, protocol, run.config.clips)
+    eval_clips = EvaluationClips.read(store, split, protocol, run.config.clips)
     parts = run.directory / FOLDER / f"{name}-{split}"
     estimator = load_estimator(run.config.eval)
-    result = evaluate(load(run.directory), run.open_clips(), held_out=held_out, folder=parts, estimator=estimator)
+    result = evaluate(load(run.directory), run.open_clips(), eval_clips=eval_clips, folder=parts, estimator=estimator)
     shutil.rmtree(parts, ignore_errors=True)
     return result.per_clip
 

@@ -12,7 +12,7 @@ from rsjax.config import SimConfig
 from rsjax.data.codec import Record
 from rsjax.data.store import Store, StoreError, open_store
 from rsjax.errors import UserError
-from rsjax.evaluation.evaluate import HeldOut
+from rsjax.evaluation.evaluate import EvaluationClips
 from rsjax.evaluation.protocols import Protocol
 from rsjax.progress import Progress
 from rsjax.tools.pipeline.run import Run
@@ -41,7 +41,7 @@ def _lacking(splits: Collection[str], wanted: tuple[str, ...]) -> list[str]:
     return [pattern for pattern in wanted if not any(fnmatchcase(split, pattern) for split in splits)]
 
 
-def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
+def evaluation_store(run: Run, store: Store, protocol: Protocol) -> Store:
     """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
     sim = run.config.sim
     needed = protocol.prompt_frames + protocol.horizon
@@ -66,18 +66,18 @@ def held_out_store(run: Run, store: Store, protocol: Protocol) -> Store:
     return _simulated(f"{protocol.clips} episodes of {needed} frames; the run's have {sim.frames}", make)
 
 
-def with_second_takes(held_out: HeldOut, workers: int) -> HeldOut:
+def with_second_takes(eval_clips: EvaluationClips, workers: int) -> EvaluationClips:
     """Adds second takes of all clips, which are simulated if necessary."""
-    protocol = held_out.protocol
-    clips = held_out.clips
+    protocol = eval_clips.protocol
+    clips = eval_clips.clips
     if protocol.reference != "recorded":
         raise UserError(f"protocol {protocol.name} compares with reconstructions, of which there is no second take")
 
     def make(report: Report) -> list[Record]:
-        return retakes.collect_second_takes(held_out.store, held_out.split, clips.index.tolist(), workers, report)
+        return retakes.collect_second_takes(eval_clips.store, eval_clips.split, clips.index.tolist(), workers, report)
 
     takes = _simulated(f"second takes of {len(clips.rgb)} clips", make)
-    return replace(held_out, retakes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
+    return replace(eval_clips, retakes=Video(np.stack([take["rgb"][: clips.rgb.shape[1]] for take in takes])))
 
 
 def _simulated(what: str, make: Callable[[Report], T]) -> T:
