@@ -5,14 +5,12 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from rsjax.tools.play import keep, shown
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.frames import Place
+from rsjax.tools.play import keep
 from rsjax.tools.play.link import Saved, read_state, state_of
-from rsjax.tools.play.messages import MOST_ID, choice, kinds, number, whole, words
-from rsjax.tools.play.pictures import read_picture
-from rsjax.tools.play.settings import MOST_SEED
-from rsjax.tools.play.viewer import Viewer
+from rsjax.tools.play.messages import MOST_ID, Refused, choice, kinds, number, whole, words
+from rsjax.tools.play.pictures import Place, read_picture
+from rsjax.tools.play.session import MOST_SEED
+from rsjax.tools.play.viewer import KINDS, Viewer
 
 Message = dict[str, Any]
 Answer = Callable[[Viewer, Message], Awaitable[Message]]
@@ -92,7 +90,7 @@ async def _settings(viewer: Viewer, message: Message) -> Message:
 
 @answers("watch")
 async def _watch(viewer: Viewer, message: Message) -> Message:
-    viewer.session.watched = kinds(message, shown.KINDS)
+    viewer.session.watched = kinds(message, KINDS)
     if not {"truth", "truth_depth"} & set(viewer.session.watched):
         viewer.rest()
     return {"type": "ok"}
@@ -140,7 +138,7 @@ async def _drop(viewer: Viewer, message: Message) -> Message:
 @answers("frames")
 async def _frames(viewer: Viewer, message: Message) -> Message:
     branch = whole(message, "branch", 0, MOST_NUMBER)
-    chosen = kinds(message, ("rgb", *shown.KINDS))
+    chosen = kinds(message, ("rgb", *KINDS))
     first = whole(message, "first", 0, MOST_SEED)
     count = whole(message, "count", 1, MOST_FRAMES)
     nodes = viewer.session.grown.branch(branch).nodes

@@ -11,10 +11,9 @@ from starlette.types import Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rsjax.tools.play.answers import answer, refusal, upload
-from rsjax.tools.play.errors import Refused
 from rsjax.tools.play.hub import IN_FLIGHT, Hub, Seat
-from rsjax.tools.play.messages import UPLOAD_BYTES, parse
-from rsjax.tools.play.send_queue import Outbox
+from rsjax.tools.play.messages import UPLOAD_BYTES, Refused, parse
+from rsjax.tools.play.send_queue import SendQueue
 from rsjax.tools.play.viewer import Viewer
 
 # messages per second, and at once
@@ -48,7 +47,7 @@ class Connection:
     def __init__(self, socket: WebSocket, hub: Hub) -> None:
         self._socket = socket
         self._hub = hub
-        self._outbox = Outbox()
+        self._queue = SendQueue()
         self._todo: asyncio.Queue[dict[str, Any] | bytes] = asyncio.Queue(QUEUE)
         self._steps = self._strikes = 0
         self._over: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
@@ -63,10 +62,10 @@ class Connection:
         session = seat.viewer.session
         tasks: list[asyncio.Task[None]] = []
         try:
-            session.out = self._outbox
-            self._outbox.put(self._hub.welcome(seat, returned))
+            session.out = self._queue
+            self._queue.put(self._hub.welcome(seat, returned))
             if session.tree is not None:
-                self._outbox.put({"type": "session", "id": 0} | seat.viewer.describe())
+                self._queue.put({"type": "session", "id": 0} | seat.viewer.describe())
             tasks += [asyncio.create_task(work) for work in (self._read(seat), self._work(seat.viewer), self._send())]
             code, reason = await self._over
         finally:
@@ -95,7 +94,7 @@ class Connection:
                         raise Refused("too_fast", "too many messages a second")
                     self._take(raw)
                 except Refused as error:
-                    self._outbox.put(refusal(error_id(raw.get("text")), error))
+                    self._queue.put(refusal(error_id(raw.get("text")), error))
                     self._strikes += error.code in ("too_fast", "too_large", "bad_message")
                 if self._strikes >= STRIKES:
                     self.end(1008, "too many messages, or messages without sense")
@@ -141,13 +140,13 @@ class Connection:
             if isinstance(item, dict) and item["type"] == "step":
                 self._steps -= 1
             self._strikes += made.get("error") == "bad_message"
-            self._outbox.put(made)
+            self._queue.put(made)
             if self._strikes >= STRIKES:
                 self.end(1008, "too many messages without sense")
 
     async def _send(self) -> None:
         try:
-            while (item := await self._outbox.next()) is not None:
+            while (item := await self._queue.next()) is not None:
                 if isinstance(item, bytes):
                     await self._socket.send_bytes(item)
                 else:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from rsjax.config import Config
 from rsjax.data.normalization import Normalization
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
 from rsjax.tools.policies.worlds.actions import action_range
 from rsjax.tools.sim.lift import STEP, TURN
 

@@ -7,15 +7,14 @@ from typing import Any
 
 from rsjax.tools.play import messages
 from rsjax.tools.play.engine import Engine
-from rsjax.tools.play.errors import Refused
 from rsjax.tools.play.keep import Files
-from rsjax.tools.play.memory import Memories
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.messages import Refused
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.session import Session
-from rsjax.tools.play.shown import Side
 from rsjax.tools.play.sources import reasons
+from rsjax.tools.play.tree import Memories
 from rsjax.tools.play.truth import Truths
-from rsjax.tools.play.viewer import Viewer
+from rsjax.tools.play.viewer import Side, Viewer
 
 VERSION = 1  # of the protocol
 IN_FLIGHT = 4  # unanswered steps of a session, at most

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 
 from rsjax.data.build import write_clips
 from rsjax.errors import UserError, first_line, storage_limit
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
 from rsjax.tools.play.session import Session
 from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.policies.demos import controls_of

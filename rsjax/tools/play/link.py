@@ -14,11 +14,9 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from rsjax.models.branch_states import Decoding
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.messages import TEXT_BYTES, whole
+from rsjax.tools.play.messages import TEXT_BYTES, Refused, whole
 from rsjax.tools.play.pictures import Upload, read_picture
-from rsjax.tools.play.session import MOST_BRANCHES, Session, Start
-from rsjax.tools.play.settings import MOST_SEED, Settings
+from rsjax.tools.play.session import MOST_BRANCHES, MOST_SEED, Session, Settings, Start
 from rsjax.tools.play.tree import Branch
 
 VERSION = 1

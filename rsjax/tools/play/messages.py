@@ -5,7 +5,20 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rsjax.tools.play.errors import Refused
+
+class Refused(Exception):
+    """A message of a page cannot be done; the session continues.
+
+    Attributes:
+        code: a short word for the page, one of those in docs/play_protocol.md.
+        message: one plain line for the person.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+        self.message = message
+
 
 TEXT_BYTES = 256 * 2**10
 UPLOAD_BYTES = 8 * 2**20

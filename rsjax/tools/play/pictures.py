@@ -1,19 +1,26 @@
-"""Makes a first frame from an uploaded picture."""
+"""The pictures of the protocol: those that a page uploads as first frames, and those that it is sent."""
 
 import io
+import struct
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 from PIL import Image, ImageOps
 
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
 
 FORMATS = ("PNG", "JPEG", "WEBP")
 MOST_SIDE = 4096  # pixels
 LEAST_SIDE = 8
+HEADER = struct.Struct("<BBHIIBBHHHf")  # version, kind, branch, frame, id, format, 0, width, height, 0, scale
+VERSION = 1
+RAW = 0
+WEBP = 2
+KINDS = {"rgb": 1, "depth": 2, "truth": 3, "truth_depth": 4, "uncertainty": 5}
+LOSSLESS = 128  # pixels per side, up to which pictures are sent without loss
 
 
 @dataclass(frozen=True)
@@ -75,3 +82,42 @@ def _check_size(width: int, height: int) -> None:
     if max(width, height) > MOST_SIDE or min(width, height) < LEAST_SIDE:
         sides = f"{LEAST_SIDE} to {MOST_SIDE} pixels a side"
         raise Refused("bad_image", f"the picture has {width} × {height} pixels; it can have {sides}")
+
+
+class Place(NamedTuple):
+    """The frame that a picture shows, and the id of the message that it answers (0: none)."""
+
+    branch: int
+    frame: int
+    id: int
+
+
+def picture(kind: str, place: Place, rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """Returns the message with an RGB picture as WebP, lossless if it is small."""
+    return _message(kind, place, WEBP, rgb.shape, webp(rgb), 0.0)
+
+
+def depth_picture(kind: str, place: Place, depth: Float32[np.ndarray, "H W"], near: float, far: float) -> bytes:
+    """Returns the message with a depth map as a grey picture: 0 is ``near``, 255 is ``far``, linear in metres."""
+    share = np.clip((np.nan_to_num(depth, nan=far) - near) / (far - near), 0, 1)
+    grey = np.round(255 * share).astype(np.uint8)
+    return _message(kind, place, WEBP, grey.shape, webp(np.repeat(grey[..., None], 3, -1)), far)
+
+
+def uncertainty(place: Place, entropy: Float[np.ndarray, " S"], bits: int) -> bytes:
+    """Returns the message with tokens' entropies (nats) as bytes: 255 means ``bits``, the maximum for a token."""
+    side = int(np.sqrt(len(entropy)))
+    share = np.clip(entropy / np.log(2) / bits, 0, 1)
+    return _message("uncertainty", place, RAW, (side, side), np.round(255 * share).astype(np.uint8).tobytes(), bits)
+
+
+def webp(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """Returns a picture as WebP, lossless if it is small."""
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, "WEBP", lossless=len(rgb) <= LOSSLESS, quality=80, method=0)
+    return buffer.getvalue()
+
+
+def _message(kind: str, place: Place, form: int, shape: tuple[int, ...], payload: bytes, scale: float) -> bytes:
+    numbers = (VERSION, KINDS[kind], place.branch, place.frame, place.id, form, 0, shape[1], shape[0], 0, scale)
+    return HEADER.pack(*numbers) + payload

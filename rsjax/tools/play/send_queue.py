@@ -8,8 +8,8 @@ UNSENT = 32  # unsent messages from which on droppable messages are dropped
 MOST = 256  # unsent messages at which a page counts as too slow to be served
 
 
-class Outbox:
-    """A queue of messages, from any coroutine to the one that sends them."""
+class SendQueue:
+    """A queue of messages, from any coroutine to the one that sends them; a session and its connection share it."""
 
     def __init__(self) -> None:
         self._items: deque[bytes | dict[str, Any]] = deque()

@@ -18,13 +18,12 @@ from rsjax.config.fields import require, require_range
 from rsjax.errors import UserError
 from rsjax.progress import note
 from rsjax.tools.play.engine import Engine, warm_up
-from rsjax.tools.play.errors import Refused
 from rsjax.tools.play.guard import Guard, is_loopback
 from rsjax.tools.play.hub import Hub
-from rsjax.tools.play.messages import UPLOAD_BYTES
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.messages import UPLOAD_BYTES, Refused
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.server import make_app
-from rsjax.tools.play.settings import first_settings
+from rsjax.tools.play.session import first_settings
 from rsjax.tools.play.sources import check_policy
 from rsjax.tools.policies.policy import load_policy
 from rsjax.tools.policies.run_data import RunData

@@ -14,11 +14,11 @@ from starlette.types import ASGIApp as App
 from starlette.websockets import WebSocket
 
 from rsjax.tools.play.connection import Connection
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.frames import webp
 from rsjax.tools.play.guard import Guard, Guarded
 from rsjax.tools.play.hub import Hub
 from rsjax.tools.play.keep import TYPES as FILE_TYPES
+from rsjax.tools.play.messages import Refused
+from rsjax.tools.play.pictures import webp
 
 PAGE = Path(__file__).parent / "page"
 PLAYER = Path(__file__).parents[1] / "studies" / "report" / "player"  # shared with the report, at page/player

@@ -3,33 +3,84 @@
 import asyncio
 import secrets
 import time
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
 from rsjax.clip import Video
+from rsjax.config import Config
 from rsjax.data.codec import Record
 from rsjax.models.branch_states import Decoding, Moment
 from rsjax.tools.play.engine import Engine, Work
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.memory import Memories
+from rsjax.tools.play.messages import Refused, number, whole
 from rsjax.tools.play.pictures import Upload
-from rsjax.tools.play.run_data import PlayRun
-from rsjax.tools.play.settings import MOST_SEED, first_settings, settings_limits
-from rsjax.tools.play.tree import Branch, Node, Tree
+from rsjax.tools.play.play_run import PlayRun
+from rsjax.tools.play.send_queue import SendQueue
+from rsjax.tools.play.tree import Branch, Memories, Node, Tree
 
+MOST_STEPS = 16
+MOST_TEMPERATURE = 4.0
+MOST_GUIDANCE = 8.0
+MOST_SEED = 2**31 - 1
 MOST_BRANCHES = 32
 MOST_FRAMES = 4096
 FRAME_BYTES = 256 * 2**20  # of a session's pictures; for large pictures this lowers the number of frames
 
 
-class Outbox(Protocol):
-    """The destination of a session's messages."""
+@dataclass(frozen=True)
+class Settings:
+    """Settings that a page can change: those of :class:`rsjax.config.SampleConfig`."""
 
-    def put(self, item: bytes | dict[str, Any], droppable: bool = False) -> None: ...
-    async def room(self) -> None: ...
+    temperature: float
+    steps: int
+    guidance: float
+    top_k: int
+
+    def describe(self) -> dict[str, Any]:
+        """Returns the settings for a page."""
+        return asdict(self)
+
+    def decoding(self, seed: int, draw: int) -> Decoding:
+        """Returns how the next frame is decoded."""
+        return Decoding(self.steps, self.temperature, self.guidance, self.top_k, seed, draw)
+
+    def changed(self, message: dict[str, Any], limits: dict[str, Any]) -> "Settings":
+        """Returns the settings with the fields that a message changes.
+
+        Raises:
+            Refused: a field is outside the run's limits.
+        """
+        try:
+            low, high = limits["guidance"]
+            return replace(
+                self,
+                temperature=number(message, "temperature", 0, MOST_TEMPERATURE, self.temperature),
+                steps=whole(message, "steps", 1, limits["steps"], self.steps),
+                guidance=number(message, "guidance", low, high, self.guidance),
+                top_k=whole(message, "top_k", 0, limits["top_k"], self.top_k),
+            )
+        except Refused as error:
+            raise Refused("bad_settings", error.message) from error
+
+
+def first_settings(config: Config) -> Settings:
+    """Returns the run's own settings."""
+    sample: Any = config.model.sample  # type: ignore[attr-defined]  # every family that branches has it
+    return Settings(float(sample.temperature), sample.steps, float(sample.guidance), sample.top_k)
+
+
+def settings_limits(config: Config) -> dict[str, Any]:
+    """Returns the limits of a run's settings."""
+    dropout = getattr(config.model, "action_dropout", 0.0)
+    codes = 2 ** (config.tokenizer.code_bits // config.tokenizer.vocabularies)
+    cells = config.grid**2
+    return {
+        "steps": max(min(MOST_STEPS, cells), first_settings(config).steps),
+        "guidance": [0.0, MOST_GUIDANCE] if dropout else [1.0, 1.0],
+        "top_k": codes,
+    }
 
 
 @dataclass(frozen=True)
@@ -74,7 +125,7 @@ class Session:
         self.used = time.monotonic()
         self.run = run
         self.engine = engine
-        self.out: Outbox | None = None
+        self.out: SendQueue | None = None
         self.watched: list[str] = []
         self.settings = first_settings(run.data.config)
         self.seed = 0

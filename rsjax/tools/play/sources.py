@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from rsjax.errors import UserError
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.messages import choice, whole
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.messages import Refused, choice, whole
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.session import Session
 from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.policies.judges.judge_training import FOLDER

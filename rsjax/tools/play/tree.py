@@ -1,5 +1,7 @@
-"""A tree of frames: branches that share their beginnings."""
+"""A tree of frames, branches that share their beginnings, and a bound on the memory that all frames keep."""
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,7 +9,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from rsjax.models.branch_states import Decoding, Moment
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
+
+BYTES = 2**30  # of memory that the frames of all sessions keep
 
 
 @dataclass(eq=False)
@@ -107,3 +111,33 @@ class Tree:
             raise Refused("no_branch", f"branch {number} cannot go: others fork from it, or it is the first")
         self.frames -= len(branch.nodes) - 1 - int(branch.fork or 0)
         del self.branches[number]
+
+
+class Memories:
+    """The frames with a large memory; when there is too much, the oldest frames lose theirs.
+
+    Args:
+        least: frames that keep their memory whatever its size: as many as there are sessions.
+        most: bytes of memory that all frames together may keep.
+    """
+
+    def __init__(self, least: int, most: int = BYTES) -> None:
+        self._least = least
+        self._most = most
+        self._bytes = 0
+        self._nodes: OrderedDict[int, tuple[Node, int, Callable[[Moment], Moment]]] = OrderedDict()
+
+    def note(self, node: Node, lighten: Callable[[Moment], Moment]) -> None:
+        """Notes that a frame has a large memory, and how to remove it."""
+        self._nodes[id(node)] = node, node.moment.size, lighten
+        self._bytes += node.moment.size
+        while self._bytes > self._most and len(self._nodes) > self._least:
+            oldest, _, lighter = next(iter(self._nodes.values()))
+            self.forget(oldest)
+            oldest.moment = lighter(oldest.moment)
+
+    def forget(self, node: Node) -> None:
+        """Notes that a frame no longer has a large memory."""
+        found = self._nodes.pop(id(node), None)
+        if found is not None:
+            self._bytes -= found[1]

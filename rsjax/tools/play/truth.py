@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from rsjax.config import SimConfig
 from rsjax.errors import first_line
 from rsjax.processes import Helper, WorkerDied
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
 from rsjax.tools.play.simulate import Job, Rendered, Simulate, simulate
 from rsjax.tools.play.tree import Node, Truth
 from rsjax.tools.sim.episode import clip_seed

@@ -1,23 +1,99 @@
-"""A session together with what its page sees."""
+"""A session together with what its page sees: frames, depth, uncertainty, the simulator's frames, keypoints."""
 
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from rsjax.data.codec import Record
-from rsjax.tools.play import shown
-from rsjax.tools.play.errors import Refused
-from rsjax.tools.play.frames import Place
+from rsjax.tools.play import pictures
 from rsjax.tools.play.keep import Files
+from rsjax.tools.play.messages import Refused
+from rsjax.tools.play.pictures import Place
+from rsjax.tools.play.points import points_of
 from rsjax.tools.play.session import Session
-from rsjax.tools.play.shown import BACKLOG, Side
 from rsjax.tools.play.sources import Sources
 from rsjax.tools.play.tree import Branch, Node
 from rsjax.tools.play.truth import Follower, Truths
 
+KINDS = ("depth", "uncertainty", "truth", "truth_depth", "points")
+BACKLOG = 8  # frames whose depth may wait; beyond that, new frames get no depth, but a page may ask for it later
 _TRUTHS = {"truth", "truth_depth"}
+
+
+@dataclass
+class Side:
+    """The thread for work that an action's frame does not wait for."""
+
+    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "play-side"))
+    waiting: int = 0
+
+    async def run(self, work: Any, *inputs: Any) -> Any:
+        """Runs a function in the thread."""
+        self.waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self.pool, work, *inputs)
+        finally:
+            self.waiting -= 1
+
+
+def send_rgb(session: Session, place: Place, node: Node) -> None:
+    """Sends a frame's picture."""
+    session.send(pictures.picture("rgb", place, node.moment.rgb))
+
+
+def send_uncertainty(session: Session, place: Place, node: Node) -> None:
+    """Sends the entropy of a frame's tokens; a first frame has none."""
+    if node.moment.entropy is not None:
+        session.send(pictures.uncertainty(place, node.moment.entropy, session.run.bits), droppable=True)
+
+
+async def send_depth(session: Session, side: Side, place: Place, node: Node) -> None:
+    """Decodes and sends a frame's depth."""
+    message = await side.run(_depth_message, session, place, node)
+    if message is not None:
+        session.send(message, droppable=True)
+
+
+def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
+    depth = session.engine.branching(session.has_depth).depth(node.moment)
+    near_far = session.run.trained.assets.normalization.depth_range
+    if depth is None or near_far is None:
+        return None
+    return pictures.depth_picture("depth", place, depth, *near_far)
+
+
+def send_truth(session: Session, place: Place, node: Node, kinds: list[str], mean: float | None) -> None:
+    """Sends the simulator's frame, if there is one, and the PSNR of the model's frame."""
+    truth = node.truth
+    if truth is None:
+        return
+    if "truth" in kinds:
+        session.send(pictures.picture("truth", place, truth.rgb), droppable=True)
+    near_far = session.run.trained.assets.normalization.depth_range
+    if "truth_depth" in kinds and near_far is not None:
+        session.send(pictures.depth_picture("truth_depth", place, truth.depth, *near_far), droppable=True)
+    facts = {"psnr": truth.psnr, "psnr_mean": mean, "success": truth.success}
+    session.send({"type": "truth", "id": place.id, "branch": place.branch, "frame": place.frame} | facts)
+
+
+async def send_points(session: Session, side: Side, place: Place, nodes: list[Node], pane: str) -> None:
+    """Finds and sends the keypoints of the last of these frames of a branch."""
+    points = await side.run(points_of, session, nodes, pane)
+    rounded = [[round(float(x), 4), round(float(y), 4), int(seen)] for x, y, seen in points]
+    facts = {"branch": place.branch, "frame": place.frame, "pane": pane, "points": rounded}
+    session.send({"type": "points", "id": place.id} | facts, droppable=True)
+
+
+def mean_psnr(nodes: list[Node]) -> float | None:
+    """Returns the mean PSNR over the frames after the first that have one; None if none has."""
+    known = [node.truth.psnr for node in nodes[1:] if node.truth is not None and node.truth.psnr is not None]
+    if known:
+        return float(np.mean(known))
+    return None
 
 
 class Viewer:
@@ -82,13 +158,13 @@ class Viewer:
         nodes = session.grown.branch(number).nodes
         place = Place(number, frame, answered)
         node = nodes[frame]
-        shown.send_rgb(session, place, node)
+        send_rgb(session, place, node)
         if "uncertainty" in session.watched:
-            shown.send_uncertainty(session, place, node)
+            send_uncertainty(session, place, node)
         if "depth" in session.watched and session.has_depth and self.side.waiting < BACKLOG:
-            self._later(shown.send_depth(session, self.side, place, node))
+            self._later(send_depth(session, self.side, place, node))
         if "points" in session.watched and self.side.waiting < BACKLOG:
-            self._later(shown.send_points(session, self.side, place, nodes[: frame + 1], "rgb"))
+            self._later(send_points(session, self.side, place, nodes[: frame + 1], "rgb"))
         if _TRUTHS & set(session.watched):
             self._follow(number, frame)
 
@@ -99,19 +175,19 @@ class Viewer:
         if session.out is not None:
             await session.out.room()
         if "rgb" in kinds:
-            shown.send_rgb(session, place, node)
+            send_rgb(session, place, node)
         if "uncertainty" in kinds:
-            shown.send_uncertainty(session, place, node)
+            send_uncertainty(session, place, node)
         if "depth" in kinds and session.has_depth:
-            await shown.send_depth(session, self.side, place, node)
+            await send_depth(session, self.side, place, node)
         if "points" in kinds:
-            await shown.send_points(session, self.side, place, nodes, "rgb")
+            await send_points(session, self.side, place, nodes, "rgb")
             if node.truth is not None:
-                await shown.send_points(session, self.side, place, nodes, "truth")
+                await send_points(session, self.side, place, nodes, "truth")
         if _TRUTHS & set(kinds):
             if node.truth is None and _TRUTHS & set(session.watched):
                 self._follow(place.branch, place.frame)
-            shown.send_truth(session, place, node, kinds, shown.mean_psnr(nodes))
+            send_truth(session, place, node, kinds, mean_psnr(nodes))
 
     def _follow(self, number: int, frame: int) -> None:
         """Sends the simulator to a frame, instead of one that it has not reached; frames on the way are shown too."""
@@ -141,9 +217,9 @@ class Viewer:
                     return
                 for each in filled:
                     place = Place(number, each, 0)
-                    shown.send_truth(session, place, nodes[each], session.watched, shown.mean_psnr(nodes[: each + 1]))
+                    send_truth(session, place, nodes[each], session.watched, mean_psnr(nodes[: each + 1]))
                     if "points" in session.watched:
-                        await shown.send_points(session, self.side, place, nodes[: each + 1], "truth")
+                        await send_points(session, self.side, place, nodes[: each + 1], "truth")
         except Refused as error:
             if self._chase is chase:
                 session.send({"type": "truth_off", "id": 0, "branch": number, "message": error.message})

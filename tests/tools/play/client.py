@@ -11,10 +11,10 @@ from typing import Any
 import uvicorn
 from websockets.sync.client import ClientConnection, connect
 
-from rsjax.tools.play.frames import HEADER
 from rsjax.tools.play.guard import Guard
 from rsjax.tools.play.hub import Hub
 from rsjax.tools.play.messages import UPLOAD_BYTES
+from rsjax.tools.play.pictures import HEADER
 from rsjax.tools.play.serve import listen
 from rsjax.tools.play.server import make_app
 from tests.waiting import wait_until

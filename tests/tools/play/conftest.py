@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("uvicorn", reason="uvicorn is not installed (make setup)")
 pytest.importorskip("websockets", reason="websockets is not installed (make setup)")
 
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from tests.tools.play.client import Server, serving
 from tests.tools.play.fake import Fakes, hub_of, play_run
 

@@ -14,7 +14,7 @@ from rsjax.data.normalization import Normalization
 from rsjax.models.branch_states import Decoding, Moment
 from rsjax.tools.play.engine import Engine
 from rsjax.tools.play.hub import Hub
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.truth import Truths
 from rsjax.tools.policies.run_data import RunData
 from tests.tools.pipeline import toy

@@ -15,7 +15,7 @@ import pytest
 from rsjax.data.store import open_store
 from rsjax.tools.play import keep
 from rsjax.tools.play.controls import Controls
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from tests.tools.play.client import Client, Server, serving
 from tests.tools.play.fake import Fakes, hub_of, play_run
 from tests.tools.play.test_session import rgb, same

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.studies.report.depth_view import depth_to_colors
 from tests.tools.play.client import Server, serving
 from tests.tools.play.fake import hub_of

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.points import GRID, points_of
-from rsjax.tools.play.run_data import PlayRun
 from tests.tools.play.client import Server
 
 

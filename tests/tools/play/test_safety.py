@@ -17,12 +17,11 @@ from websockets.typing import Origin
 from rsjax.data.codec import Record
 from rsjax.data.store import StoreError
 from rsjax.tools.play.connection import BURST, STRIKES
-from rsjax.tools.play.errors import Refused
 from rsjax.tools.play.guard import is_loopback
-from rsjax.tools.play.messages import TEXT_BYTES, UPLOAD_BYTES, parse
+from rsjax.tools.play.messages import TEXT_BYTES, UPLOAD_BYTES, Refused, parse
 from rsjax.tools.play.pictures import read_picture
-from rsjax.tools.play.run_data import FPS, PlayRun
-from rsjax.tools.play.send_queue import MOST, UNSENT, Outbox
+from rsjax.tools.play.play_run import FPS, PlayRun
+from rsjax.tools.play.send_queue import MOST, UNSENT, SendQueue
 from tests.tools.play.client import Client, Picture, Server, serving
 from tests.tools.play.fake import Fakes, hub_of
 from tests.waiting import wait_until
@@ -237,7 +236,7 @@ def test_fifty_at_once(run: PlayRun) -> None:
 
 
 def test_a_slow_page_loses_what_it_can_ask_for_again_and_then_its_connection() -> None:
-    box = Outbox()
+    box = SendQueue()
     for number in range(UNSENT + 5):
         box.put({"number": number}, droppable=True)
     assert len(box._items) == UNSENT

@@ -12,7 +12,7 @@ from rsjax.config import ConfigError, Departures
 from rsjax.errors import UserError
 from rsjax.tools.play.guard import Guard
 from rsjax.tools.play.serve import ServeSettings, _address, listen
-from rsjax.tools.play.settings import first_settings, settings_limits
+from rsjax.tools.play.session import first_settings, settings_limits
 from tests.tools.pipeline import toy
 
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from rsjax.config import DataConfig
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from tests.tools.play.client import Client, Picture, Server
 from tests.tools.play.fake import LIGHT, Fakes
 from tests.waiting import wait_until

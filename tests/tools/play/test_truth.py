@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsjax.tools.play.run_data import PlayRun
+from rsjax.tools.play.play_run import PlayRun
 from rsjax.tools.play.truth import Truths
 from tests.tools.play.client import Client, Server, serving
 from tests.tools.play.fake import Fakes, hub_of, play_run

@@ -19,7 +19,7 @@ from rsjax.data.store import Source, Store, StoreError
 from rsjax.errors import UserError, first_line
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.play.controls import Controls, controls_of_run
-from rsjax.tools.play.errors import Refused
+from rsjax.tools.play.messages import Refused
 from rsjax.tools.policies.policy import Policy
 from rsjax.tools.policies.run_data import RunData
 
