@@ -73,12 +73,13 @@ def first_settings(config: Config) -> Settings:
 
 def settings_limits(config: Config) -> dict[str, Any]:
     """Returns the limits of a run's settings."""
-    dropout = getattr(config.model, "action_dropout", 0.0)
+    departures = getattr(config.model, "departures", None)  # only families of tokens have them
+    guided = departures is not None and departures.action_dropout > 0
     codes = 2 ** (config.tokenizer.code_bits // config.tokenizer.vocabularies)
     cells = config.grid**2
     return {
         "steps": max(min(MOST_STEPS, cells), first_settings(config).steps),
-        "guidance": [0.0, MOST_GUIDANCE] if dropout else [1.0, 1.0],
+        "guidance": [0.0, MOST_GUIDANCE] if guided else [1.0, 1.0],
         "top_k": codes,
     }
 
