@@ -161,32 +161,6 @@ class Metric:
         return f"{self.title}{unit} {'↑' if self.better == 'higher' else '↓'}"
 
 
-ABSENT = "–"  # stands in tables in place of a missing number
-_SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-class Footnotes:
-    """Numbers the reasons for absent metrics in the order in which a table mentions them.
-
-    Attributes:
-        texts: the footnotes mentioned so far.
-    """
-
-    def __init__(self) -> None:
-        self._numbers: dict[str, str] = {}
-
-    def mark(self, reason: str | None) -> str:
-        """Returns the mark of a reason, such as "²"; "" without a reason."""
-        if not reason:
-            return ""
-        return self._numbers.setdefault(reason, str(len(self._numbers) + 1).translate(_SUPERSCRIPT))
-
-    @property
-    def texts(self) -> list[str]:
-        """The reasons with their marks, in order."""
-        return [f"{mark} {reason}" for reason, mark in self._numbers.items()]
-
-
 _METRICS: dict[str, Metric] = {}
 
 

@@ -11,7 +11,7 @@ from rsjax.models.roboscape.keypoints import motion_magnitude
 from rsjax.tools.pipeline.provenance import read_starts
 from rsjax.tools.pipeline.run import STAGES, TRAINED, Run
 from rsjax.tools.studies.report.figures import ClipFigure
-from rsjax.tools.studies.report.page import Report, write_report
+from rsjax.tools.studies.report.page import RunReport, write_report
 from rsjax.training.log import read_log
 
 LIBRARIES = ("rsjax", "jax", "flax", "optax", "orbax-checkpoint", "grain", "numpy", "robosuite", "mujoco")
@@ -27,7 +27,7 @@ def write_summary(run: Run, command: str) -> None:
     seconds = {stage: run.seconds(stage) for stage in STAGES[:-1] if run.mark(stage)}
     metrics = result.metrics | {"seconds_total": round(sum(seconds.values()), 1)}
     cfg = run.config
-    report = Report(
+    report = RunReport(
         preset=cfg.name,
         metrics=metrics,
         reasons=result.reasons,

@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from rsjax.evaluation.registry import ABSENT, Metric
+from rsjax.evaluation.registry import Metric
 from rsjax.tools.studies.ablation.table import Row, best
+from rsjax.tools.studies.tables import ABSENT
 
 PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
 PANEL, LINE = 2.3, 0.42  # width of a panel and height of a line, in inches

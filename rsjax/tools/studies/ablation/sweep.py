@@ -27,17 +27,14 @@ from rsjax.tools.pipeline.run import Run, link
 from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.ablation.grid import FILE, Choice, Grid, add_cells, merge, read_grid, repeated_cells
 from rsjax.tools.studies.ablation.table import (
-    ERROR,
     Row,
-    State,
     as_csv,
     as_json,
     as_markdown,
-    read_metrics,
-    read_result,
     shown_columns,
     tabulate,
 )
+from rsjax.tools.studies.results import ERROR, State, read_metrics, read_run
 
 SHARED = ("tokenizer", "tokens", "world_model")  # each stage needs the stages before it
 
@@ -209,7 +206,7 @@ def write_tables(out: Path, data: Path) -> list[Row]:
         grid = read_grid(out)
         assert grid is not None
         runs = runs_of(grid, out, data).values()
-        rows = tabulate(map(read_result, runs), grid.fields)
+        rows = tabulate(map(read_run, runs), grid.fields)
         write_atomically(out / "table.md", as_markdown(rows).encode())
         write_atomically(out / "table.csv", as_csv(rows).encode())
         write_json(out / "table.json", as_json(rows))
@@ -230,4 +227,4 @@ def print_cells(new: Grid, choice: Choice, out: Path, data: Path) -> None:
     chosen, runs = choice.of(names), runs_of(grid, out, data)
     for number, name in enumerate(names):
         if name in chosen:
-            print(f"{number:4}  {read_result(runs[name]).state:11}  {name}")
+            print(f"{number:4}  {read_run(runs[name]).state:11}  {name}")

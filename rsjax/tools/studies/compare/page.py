@@ -13,16 +13,17 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from rsjax.errors import UserError
-from rsjax.evaluation.registry import Footnotes, Metric
+from rsjax.evaluation.registry import Metric
 from rsjax.evaluation.results import Curves, read_frames
 from rsjax.evaluation.shown import extremes
 from rsjax.files import write_file
 from rsjax.progress import note
-from rsjax.tools.studies.compare.table import DIFFERENCES, Comparison, difference_rows, header, legend, score_rows
+from rsjax.tools.studies.compare.table import Comparison, difference_table, legend, score_table
 from rsjax.tools.studies.report.curves import Chart, charts_svg
 from rsjax.tools.studies.report.figures import ClipFigure, filmstrip
 from rsjax.tools.studies.report.page import template_environment
 from rsjax.tools.studies.report.video import webp_uri
+from rsjax.tools.studies.tables import Footnotes, as_html
 
 LABEL = 18  # letters per line in a film strip's labels
 COLORS = ("#3b7dd8", "#d9480f", "#3f9a63", "#8f5bd1", "#b8860b", "#c2417c", "#1b8a9c", "#6b7280")
@@ -49,7 +50,8 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
     Args:
         command: the command that repeats the comparison.
     """
-    notes, shown = Footnotes(), strips(comparison)
+    notes = Footnotes()
+    shown = strips(comparison)
     html = (
         template_environment("rsjax.tools.studies.compare")
         .get_template("compare.html.j2")
@@ -57,11 +59,8 @@ def write_page(path: Path, comparison: Comparison, command: str) -> None:
             title=comparison.title,
             reference=comparison.reference.name,
             origin=comparison.protocol.get("origin", ""),
-            header=header(comparison),
-            published=len(comparison.papers),
-            scores=score_rows(comparison, notes),
-            difference_header=DIFFERENCES,
-            differences=difference_rows(comparison),
+            scores=as_html(score_table(comparison, notes)),
+            differences=as_html(difference_table(comparison)),
             legend=legend(comparison),
             notes=notes.texts,
             curves=Markup(_curves(comparison)),

@@ -69,7 +69,7 @@ def published_by_metric(name: str, protocol: str = "paper") -> dict[str, float]:
     return {ours.get(metric, metric): value for metric, value in published(name, protocol).items()}
 
 
-def score_of(scores: Mapping[str, float], metric: str, depth_suffix: str) -> float | None:
+def published_score_of(scores: Mapping[str, float], metric: str, depth_suffix: str) -> float | None:
     """Returns the published score to show next to one of our metrics.
 
     The paper states neither the LPIPS network nor the depth alignment.

@@ -16,8 +16,8 @@ from rsjax.config import require
 from rsjax.errors import did_you_mean
 from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.statistics import Estimate, Verdict, Welch, paired_bootstrap, verdict, welch
-from rsjax.tools.studies.ablation.table import Spread, spread
 from rsjax.tools.studies.compare.groups import Group
+from rsjax.tools.studies.results import Spread, spread
 
 BASELINES = {"_repeat_first": "first frame repeated", "_tokenizer": "tokenizer's reconstruction"}
 BEST = "_incl_ctx"  # the names of scores of the best of several samples end with this
@@ -59,7 +59,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Score:
     """An entry's score of a metric.
 
     Attributes:
@@ -153,13 +153,13 @@ def _parts(names: Collection[str]) -> list[Metric]:
     return found
 
 
-def cell(entry: Entry, metric: Metric) -> Cell:
+def score_of(entry: Entry, metric: Metric) -> Score:
     """Returns an entry's score of a metric."""
     seeds, clips = entry.seeds(metric), entry.per_clip(metric)
     if not seeds:
-        return Cell(None, None, entry.reason(metric))
+        return Score(None, None, entry.reason(metric))
     interval = None if clips is None else paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
-    return Cell(spread(seeds), interval, "")
+    return Score(spread(seeds), interval, "")
 
 
 def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | None:

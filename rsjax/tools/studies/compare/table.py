@@ -1,7 +1,5 @@
 """Computes a comparison and writes it as Markdown, CSV and JSON."""
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +7,12 @@ from typing import Any
 
 from rsjax.config import require
 from rsjax.errors import did_you_mean
-from rsjax.evaluation.registry import ABSENT, Footnotes, Metric
-from rsjax.evaluation.statistics import Estimate
+from rsjax.evaluation.registry import Metric
+from rsjax.tools.studies import tables
 from rsjax.tools.studies.compare.groups import Group, noted
-from rsjax.tools.studies.compare.published import SOURCE, published, published_name, score_of
-from rsjax.tools.studies.compare.scores import Cell, Difference, Entry, cell, columns, difference, entries_of
+from rsjax.tools.studies.compare.published import SOURCE, published, published_name, published_score_of
+from rsjax.tools.studies.compare.scores import Difference, Entry, Score, columns, difference, entries_of, score_of
+from rsjax.tools.studies.tables import ABSENT, CellText, Footnotes, Marked, Table, interval_text, mean_text
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Comparison:
     Attributes:
         entries: groups, then baselines.
         reference: the entry that the others are compared with.
-        cells: by metric, one for each entry.
+        scores: by metric, one for each entry.
         differences: from the reference, by metric, one for each entry; None for the reference itself and where a score
             is missing.
         papers: published row → its scores by metric.
@@ -34,7 +33,7 @@ class Comparison:
     entries: Sequence[Entry]
     metrics: Sequence[Metric]
     reference: Entry
-    cells: dict[str, list[Cell]]
+    scores: dict[str, list[Score]]
     differences: dict[str, list[Difference | None]]
     papers: dict[str, dict[str, float]]
     notes: list[str]
@@ -77,7 +76,7 @@ def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = ""
         entries,
         chosen,
         reference,
-        {each.name: [cell(entry, each) for entry in entries] for each in chosen},
+        {each.name: [score_of(entry, each) for entry in entries] for each in chosen},
         {
             each.name: [None if entry is reference else difference(entry, reference, each) for entry in entries]
             for each in chosen
@@ -92,56 +91,54 @@ def published_score(comparison: Comparison, metric: Metric, name: str) -> float 
     protocol = comparison.protocol
     plain = protocol["depth_alignment"] == "none"
     suffix = "" if plain else f"_{protocol['depth_alignment']}_{protocol['depth_source']}"
-    return score_of(comparison.papers[name], metric.name, suffix)
+    return published_score_of(comparison.papers[name], metric.name, suffix)
 
 
-def header(comparison: Comparison) -> list[str]:
-    """Returns the headings of the table of scores."""
-    own = [f"{entry.name} (n = {len(entry.group.results)})" for entry in comparison.entries if not entry.suffix]
-    baselines = [entry.name for entry in comparison.entries if entry.suffix]
-    return ["metric", *own, *baselines, *(f"published: {name}" for name in comparison.papers)]
-
-
-def score_rows(comparison: Comparison, notes: Footnotes) -> list[list[str]]:
-    """Returns a row for each metric: each entry's mean ± deviation over seeds and interval, then published numbers."""
+def score_table(comparison: Comparison, notes: Footnotes) -> Table:
+    """Makes a row for each metric: each entry's mean ± deviation over seeds and interval, then published numbers."""
+    head: list[CellText] = ["metric"]
+    head += [f"{entry.name} (n = {len(entry.group.results)})" for entry in comparison.entries if not entry.suffix]
+    head += [entry.name for entry in comparison.entries if entry.suffix]
+    head += [Marked(f"published: {name}", "published") for name in comparison.papers]
     rows = []
     for metric in comparison.metrics:
-        cells = [_cell_text(each, metric, notes) for each in comparison.cells[metric.name]]
-        papers = [published_score(comparison, metric, name) for name in comparison.papers]
-        rows.append([metric.heading, *cells, *(ABSENT if value is None else f"{value:g}" for value in papers)])
-    return rows
+        row: list[CellText] = [metric.heading]
+        for score in comparison.scores[metric.name]:
+            if score.spread is None:
+                row.append(notes.absent(score.reason))
+            else:
+                mean = mean_text(score.spread, metric.decimals)
+                row.append(f"{mean} {interval_text(score.interval, metric.decimals)}".rstrip())
+        for name in comparison.papers:
+            value = published_score(comparison, metric, name)
+            row.append(Marked(ABSENT if value is None else f"{value:g}", "published"))
+        rows.append(row)
+    return Table(head, rows)
 
 
-def _cell_text(each: Cell, metric: Metric, notes: Footnotes) -> str:
-    if each.spread is None:
-        return ABSENT + notes.mark(each.reason)
-    numbers = " ± ".join(f"{x:.{metric.decimals}f}" for x in each.spread[:2] if x is not None)
-    return f"{numbers} {_interval(each.interval, metric.decimals)}".rstrip()
-
-
-def _interval(interval: Estimate | None, decimals: int) -> str:
-    if interval is None or interval.low is None or interval.high is None:
-        return ""
-    return f"[{interval.low:.{decimals}f}, {interval.high:.{decimals}f}]"
-
-
-def difference_rows(comparison: Comparison) -> list[list[str]]:
-    """Returns a row for each metric and entry other than the reference."""
+def difference_table(comparison: Comparison) -> Table:
+    """Makes a row for each metric and entry other than the reference."""
     rows = []
     for metric in comparison.metrics:
         digits = metric.decimals + 1
         for entry, found in zip(comparison.entries, comparison.differences[metric.name], strict=True):
             if found is None:
                 continue
-            estimate = found.interval or (found.welch.difference if found.welch else None)
+            estimate = found.interval
+            test = ABSENT
+            if found.welch:
+                estimate = estimate or found.welch.difference
+                test = f"t = {found.welch.t:.2f}, p = {found.welch.p:.3g}"
             value = f"{estimate.value:+.{digits}f}" if estimate else ABSENT
-            test = f"t = {found.welch.t:.2f}, p = {found.welch.p:.3g}" if found.welch else ABSENT
-            interval = _interval(found.interval, digits) or ABSENT
-            rows.append([metric.heading, entry.name, value, interval, test, found.finding])
-    return rows
-
-
-DIFFERENCES = ("metric", "entry", "difference", "95 % interval over seeds and clips", "Welch over seeds", "finding")
+            interval = interval_text(found.interval, digits) or ABSENT
+            finding: CellText = found.finding
+            if found.finding == "better":
+                finding = Marked("better", "met")
+            elif found.finding == "worse":
+                finding = Marked("worse", "missed")
+            rows.append([metric.heading, entry.name, value, interval, test, finding])
+    head = ("metric", "entry", "difference", "95 % interval over seeds and clips", "Welch over seeds", "finding")
+    return Table(head, rows)
 
 
 def legend(comparison: Comparison) -> list[str]:
@@ -165,28 +162,15 @@ def legend(comparison: Comparison) -> list[str]:
 def as_markdown(comparison: Comparison) -> str:
     """Returns the tables of scores and of differences, with their legend and the reasons for absent numbers."""
     notes = Footnotes()
-    scores = _markdown(header(comparison), score_rows(comparison, notes))
-    differences = _markdown(DIFFERENCES, difference_rows(comparison))
+    scores = tables.as_markdown(score_table(comparison, notes))
+    differences = tables.as_markdown(difference_table(comparison))
     paragraphs = [comparison.title, scores, differences, *legend(comparison), *notes.texts]
     return "\n\n".join(paragraphs) + "\n"
 
 
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    texts = [[cell.replace("|", r"\|") for cell in row] for row in (head, *rows)]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    texts.insert(1, ["-" * width for width in widths])
-    lines = [" | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) for line in texts]
-    return "\n".join(f"| {line} |" for line in lines)
-
-
 def as_csv(comparison: Comparison) -> str:
     """Returns a line for each metric and entry: score, interval, and the difference from the reference."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_FIELDS)
-    for row in _records(comparison):
-        writer.writerow([row.get(name) for name in _FIELDS])
-    return text.getvalue()
+    return tables.as_csv(_FIELDS, [[row.get(name) for name in _FIELDS] for row in _records(comparison)])
 
 
 _FIELDS = (
@@ -199,8 +183,9 @@ def _records(comparison: Comparison) -> list[dict[str, Any]]:
     """Returns a record for each metric and entry, and for each published number; its keys are the CSV's columns."""
     out = []
     for metric in comparison.metrics:
-        found = zip(comparison.entries, comparison.cells[metric.name], comparison.differences[metric.name], strict=True)
-        for entry, each, change in found:
+        scores = comparison.scores[metric.name]
+        differences = comparison.differences[metric.name]
+        for entry, each, change in zip(comparison.entries, scores, differences, strict=True):
             row: dict[str, Any] = {"metric": metric.name, "entry": entry.name, "reason": each.reason or None}
             row |= {"kind": "baseline" if entry.suffix else "group"}
             row |= each.spread._asdict() if each.spread else {}

@@ -19,10 +19,10 @@ from rsjax.evaluation.statistics import (
     welch,
 )
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.studies.ablation.table import Result, Spread, read_result, spread
 from rsjax.tools.studies.paper.claim import Claim, Comparison
 from rsjax.tools.studies.paper.measurements import read_scores
 from rsjax.tools.studies.paper.plan import Cell, Plan
+from rsjax.tools.studies.results import RunResult, Spread, read_run, spread
 
 CEILING = "psnr_tokenizer"  # PSNR of the reconstruction by each family's own autoencoder, a limit on the prediction's
 SUCCESS = "success"  # the name of scores that are 1 or 0 for each trial; all trials may end alike
@@ -71,12 +71,12 @@ class Trained:
 
     name: str
     cells: tuple[Cell, ...]
-    results: tuple[Result, ...]
+    results: tuple[RunResult, ...]
     absent: str
     spreads: Mapping[str, Spread]
 
     @property
-    def finished(self) -> tuple[Result, ...]:
+    def finished(self) -> tuple[RunResult, ...]:
         """The results of finished seeds."""
         return tuple(result for result in self.results if result.state == "finished")
 
@@ -116,7 +116,7 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
     Args:
         runs: the run of each cell of the plan, by name.
     """
-    results = {name: read_result(runs[name]) for name in plan.cells}
+    results = {name: read_run(runs[name]) for name in plan.cells}
     read: dict[tuple[str, str], tuple[Mapping[str, Sequence[float]], str]] = {}
     sources = {"", *(name for claim in plan.claims for arm in claim.arms for name in claim.measurements(arm.name))}
     for name, result in results.items():
@@ -126,7 +126,7 @@ def judge_all(plan: Plan, runs: Mapping[str, Run]) -> list[Outcome]:
     return [_judge_claim(claim, plan, results, read) for claim in plan.claims]
 
 
-def _judge_claim(claim: Claim, plan: Plan, results: Mapping[str, Result], read: Mapping[Any, Any]) -> Outcome:
+def _judge_claim(claim: Claim, plan: Plan, results: Mapping[str, RunResult], read: Mapping[Any, Any]) -> Outcome:
     arms = {}
     for arm in claim.arms:
         cells = plan.of(claim.name, arm.name)

@@ -13,10 +13,10 @@ from typing import Any
 from rsjax.config import Config, require
 from rsjax.errors import UserError
 from rsjax.evaluation.registry import Unavailable
-from rsjax.evaluation.results import load_evaluation
 from rsjax.files import FileError, read_json, write_json
 from rsjax.progress import note
 from rsjax.tools.pipeline.run import Run
+from rsjax.tools.studies.results import read_per_clip
 
 Scores = Mapping[str, Sequence[float]]  # a number per clip, in the same order for all runs
 Measurement = Callable[[Run], Scores]
@@ -86,7 +86,7 @@ def read_scores(run: Run, name: str) -> tuple[Scores, str]:
     """
     try:
         if not name:
-            return load_evaluation(run.output("evaluation")).per_clip, ""
+            return read_per_clip(run), ""
         saved = read_json(_path(run, name))
     except (UserError, OSError) as error:
         return {}, f"no {name or 'evaluation'} yet" if isinstance(error, (FileError, OSError)) else str(error)

@@ -8,35 +8,37 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
-import jinja2
 import numpy as np
 from jaxtyping import UInt8
 
 from rsjax.config import Config
 from rsjax.errors import UserError
-from rsjax.evaluation.registry import ABSENT, Metric, metrics
+from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.results import read_frames
 from rsjax.evaluation.statistics import Estimate
 from rsjax.files import disk_guard, write_file, write_json
 from rsjax.progress import duration
 from rsjax.tools.studies.ablation.figure import draw
-from rsjax.tools.studies.ablation.table import Result, Row
+from rsjax.tools.studies.ablation.table import Row
 from rsjax.tools.studies.compare.page import ComparedClip
 from rsjax.tools.studies.paper import budget
 from rsjax.tools.studies.paper.judge import CEILING, Judged, Outcome, Trained
 from rsjax.tools.studies.paper.plan import Plan
 from rsjax.tools.studies.report.figures import filmstrip
+from rsjax.tools.studies.report.page import template_environment
 from rsjax.tools.studies.report.score_charts import SCENES
 from rsjax.tools.studies.report.video import webp, webp_uri
+from rsjax.tools.studies.results import RunResult
+from rsjax.tools.studies.tables import ABSENT, CellText, Marked, Table, as_html, as_markdown, mean_text
 
 LEGEND = (
     "Differences are paired by clip: mean (or median) over clips and seeds, with the 95 % interval from resampling "
     "both. A verdict takes the wider of this interval and Welch's t over the seeds; p is Welch's. A claim holds if all "
     "its comparisons do, and does not hold if any does not; otherwise the budget is too small to tell. With one seed "
-    "nothing is told."
+    "there is no verdict."
 )
 
 
@@ -52,28 +54,32 @@ def write_report(out: Path, plan: Plan, outcomes: Sequence[Outcome], command: st
         "legend": LEGEND,
         "claims": [_claim(each) for each in outcomes],
     }
-    folders = [
-        jinja2.PackageLoader(package, ".") for package in ("rsjax.tools.studies.paper", "rsjax.tools.studies.report")
-    ]
-    environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader(folders),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        autoescape=lambda name: bool(name) and "html" in str(name),
-    )
+    tables = [_tables(claim) for claim in content["claims"]]
+    overview = _overview(content["claims"])
+    environment = template_environment("rsjax.tools.studies.paper")
+    environment.autoescape = lambda name: bool(name) and "html" in str(name)
     with disk_guard(out):
-        figures, strips = dict[str, str](), dict[str, str]()
+        figures: dict[str, str] = {}
+        strips: dict[str, str] = {}
         for outcome in outcomes:
-            if picture := _figure(outcome):
+            picture = _figure(outcome)
+            if picture is not None:
                 figures[outcome.claim.name] = base64.b64encode(picture).decode()
                 write_file(out / "figures" / f"{outcome.claim.name}.png", picture)
-            if (strip := _strip(outcome)) is not None:
+            strip = _strip(outcome)
+            if strip is not None:
                 strips[outcome.claim.name] = webp_uri(strip)
                 write_file(out / "figures" / f"{outcome.claim.name}-clip.webp", webp(strip))
         write_json(out / "report.json", content)
-        for name in ("report.md", "report.html"):
-            text = environment.get_template(f"{name}.j2").render(**content, figures=figures, strips=strips)
+        for name, render in (("report.md", as_markdown), ("report.html", as_html)):
+            template = environment.get_template(f"{name}.j2")
+            text = template.render(
+                **content,
+                overview=render(overview),
+                tables=[{key: render(table) for key, table in each.items()} for each in tables],
+                figures=figures,
+                strips=strips,
+            )
             write_file(out / name, text.encode())
     return out / "report.html"
 
@@ -121,6 +127,47 @@ def _claim(outcome: Outcome) -> dict[str, Any]:
         "comparisons": [_comparison(each) for each in outcome.judged],
         "missing": [_missing(result) for arm in outcome.arms for result in arm.results if result.state != "finished"],
     }
+
+
+def _marked(verdict: str, remark: str = "") -> Marked:
+    marks: dict[str, Literal["met", "missed"]] = {"holds": "met", "does not hold": "missed"}
+    return Marked(verdict, marks.get(verdict, ""), remark)
+
+
+def _overview(claims: Sequence[dict[str, Any]]) -> Table:
+    """Makes a row for each claim: its verdict, and how many of its comparisons have which."""
+    rows = []
+    for claim in claims:
+        counts = list(claim["counts"].values())
+        missing = len(claim["comparisons"]) - sum(counts)
+        rows.append([claim["title"], claim["place"], _marked(claim["verdict"]), *map(str, counts), str(missing)])
+    return Table(["claim", "place", "verdict", "comparisons: hold", "do not", "cannot tell", "not measured"], rows)
+
+
+def _tables(claim: dict[str, Any]) -> dict[str, Table]:
+    """Makes a claim's tables: its arms with both baselines, the comparisons, and the paper's numbers, if it has any."""
+    arms = []
+    for arm in claim["arms"]:
+        costs = [arm[name] or "" for name in ("parameters", "steps", "tflop", "minutes")]
+        arms.append([arm["name"], arm["seeds"], *arm["scores"], *arm["beside"], *map(str, costs)])
+    for baseline in claim["baselines"]:
+        blank = [""] * (len(claim["beside"]) + 4)
+        arms.append([Marked(text, "note") for text in (baseline["name"], "", *baseline["scores"], *blank)])
+    costs = ["trained parameters", "steps", "TFLOP", "minutes"]
+    tables = {"arms": Table(["", "seeds", *claim["header"], *claim["beside"], *costs], arms)}
+
+    comparisons: list[list[CellText]] = []
+    for each in claim["comparisons"]:
+        metric = f"{each['metric']}, {each['where']}" if each["where"] else each["metric"]
+        row = [each["what"], metric, each["sides"] or "", each["difference"], each["interval"], each["p"] or ""]
+        row += [each["published"] or "", ", ".join(map(str, each["seeds"])), str(each["clips"])]
+        comparisons.append([*row, _marked(each["verdict"], each["reason"])])
+    head = ["compared", "by", "scores", "difference", "95 % interval", "p", "the paper's", "seeds", "clips", "verdict"]
+    tables["comparisons"] = Table(head, comparisons)
+    if claim["published"]:
+        published = [[arm["name"], *arm["published"]] for arm in claim["arms"]]
+        tables["published"] = Table(["", *claim["published_header"]], published)
+    return tables
 
 
 def _columns(outcome: Outcome) -> list[Metric]:
@@ -187,14 +234,12 @@ def _baselines(outcome: Outcome, columns: Sequence[Metric]) -> list[dict[str, An
     return rows
 
 
-def _trained(result: Result) -> dict[str, float]:
+def _trained(result: RunResult) -> dict[str, float]:
     return {stage: result.run.seconds(stage) for stage in ("tokenizer", "world_model")}
 
 
 def _spread(arm: Trained, column: Metric) -> str:
-    if column.name in arm.spreads:
-        return " ± ".join(f"{x:.{column.decimals}f}" for x in arm.spreads[column.name][:2] if x is not None)
-    return ABSENT
+    return mean_text(arm.spreads[column.name], column.decimals) if column.name in arm.spreads else ABSENT
 
 
 def _comparison(judged: Judged) -> dict[str, Any]:
@@ -242,7 +287,7 @@ def _interval(difference: Estimate | None, digits: int) -> str:
     return f"{difference.low:+.{digits}f} … {difference.high:+.{digits}f}"
 
 
-def _missing(result: Result) -> str:
+def _missing(result: RunResult) -> str:
     return f"{result.name}: {result.state} ({result.reason})"
 
 

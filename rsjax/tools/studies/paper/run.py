@@ -7,11 +7,11 @@ from rsjax.files import lock
 from rsjax.progress import duration, stage
 from rsjax.tools.pipeline.run import Run
 from rsjax.tools.studies.ablation.sweep import run_cell
-from rsjax.tools.studies.ablation.table import State, read_result
 from rsjax.tools.studies.paper.judge import judge_all
 from rsjax.tools.studies.paper.measurements import measure, measured
 from rsjax.tools.studies.paper.plan import Plan, Task
 from rsjax.tools.studies.paper.report import write_report
+from rsjax.tools.studies.results import State, read_run
 
 
 def runs_of(plan: Plan, out: Path, data: Path) -> dict[str, Run]:
@@ -87,5 +87,5 @@ def print_plan(plan: Plan, out: Path, data: Path) -> None:
 
 def _state(task: Task, run: Run) -> State:
     if not task.measurement:
-        return read_result(run).state
+        return read_run(run).state
     return "finished" if measured(run, task.measurement) else "missing"

@@ -8,7 +8,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from rsjax.evaluation.registry import ABSENT, Footnotes, Metric, metrics
+from rsjax.evaluation.registry import Metric, metrics
 from rsjax.evaluation.results import Curves
 from rsjax.files import write_file
 from rsjax.progress import duration
@@ -18,6 +18,7 @@ from rsjax.tools.studies.report.player import player_clip, player_script, player
 from rsjax.tools.studies.report.score_charts import PLACE_SCENES, SCENES, frame_curves_svg, place_errors_svg
 from rsjax.tools.studies.report.targets import judge
 from rsjax.tools.studies.report.video import webp_uri
+from rsjax.tools.studies.tables import CellText, Footnotes, Marked, Table, as_html
 
 _FPS = 4  # the rate at which the player starts; one of its rates
 
@@ -44,7 +45,7 @@ _CONTROL_COLUMNS = (("delta_psnr{}_t4", "Δ₄, dB", 2),)
 
 
 @dataclass(frozen=True)
-class Report:
+class RunReport:
     """The contents of a page; the page leaves out the sections of empty fields.
 
     Attributes:
@@ -77,7 +78,7 @@ class Report:
     show_targets: bool = True
 
 
-def write_report(path: Path, report: Report) -> None:
+def write_report(path: Path, report: RunReport) -> None:
     """Writes the page atomically.
 
     Raises:
@@ -88,6 +89,7 @@ def write_report(path: Path, report: Report) -> None:
     environment.filters["duration"] = duration
     shown = [metric for metric in metrics().values() if metric.column]
     places = [metrics()[name] for name in _PLACES]
+    scored = [metric for metric in shown if metric not in places]
     further = [metric for metric in metrics().values() if not (metric.column or metric.name.startswith("depth_"))]
     notes = Footnotes()
     html = environment.get_template("page.html.j2").render(
@@ -96,15 +98,15 @@ def write_report(path: Path, report: Report) -> None:
         player_script=Markup(player_script()),
         player_style=Markup(player_style()),
         clips=[_clip_pictures(clip) for clip in report.clips],
-        scores=_table(report, notes, _SCORE_ROWS, _columns(metric for metric in shown if metric not in places)),
-        depths=_table(report, notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
-        further=_table(report, notes, _SCORE_ROWS, _columns(further)),
-        control=_table(report, notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
-        places=_table(report, Footnotes(), _PLACE_ROWS, _columns(places)),
+        scores=_table(report, "test clips", notes, _SCORE_ROWS, _columns(scored)),
+        depths=_table(report, "depth of the prediction", notes, _DEPTH_ROWS, _DEPTH_COLUMNS),
+        further=_table(report, "test clips", notes, _SCORE_ROWS, _columns(further)),
+        control=_table(report, "ΔPSNR under", notes, _CONTROL_ROWS, _CONTROL_COLUMNS),
+        places=_table(report, "last frame", Footnotes(), _PLACE_ROWS, _columns(places)),
         place_errors=Markup(place_errors_svg(report.per_clip, places[: len(_PLACE_ERRORS)])),
         frame_curves=Markup(frame_curves_svg(report.curves, [*shown, *further])),
         notes=notes.texts,
-        verdicts=judge(report.metrics) if report.show_targets else [],
+        targets=_targets(report) if report.show_targets else None,
         training={name: Markup(curves_svg(log, name)) for name, log in report.logs.items() if log},
         settings=_settings(report.config),
     )
@@ -137,31 +139,45 @@ def _clip_pictures(clip: ClipFigure) -> dict[str, Any]:
     }
 
 
-def _table(report: Report, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any] | None:
-    """Returns the header and the cells of rows and columns that have a metric or a reason; None without any metric."""
+def _table(
+    report: RunReport, corner: str, notes: Footnotes, rows: Sequence[Row], columns: Sequence[Column]
+) -> Markup | None:
+    """Returns a table of the rows and columns that have a metric or a reason; None without any metric."""
     if not any(key.format(suffix) in report.metrics for key, _, _ in columns for suffix, _ in rows):
         return None
     known = {*report.metrics, *report.reasons}
     columns = [column for column in columns if any(column[0].format(suffix) in known for suffix, _ in rows)]
     rows = [row for row in rows if any(key.format(row[0]) in known for key, _, _ in columns)]
-    return {
-        "header": [header for _, header, _ in columns],
-        "rows": [
-            {"label": label, "cells": [_cell(report, notes, key, suffix, digits) for key, _, digits in columns]}
-            for suffix, label in rows
-        ],
-    }
+    lines: list[list[CellText]] = []
+    for suffix, label in rows:
+        lines.append([label, *(_cell(report, notes, key, suffix, digits) for key, _, digits in columns)])
+    return as_html(Table([corner, *(header for _, header, _ in columns)], lines, first_bold=True))
 
 
-def _cell(report: Report, notes: Footnotes, key: str, suffix: str, digits: int) -> dict[str, str]:
+def _cell(report: RunReport, notes: Footnotes, key: str, suffix: str, digits: int) -> Marked:
+    """Returns a score with its interval as the remark, or the footnote that says why it is absent."""
     name = key.format(suffix)
     value = report.metrics.get(name)
     if value is None:
-        reason = report.reasons.get(name) or report.reasons.get(key.format(""))
-        return {"value": ABSENT + notes.mark(reason), "interval": ""}
-    bounds = [report.metrics.get(f"{name}_{side}") for side in ("low", "high")]
-    interval = "" if None in bounds else " – ".join(f"{bound:.{digits}f}" for bound in bounds)
-    return {"value": f"{value:.{digits}f}", "interval": interval}
+        return Marked(notes.absent(report.reasons.get(name) or report.reasons.get(key.format(""))))
+    low = report.metrics.get(f"{name}_low")
+    high = report.metrics.get(f"{name}_high")
+    if low is None or high is None:
+        return Marked(f"{value:.{digits}f}")
+    return Marked(f"{value:.{digits}f}", remark=f"{low:.{digits}f} – {high:.{digits}f}")
+
+
+def _targets(report: RunReport) -> Markup | None:
+    """Returns the table of the targets whose metrics were measured; None without any."""
+    rows: list[list[CellText]] = []
+    for target, measured, margin in judge(report.metrics):
+        bound = f"{'≥' if target.at_least else '≤'} {target.bound:g} {target.unit}"
+        if margin >= 0:
+            outcome = Marked("met", "met")
+        else:
+            outcome = Marked(f"missed by {-margin:.2f}", "missed")
+        rows.append([target.name, bound, f"{measured:.2f} {target.unit}", outcome])
+    return as_html(Table(["on test episodes", "target", "measured", ""], rows)) if rows else None
 
 
 def _settings(config: Mapping[str, Any], name: str = "run") -> dict[str, list[tuple[str, Any]]]:

@@ -18,7 +18,7 @@ from rsjax.tools.pipeline import stages
 from rsjax.tools.pipeline.run import STAGES, Run, link
 from rsjax.tools.studies.ablation import sweep
 from rsjax.tools.studies.ablation.grid import Choice, Grid
-from rsjax.tools.studies.ablation.table import read_result
+from rsjax.tools.studies.results import read_run
 from tests.models.toy_family import ToyConfig
 from tests.tools.studies.ablation import process, toy
 
@@ -40,7 +40,7 @@ def runs(place: Path, grid: Grid) -> list[Run]:
 
 
 def states(place: Path, grid: Grid) -> list[str]:
-    return [read_result(run).state for run in runs(place, grid)]
+    return [read_run(run).state for run in runs(place, grid)]
 
 
 def counts(place: Path) -> dict[str, int]:
@@ -132,7 +132,7 @@ def test_what_ends_the_command_is_not_the_cells_failure(
         with pytest.raises(type(error)):
             sweep_in(tmp_path, grid)
     assert states(tmp_path, grid) == ["finished", "interrupted", "missing"]
-    assert read_result(runs(tmp_path, grid)[1]).reason == "3 of 6 stages are finished"
+    assert read_run(runs(tmp_path, grid)[1]).reason == "3 of 6 stages are finished"
     assert sweep_in(tmp_path, grid) == ["finished"] * 3
 
 

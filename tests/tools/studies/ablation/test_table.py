@@ -14,17 +14,15 @@ from rsjax.evaluation.registry import metrics
 from rsjax.tools.studies.ablation.figure import draw
 from rsjax.tools.studies.ablation.sweep import runs_of
 from rsjax.tools.studies.ablation.table import (
-    Result,
     Row,
     as_csv,
     as_json,
     as_markdown,
     best,
-    final_terms,
     shown_columns,
-    spread,
     tabulate,
 )
+from rsjax.tools.studies.results import RunResult, final_terms, spread
 from tests.tools.studies.ablation import toy
 
 COLUMNS = tuple(column for column in metrics().values() if column.column)
@@ -35,8 +33,8 @@ RUNS = list(runs_of(GRID, Path("out"), Path("data")).values())
 
 def rows_of(metrics: Mapping[int, Mapping[str, float]], reasons: Mapping[int, dict[str, str]] = {}) -> list[Row]:
     """The table of cells of which these are finished with their metrics, and the others are not."""
-    finished = {i: Result(RUNS[i], "finished", "", numbers, reasons.get(i, {})) for i, numbers in metrics.items()}
-    results = (finished.get(i) or Result(run, "missing", "its reason", {}) for i, run in enumerate(RUNS))
+    finished = {i: RunResult(RUNS[i], "finished", "", numbers, reasons.get(i, {})) for i, numbers in metrics.items()}
+    results = (finished.get(i) or RunResult(run, "missing", "its reason", {}) for i, run in enumerate(RUNS))
     return tabulate(results, GRID.fields)
 
 
@@ -150,7 +148,7 @@ def test_the_picture_has_a_panel_per_metric_and_grows_with_the_rows() -> None:
 
 def test_a_bar_stands_in_a_text_value_without_breaking_the_table() -> None:
     grid = toy.grid("train.start_from=a|b,c")
-    results = [Result(run, "finished", "", {}) for run in runs_of(grid, Path("out"), Path("data")).values()]
+    results = [RunResult(run, "finished", "", {}) for run in runs_of(grid, Path("out"), Path("data")).values()]
     rows = tabulate(results, grid.fields)
     assert r"| a\|b" in as_markdown(rows)
 

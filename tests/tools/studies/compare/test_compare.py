@@ -44,7 +44,7 @@ def test_one_seed_each_is_paired_by_clip(make: Make) -> None:
     assert difference.interval.low == pytest.approx(expected.low)
     assert (difference.finding, difference.welch) == ("better", None)
     # Clips differ by far more than models do, so only pairing shows it.
-    cells = [cell.interval for cell in found.cells["psnr"][:2]]
+    cells = [cell.interval for cell in found.scores["psnr"][:2]]
     assert cells[0] and cells[1] and cells[0].high is not None and cells[1].low is not None
     assert cells[0].high > cells[1].low
     assert [entry.name for entry in found.entries] == ["a", "b", "first frame repeated", "tokenizer's reconstruction"]
@@ -65,7 +65,7 @@ def test_better_is_only_said_where_seeds_bear_it_out(make: Make) -> None:
     assert weak.welch.p == pytest.approx(expected.p)
     assert weak.welch.p > 0.05
     assert (weak.finding, strong.finding) == ("cannot tell", "better")
-    assert found.cells["psnr"][0].spread == pytest.approx((np.mean(seeds[0]), np.std(seeds[0], ddof=1), 3))
+    assert found.scores["psnr"][0].spread == pytest.approx((np.mean(seeds[0]), np.std(seeds[0], ddof=1), 3))
     other = compare(read_groups([make("a", *a), make("c", *c)], "paper"), against="c")
     assert [each.finding if each else None for each in other.differences["psnr"]][:2] == ["worse", None]
     same = found.differences["depth_absrel_median_branch"][1]
@@ -192,7 +192,7 @@ def test_parts_of_metrics_are_compared_beside_their_baselines(make: Make) -> Non
     wanted = ["delta_psnr", "delta_psnr_t4", "psnr_second_half", "physics_iq_mse_all_frames", "psnr_n1_pred_only"]
     assert [each.name for each in found.metrics] == wanted
     assert [each.title for each in found.metrics][1:3] == ["ΔPSNR, another clip's actions, t4", "PSNR, second half"]
-    assert [cell.spread and cell.spread.mean for cell in found.cells["psnr_second_half"]] == [1.0, None, 1.0]
+    assert [cell.spread and cell.spread.mean for cell in found.scores["psnr_second_half"]] == [1.0, None, 1.0]
     rows = {row["metric"]: row["mean"] for row in as_json(found)["scores"] if row["entry"] == "RoboScape"}
     assert rows == {"delta_psnr": 3.3435, "physics_iq_mse_all_frames": 0.0184}
     assert {*(each.name for each in compare(groups).metrics)}.isdisjoint({"delta_psnr_t4", "psnr_second_half"})
@@ -210,7 +210,7 @@ def test_differences_of_medians_are_those_of_the_scores_beside_them(make: Make) 
 
     groups = [make("a", result(0, 1.0), result(1, 2.0)), make("b", result(2, 1.0), result(3, 3.0))]
     found = compare(read_groups(groups, None), ["cube_error_widths", "psnr"])
-    a, b = (cell for cell in found.cells["cube_error_widths"][:2])
+    a, b = (cell for cell in found.scores["cube_error_widths"][:2])
     change = found.differences["cube_error_widths"][1]
     assert a.spread and b.spread and a.interval and change and change.interval and change.welch
     assert a.interval.value == pytest.approx(a.spread.mean)

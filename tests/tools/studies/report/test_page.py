@@ -4,7 +4,7 @@ from html.parser import HTMLParser
 import pytest
 
 from rsjax.tools.studies.report.curves import curves_svg
-from rsjax.tools.studies.report.page import Report, write_report
+from rsjax.tools.studies.report.page import RunReport, write_report
 from rsjax.tools.studies.report.targets import judge
 
 _METRICS = {
@@ -78,7 +78,7 @@ class _Page(HTMLParser):
 @pytest.fixture(scope="module")
 def full_page(tmp_path_factory, make_clip):
     path = tmp_path_factory.mktemp("report") / "report.html"
-    report = Report(
+    report = RunReport(
         preset="tiny",
         metrics=_METRICS,
         clips=[make_clip(title=f"episode <{i}>") for i in range(3)],
@@ -132,7 +132,9 @@ def test_tables_show_each_number_in_its_row(full_page):
 
 def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
     weights = dict.fromkeys(("lpips_alex", "depth_absrel_median_estimator"), "no <weights>")
-    report = Report("tiny", _METRICS | {"depth_absrel_median_branch": 0.0123}, weights | {"depth_delta1": "no depth"})
+    report = RunReport(
+        "tiny", _METRICS | {"depth_absrel_median_branch": 0.0123}, weights | {"depth_delta1": "no depth"}
+    )
     write_report(tmp_path / "r.html", report)
     page = _Page(tmp_path / "r.html")
     assert ["prediction", "26.31", "25.40 – 27.20", "0.871", "–¹", "0.0213", "–²", "–¹", "6.75"] in page.cells
@@ -142,14 +144,14 @@ def test_an_absent_metric_has_its_reason_as_a_footnote(tmp_path):
 
 
 def test_missing_parts_are_left_out(tmp_path, make_clip):
-    write_report(tmp_path / "bare.html", Report(preset="debug", metrics={"psnr": 20.0}))
+    write_report(tmp_path / "bare.html", RunReport(preset="debug", metrics={"psnr": 20.0}))
     page = _Page(tmp_path / "bare.html")
     assert ["test clips", "PSNR, dB ↑"] in page.cells
     assert "script" not in page.tags
     for absent in ("Targets", "Keypoints", "Training", "Clip by clip", "ΔPSNR", "Command", "Frame by", "Where cube"):
         assert absent not in page.text
     clip = make_clip(true_depth=None, predicted_depth=None, tracks=None, visible=None, selected=None)
-    write_report(tmp_path / "rgb.html", Report(preset="debug", metrics={}, clips=[clip]))
+    write_report(tmp_path / "rgb.html", RunReport(preset="debug", metrics={}, clips=[clip]))
     page = _Page(tmp_path / "rgb.html")
     assert len(page.images) == 1
     for absent in ("Depth", "Keypoints", "Scores", "Details"):
@@ -160,7 +162,7 @@ def test_a_failed_page_leaves_the_old_one(tmp_path, make_clip):
     path = tmp_path / "r.html"
     path.write_text("old")
     with pytest.raises(ValueError, match="log of tokenizer has no scalar"):
-        write_report(path, Report(preset="tiny", metrics={}, logs={"tokenizer": [{"step": 1}]}))
+        write_report(path, RunReport(preset="tiny", metrics={}, logs={"tokenizer": [{"step": 1}]}))
     assert path.read_text() == "old"
 
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from rsjax.evaluation.metrics.psnr import psnr
-from rsjax.tools.studies.report.page import Report, write_report
+from rsjax.tools.studies.report.page import RunReport, write_report
 from rsjax.tools.studies.report.player import player_clip, player_script
 from rsjax.tools.studies.report.video import sprite_uri
 
@@ -64,7 +64,7 @@ def test_the_player_scrubs_all_videos_in_step(tmp_path, make_clip, browser):
     pytest.importorskip("playwright")
     clips = [make_clip(frames=8, title=f"clip <{n}>", label=f"label {n}") for n in range(2)]
     clips[1] = make_clip(frames=5, truth=255 - clips[1].truth[:5], title="second", label="second")
-    write_report(tmp_path / "report.html", Report("tiny", {}, clips=clips))
+    write_report(tmp_path / "report.html", RunReport("tiny", {}, clips=clips))
     page = browser.new_page(viewport={"width": 390, "height": 844}, reduced_motion="reduce")
     problems = []
     page.on("pageerror", lambda error: problems.append(str(error)))
