@@ -51,7 +51,9 @@ MOST = 200  # steps of the part "feed"
 
 def matmul(dtype: str, budget: float) -> Numbers:
     """Measures matrix products with float32 accumulation; the ceiling is the fastest rate in operations a second."""
-    shapes = CPU_PRODUCTS if jax.default_backend() == "cpu" else ACCELERATOR_PRODUCTS
+    shapes = ACCELERATOR_PRODUCTS
+    if jax.default_backend() == "cpu":
+        shapes = CPU_PRODUCTS
     product = jax.jit(lambda x, w: jnp.matmul(x, w, preferred_element_type=jnp.float32))
     rates = {}
     for n, k, m in shapes:

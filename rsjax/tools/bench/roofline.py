@@ -250,12 +250,16 @@ def _measure(
     out = jax.eval_shape(operation.run, *operands)
     forward = jax.jit(operation.run)
     cotangent = jnp.ones(out.shape, out.dtype)
-    run = partial(both, cotangent, *operands) if gradient else partial(forward, *operands)
+    run = partial(forward, *operands)
+    passes = 1
+    if gradient:
+        run = partial(both, cotangent, *operands)
+        passes = 3
     seconds = median_seconds(run, budget)
     read = sum(x.size for x in operands)
     # Forward moves operands and result; the gradient moves operands, the result's gradient and the operands' gradients.
     moved = FLOAT * (read + out.size + (gradient and not operation.passes_on) * (2 * read + out.size))
-    products = (3 if gradient else 1) * operation.flops
+    products = passes * operation.flops
     return operation.times * seconds, operation.times * max(products / ceiling, moved / speed)
 
 

@@ -69,7 +69,9 @@ def bench(
                 add(name, measure_part(name, config, batch, budget, horizons, numbers))
         if rival is not None:
             say("measuring torch")
-            ours = parts.train_adamw(config, batch, budget) if "train" in only else {}
+            ours: dict[str, Any] = {}
+            if "train" in only:
+                ours = parts.train_adamw(config, batch, budget)
             add("torch", ours | rival(config, batch, budget, horizons[0]))
     return numbers
 
@@ -128,14 +130,19 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:
         if (name := f"{plain}_{variant}") not in numbers:
             return plain
         gains = (numbers[name] > numbers[plain]) == quantity.endswith("_per_s")
-        chosen[f"{part}_fastest_torch_{dtype}"] = variant if gains else "eager"
-        return name if gains else plain
+        if gains:
+            chosen[f"{part}_fastest_torch_{dtype}"] = variant
+            return name
+        chosen[f"{part}_fastest_torch_{dtype}"] = "eager"
+        return plain
 
     same_device = (numbers.get("torch_device") == "cpu") == (numbers.get("platform") == "cpu")
     if same_device and not dual:  # the PyTorch baseline has only one branch
         for dtype in ("float32", "bfloat16"):
             theirs = fastest("train", "train_step_s", dtype, "compiled")
-            ours = "train_step_s_adamw" if "train_step_s_adamw" in numbers else "train_step_s"
+            ours = "train_step_s"
+            if "train_step_s_adamw" in numbers:
+                ours = "train_step_s_adamw"
             over[f"train_speedup_over_torch_{dtype}"] = (theirs, ours)
             over[f"sample_speedup_over_torch_{dtype}"] = (
                 f"torch_sample_s_per_frame_{dtype}",
@@ -151,13 +158,16 @@ def ratios(numbers: dict[str, Any], dual: bool) -> dict[str, Any]:
 def facts(config: Config, batch: int) -> dict[str, Any]:
     """Returns facts about the model, the machine and the date."""
     device = jax.local_devices()[0]
+    name = device.device_kind
+    if device.platform == "cpu":
+        name = _cpu_model()
     return {
         "preset": config.name,
         "batch": batch,
         "model": config.model.family,
         "frames": config.clips.frames,
         **{name: getattr(config.model, name) for name in MODEL_FACTS if hasattr(config.model, name)},
-        "device": _cpu_model() if device.platform == "cpu" else device.device_kind,
+        "device": name,
         "platform": device.platform,
         "cores": len(os.sched_getaffinity(0)),
         "jax": jax.__version__,
@@ -195,5 +205,7 @@ def _shown(name: str, value: Any) -> str:
     if "_per_s" in name:
         return f"{value:,.1f} /s"
     if "_s_" in name or name.endswith("_s"):
-        return f"{value:,.3f} s" if value >= 1 else f"{1e3 * value:,.2f} ms"
+        if value >= 1:
+            return f"{value:,.3f} s"
+        return f"{1e3 * value:,.2f} ms"
     return f"{value:,.3f}"

@@ -50,3 +50,12 @@ def test_errors_are_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     with pytest.raises(SystemExit, match="2"):
         call(monkeypatch, "debug", "--only", "loadr")
     assert capsys.readouterr().err.startswith("error: --only has no part 'loadr'; did you mean 'loader'")
+
+
+def test_torch_needs_the_folder_of_rivals_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "experiments" / "bench.py"))
+    with pytest.raises(SystemExit, match="2"):
+        call(monkeypatch, "debug", "--torch")
+    assert "--torch needs the folder benchmarks/ of a checkout" in capsys.readouterr().err
