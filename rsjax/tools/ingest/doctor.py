@@ -196,14 +196,14 @@ def quaternions(rows: Float[np.ndarray, "N n"]) -> list[int]:
 
     A 1 or -1 beside three zeros in every row, such as a gripper's, does not count.
     """
-    found: list[int] = []
+    firsts: list[int] = []
     for first in range(rows.shape[1] - 3 if len(rows) else 0):
-        free = not found or first >= found[-1] + 4
+        free = not firsts or first >= firsts[-1] + 4
         part = rows[:, first : first + 4]
         turns = (np.abs(part).max(1) < 1 - _TOLERANCE).any()
         if free and turns and (np.abs(np.linalg.norm(part, axis=1) - 1) < _TOLERANCE).all():
-            found.append(first)
-    return found
+            firsts.append(first)
+    return firsts
 
 
 def _sample(count: int, frames: int) -> list[int]:

@@ -88,7 +88,7 @@ class IngestPlan:
     @property
     def items(self) -> Path:
         """The part of the folder in which work items store their outputs and marks."""
-        return self.folder / "units"
+        return self.folder / "items"
 
     def keys(self, ref: EpisodeRef) -> dict[str, str]:
         """Returns the key of each of an episode's work items, by step."""

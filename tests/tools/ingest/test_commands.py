@@ -134,13 +134,13 @@ def test_a_command_that_is_stopped_goes_on(command: Command, tmp_path: Path, num
     line = ["folder", source, "--out", tmp_path / "store", *SMALL]
     words = [sys.executable, "-m", "experiments.ingest", *map(str, line), "--workers", "2"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.rglob("units/**/*.json")):
+        while not list(tmp_path.rglob("items/**/*.json")):
             assert process.poll() is None
             time.sleep(0.01)
         process.send_signal(number)
         _, text = process.communicate()
     assert process.returncode == status and text.count("\n") == 1 and "the same command resumes" in text
-    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/**/*.json")}
+    marks = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("items/**/*.json")}
     assert 0 < len(marks) < 200 and not (tmp_path / "store").exists()
     text = command(ingest, *line, "--workers", 0, "--keep-clips")
     assert f"this run  {200 - len(marks)} work items" in text

@@ -108,11 +108,11 @@ def test_the_same_again_does_nothing_and_more_episodes_reuse_annotations(tmp_pat
     ingested(clip_plan(tmp_path, Source(3), methods))
     assert ingested(clip_plan(tmp_path, Source(3), methods)) is None
     plan = clip_plan(tmp_path, Source(4), methods)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("units/tracks/*/*")}
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("items/tracks/*/*")}
     summary = ingested(plan)
     assert summary is not None and summary.done == 4 and len(before) == 6
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert not list((tmp_path / "store.work" / "units" / "clips").rglob("*.*"))
+    assert not list((tmp_path / "store.work" / "items" / "clips").rglob("*.*"))
 
 
 @pytest.mark.parametrize("keep_clips", [False, True])
@@ -169,7 +169,7 @@ def test_a_network_that_cannot_be_loaded_ends_the_ingest_and_quarantines_nothing
     plan = clip_plan(tmp_path, Source(2), Annotators(None, None, Relative(loads=False), None, None))
     with pytest.raises(AnnotationError, match=r"relative.pt: no such file"):
         ingested(plan)
-    assert not list(tmp_path.rglob("units/**/*.json"))
+    assert not list(tmp_path.rglob("items/**/*.json"))
 
 
 def test_a_network_that_tracks_sees_recorded_depth_or_else_that_of_the_step(tmp_path: Path) -> None:

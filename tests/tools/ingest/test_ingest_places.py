@@ -66,7 +66,7 @@ def test_two_that_make_one_store_do_not_meet(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_worker_left_is_swept_up(tmp_path: Path) -> None:
-    left = tmp_path / "store.work" / "units" / "tracks" / "ab" / "x.array_record.host-1.tmp"
+    left = tmp_path / "store.work" / "items" / "tracks" / "ab" / "x.array_record.host-1.tmp"
     left.parent.mkdir(parents=True)
     left.touch()
     ingested(clip_plan(tmp_path, Source(2)))

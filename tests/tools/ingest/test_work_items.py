@@ -138,13 +138,13 @@ def test_after_a_kill_only_the_rest_is_run(tmp_path: Path) -> None:
     parent.kill()
     parent.communicate()
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
-    marks = len(list(tmp_path.rglob("units/**/*.json")))
+    marks = len(list(tmp_path.rglob("items/**/*.json")))
     assert 0 < marks < 12
     started = len(runs(tmp_path))
     plan = noting_plan(tmp_path, Source(6))
     assert finish(plan).done == 6
     assert len(runs(tmp_path)) - started == 12 - marks
-    assert len(list(tmp_path.rglob("units/**/*.array_record"))) == 12
+    assert len(list(tmp_path.rglob("items/**/*.array_record"))) == 12
 
 
 def test_a_full_disk_ends_the_run_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,7 +138,7 @@ def transition_probabilities(
     torch = library("torch", "TransNetV2")
     count = len(pictures)
     padded = np.pad(pictures, ((_EDGE, _EDGE + -count % STEP), (0, 0), (0, 0), (0, 0)), mode="edge")
-    found = []
+    probabilities = []
     for start in range(0, count, STEP):
         window = torch.from_numpy(padded[start : start + WINDOW])[None].to(device)
         with torch.no_grad():
@@ -147,5 +147,5 @@ def transition_probabilities(
             logits = output[0]
         else:
             logits = output
-        found.append(torch.sigmoid(logits)[0, _EDGE : _EDGE + STEP, 0].cpu().numpy())
-    return np.concatenate(found)[:count].astype(np.float32)
+        probabilities.append(torch.sigmoid(logits)[0, _EDGE : _EDGE + STEP, 0].cpu().numpy())
+    return np.concatenate(probabilities)[:count].astype(np.float32)

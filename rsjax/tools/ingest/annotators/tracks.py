@@ -295,11 +295,11 @@ class BootsTapir(GridTracker, Network):
         video = torch.from_numpy(square).to(self.device)[None].float() / 127.5 - 1
         rows = np.concatenate([np.zeros((len(points), 1)), points[:, ::-1] * self.side], 1)  # frame, y, x
         with torch.no_grad():
-            found = model(video, torch.from_numpy(rows.astype(np.float32))[None].to(self.device))
-            hidden = torch.sigmoid(found["occlusion"][0])
-            far = torch.sigmoid(found["expected_dist"][0])
+            output = model(video, torch.from_numpy(rows.astype(np.float32))[None].to(self.device))
+            hidden = torch.sigmoid(output["occlusion"][0])
+            far = torch.sigmoid(output["expected_dist"][0])
         seen = ((1 - hidden) * (1 - far) > 0.5).cpu().numpy()
-        return _cleaned(found["tracks"][0].cpu().numpy() / self.side, seen, points)
+        return _cleaned(output["tracks"][0].cpu().numpy() / self.side, seen, points)
 
     def build(self) -> Any:
         module = checkout_module(self.checkout, "tapnet.torch.tapir_model", self.title)

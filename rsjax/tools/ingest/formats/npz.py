@@ -44,7 +44,7 @@ _SAVE = "save the file again"
 
 
 @dataclass(frozen=True)
-class Settings:
+class NpzConfig:
     """The options of :func:`open_source`."""
 
     frames: str
@@ -98,7 +98,7 @@ def open_source(
         stay = None
     else:
         stay = tuple(held)
-    settings = Settings(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions))
+    settings = NpzConfig(frames, actions, task, float(fps), after, kind or "", stay, tuple(quaternions))
     return NpzFolder(folder, tuple(str(file.relative_to(folder)) for file in files), settings)
 
 
@@ -115,7 +115,7 @@ class NpzFolder:
     name = "npz"
     folder: Path
     files: tuple[str, ...]
-    settings: Settings
+    settings: NpzConfig
 
     def episodes(self) -> Iterator[EpisodeRef]:
         """Lists the files by name."""
