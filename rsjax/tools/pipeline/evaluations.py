@@ -84,14 +84,19 @@ def evaluate_run(directory: Path, data: Path, request: Request) -> Iterator[Path
     trained = _sampling(replace(load(directory), config=config), protocol)
     run = Run(config, directory, data)
     store = run.open_clips()
-    eval_clips = open_store(request.data) if request.data else evaluation_store(run, store, protocol)
-    for split in chosen_splits(eval_clips, protocol.splits):
-        parts = [label(protocol, standard), *([split] if split != "test" else [])]
-        key = safe_id(
-            str(eval_clips.manifest.get("key") or eval_clips.path.absolute())
-        )  # a key may be unsafe as a path
-        name = ",".join([*parts, *([f"data={key}"] if request.data else [])])
-        chosen = EvaluationClips.read(eval_clips, split, replace(protocol, splits=(split,)), config.clips)
+    if request.data:
+        scored_store = open_store(request.data)
+    else:
+        scored_store = evaluation_store(run, store, protocol)
+    for split in chosen_splits(scored_store, protocol.splits):
+        parts = [label(protocol, standard)]
+        if split != "test":
+            parts.append(split)
+        if request.data:
+            key = str(scored_store.manifest.get("key") or scored_store.path.absolute())
+            parts.append(f"data={safe_id(key)}")  # a key may be unsafe as a path
+        name = ",".join(parts)
+        chosen = EvaluationClips.read(scored_store, split, replace(protocol, splits=(split,)), config.clips)
         if request.retakes:
             name = f"{name},second-takes"
             chosen = with_second_takes(chosen, config.sim.workers)
