@@ -24,7 +24,7 @@ from rsjax.tools.policies.config import PolicyConfig, policy_preset, public, toy
 from rsjax.tools.policies.ddpm import add_noise, cosine_schedule
 from rsjax.tools.policies.demos import Demos, load_demos
 from rsjax.tools.policies.diffusion_policy import DiffusionPolicy, Range, Windows, scaled
-from rsjax.tools.policies.policy import Actor, Policy, load_policy
+from rsjax.tools.policies.policy import Policy, load_policy
 from rsjax.tools.policies.policy_training import train_policy
 from rsjax.tools.policies.studies.trials import Trials, try_policy
 from rsjax.tools.policies.unet1d import Conv, Double, spatial_softmax, step_embedding
@@ -235,21 +235,21 @@ def test_actions_follow_from_the_seed_and_stay_in_the_demonstrations_range(polic
     assert (one >= low - 1e-6).all() and (one <= high + 1e-6).all()
 
 
-def test_an_actor_plans_every_few_frames(policy: tuple[Policy, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = Policy(policy[0].model, policy[0].params, Range((0.0,) * 3, (1.0,) * 3))
-    planned: list[np.ndarray] = []
+class Recall(DiffusionPolicy):
+    """Plans controls that tell which frames it saw, and the place of each control."""
 
-    def plan(model: Any, params: Any, frames: Any, key: Any) -> Any:
-        planned.append(frames)
-        return np.broadcast_to(2 * (len(planned) * 0.1 + 0.01 * np.arange(4))[:, None] - 1, (2, 4, WIDTH))
+    def plan(self, params: Any, frames: Any, key: Any) -> Any:
+        older, newest = frames[:, 0, 0, 0, 0], frames[:, 1, 0, 0, 0]
+        numbers = (0.2 * older + 0.1 * newest)[:, None, None] + 0.01 * jnp.arange(4)[None, :, None]
+        return 2 * jnp.broadcast_to(numbers, (len(frames), 4, WIDTH)) - 1
 
-    monkeypatch.setattr("rsjax.tools.policies.policy._plan", plan)
-    net = replace(trained.model, config=replace(trained.model.config, execute=4))
-    actor = Actor(replace(trained, model=net), 0)
+
+def test_an_actor_plans_every_few_frames(policy: tuple[Policy, Path]) -> None:
+    net = Recall(replace(toy(), execute=4), SIZE, CONTROLS, WIDTH)
+    actor = Policy(net, policy[0].params, Range((0.0,) * 3, (1.0,) * 3)).actor()
     frames = [np.full((2, SIZE, SIZE, 3), number, np.uint8) for number in range(4)]
     rows = [actor({"rgb": each}) for each in frames]
-    assert [each[0, :, 0, 0, 0].tolist() for each in planned] == [[0, 0], [1, 2]]  # frame 0 twice, then 1 and 2
-    for row, first in zip(rows, (0.1, 0.12, 0.2, 0.22), strict=True):
+    for row, first in zip(rows, (0.0, 0.02, 0.4, 0.42), strict=True):  # it sees frame 0 twice, then 1 and 2
         np.testing.assert_allclose(row, np.repeat([first, first + 0.01], WIDTH)[None].repeat(2, 0), atol=1e-6)
     with pytest.raises(UserError, match=r"sees frames \(B, 16, 16, 3\), not \(2, 8, 8, 3\)"):
         actor({"rgb": np.zeros((2, 8, 8, 3), np.uint8)})

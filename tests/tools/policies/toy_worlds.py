@@ -74,15 +74,15 @@ class ToyPolicy:
 
 
 class ToyImagination:
-    """A world model in which the dot moves at a share of its true speed, and the judge's eye."""
+    """A world model in which the dot moves at a share of its true speed; notes the draws of each restart."""
 
-    def __init__(self, pace: float, count: int) -> None:
+    def __init__(self, pace: float, count: int, draws: list[list[int]]) -> None:
         self._pace, self._place = pace, np.zeros(count)
-        self.draws: list[list[int]] = []
+        self._draws = draws
 
     def restart(self, which: np.ndarray, first: Video, index: np.ndarray) -> Video:
         self._place[which] = first.rgb[:, 0, 7, :, 0].argmax(-1)
-        self.draws.append(index.tolist())
+        self._draws.append(index.tolist())
         return first
 
     def step(self, actions: np.ndarray) -> Video:
@@ -97,12 +97,13 @@ def judge(frames: np.ndarray) -> np.ndarray:
     return np.stack([done, ~done, np.zeros_like(done)], -1).astype(float)
 
 
-def imagined(count: int, pace: float = 1.0, judge: Any = judge) -> ModelWorld:
-    """A world of ``count`` imagined episodes."""
+def imagined(count: int, pace: float = 1.0, judge: Any = judge, draws: list[list[int]] | None = None) -> ModelWorld:
+    """A world of ``count`` imagined episodes; ``draws`` gets those of each start."""
+    noted = [] if draws is None else draws
 
     class Model:
         def imagine(self, params: Any, assets: Any, count: int) -> ToyImagination:
-            return ToyImagination(pace, count)
+            return ToyImagination(pace, count, noted)
 
     return ModelWorld(trained_like(Model(), {"pace": pace}), count, judge, action_range(RANGE))
 

@@ -151,10 +151,10 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(improvement, "train_policy", train)
     settings = Improvement(rounds=2, imagined=10, max_steps=4, steps=7, share=0.5, learning_rate=0.5)
     starts = first_frames(simulated(5), list(range(10)), tmp_path / "starts.npz")
-    model: Any = imagined(5)
+    draws: list[list[int]] = []
+    model = imagined(5, draws=draws)
     inputs: Any = (ToyPolicy(0.8), demos(3), starts, model, simulated(5), settings, TRIALS, tmp_path)
     results = improve(*inputs)
-    draws = model._imagination.draws
     assert draws[0] == [0, 1, 2, 3, 4] and draws[2] == [10, 11, 12, 13, 14]  # a second round has other draws
     kept = [row["kept"] for row in results["rounds"]]
     assert kept == [2, 4]  # of columns 0 … 4 twice, those from which 4 steps at this speed come to column 10
@@ -173,9 +173,10 @@ def test_imagined_successes_are_learnt_from(tmp_path: Path, monkeypatch: pytest.
     assert "| 2 | 10 | 4 | 0 % | imagined | 60 % |" in (tmp_path / "results.md").read_text()
     count = len(draws)
     assert improve(*inputs) == results and len(draws) == count  # nothing is imagined again
-    other: Any = imagined(5, pace=0.5)  # a model of other weights imagines anew
+    drawn: list[list[int]] = []
+    other = imagined(5, pace=0.5, draws=drawn)  # a model of other weights imagines anew
     made, counts = improvement.imagine(inputs[0], starts, other, settings, 1, tmp_path / "round-1" / "episodes")
-    assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(other._imagination.draws) == 2
+    assert not made and counts == {"uninterpretable": 0, "clipped": 0} and len(drawn) == 2
 
 
 def test_old_demonstrations_are_the_share_that_is_asked_for() -> None:
