@@ -2,7 +2,7 @@
 
 >>> import rsjax
 >>> model = rsjax.load("runs/tiny")
->>> clips = rsjax.open_store("data/lift-5f1bcdd16386361c").source("test")
+>>> clips = rsjax.open_store("data/lift-9c6b21215947e5ca").source("test")
 >>> video = model.generate(clips[0]["rgb"][:1], clips[0]["actions"])
 
 ``docs/api.md`` describes the whole API.
