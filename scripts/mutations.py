@@ -117,8 +117,8 @@ MUTATIONS = (
     ),
     Mutation(
         "objective: each term has weight 1",
-        "sum((weights[name] * share for",
-        "sum((share for",
+        "loss += weights[name] * shares[name]",
+        "loss += shares[name]",
         (*OBJECTIVE, "test_state.py"),
     ),
     Mutation(
@@ -171,8 +171,8 @@ MUTATIONS = (
     ),
     Mutation(
         "sharding: the ratio of a device instead of the whole batch's",
-        "value / jnp.maximum(total(jax.lax.stop_gradient(weight)), 1e-8)",
-        "value / jnp.maximum(jax.lax.stop_gradient(weight), 1e-8)",
+        "whole = over_devices(jax.lax.stop_gradient(weight), axis_name)",
+        "whole = jax.lax.stop_gradient(weight)",
         SHARDING,
     ),
     Mutation(
