@@ -114,7 +114,7 @@ def rollout_tokens(trained: Any, clips: Any) -> dict[str, Any]:
     """Returns the tokens of the videos generated under the clips' own actions."""
     import jax
 
-    from rsjax.models.roboscape.rollout import rollout
+    from rsjax.models.roboscape.sample import rollout
     from rsjax.tokenizers.codec import Codec
 
     model, codec = (

@@ -34,7 +34,7 @@ class Decoding:
 
 
 @dataclass(frozen=True)
-class Moment:
+class BranchState:
     """A frame of a clip, and the memory from which the next one is generated.
 
     Attributes:
@@ -59,31 +59,31 @@ class Branching(Protocol):
 
     lanes: int  # clips that one pass generates
 
-    def begin(self, first: Video) -> Moment:
+    def begin(self, first: Video) -> BranchState:
         """Returns the first frame of a clip, (1, 1, …), as the model sees it."""
         ...
 
     def advance(
-        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
-    ) -> list[Moment]:
-        """Generates the next frame of each of these moments, at most ``lanes``, and uses up their memories.
+        self, states: Sequence[BranchState], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[BranchState]:
+        """Generates the next frame of each of these states, at most ``lanes``, and uses up their memories.
 
         A frame has the same bits whichever other frames are generated in the same pass.
 
         Args:
-            moments: with memories.
+            states: with memories.
             actions: in the recording's units.
             decodings: with the same ``program``.
         """
         ...
 
-    def lightened(self, moment: Moment) -> Moment:
-        """Returns the moment with a small memory, which :meth:`advance` does not use up, or with none.
+    def lightened(self, state: BranchState) -> BranchState:
+        """Returns the state with a small memory, which :meth:`advance` does not use up, or with none.
 
         First frames have a small memory, and some later frames do. The frames that follow have the same bits.
         """
         ...
 
-    def depth(self, moment: Moment) -> Float32[np.ndarray, "H W"] | None:
+    def depth(self, state: BranchState) -> Float32[np.ndarray, "H W"] | None:
         """Returns a frame's depth in metres; None if its clip has none."""
         ...

@@ -8,7 +8,7 @@ import numpy as np
 from rsjax.config import SampleConfig
 from rsjax.layers.unstacked_params import apart, together
 from rsjax.models.ivideogpt.rollout import sample
-from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.ivideogpt import toy
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, given, random_params
 

@@ -13,7 +13,7 @@ from rsjax.config import SampleConfig
 from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.sample import rollout
 from rsjax.models.trained import ShapeError, TrainedModel
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy

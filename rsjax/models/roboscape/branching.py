@@ -11,7 +11,7 @@ Axes: N clips, S cells, A action dimensions.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int, UInt8
 
 from rsjax.clip import Video
-from rsjax.config import TokenizerConfig, TokenModelConfig
+from rsjax.config import SampleConfig, TokenizerConfig, TokenModelConfig
 from rsjax.data.normalization import with_sums
-from rsjax.models.branch_states import Decoding, Moment
+from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.stepping import Dials, Network, State, advance, begin, last_frame, restart
+from rsjax.models.roboscape.departures import mean_codes
+from rsjax.models.roboscape.sample import State, start, step
 from rsjax.models.roboscape.transformer import Cache
-from rsjax.tokenizers import lfq
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.trainable import Params
@@ -33,11 +33,11 @@ from rsjax.trainable import Params
 
 @dataclass(frozen=True)
 class _Memory:
-    """The state from which a moment's clip continues.
+    """What a clip continues from.
 
     Attributes:
         state: of one clip, without its cache.
-        cache: None stands for an empty one.
+        cache: None if the clip has its first frame only, or if its window is full and is encoded again anyway.
         sums: of the clip's scaled actions.
     """
 
@@ -65,90 +65,115 @@ class TokenBranching:
     ) -> None:
         self.lanes = lanes
         self._width = program_clips(lanes)
-        self._config, self._arch, self._codec, self._params = config, arch, codec, params
+        self._config = config
+        self._arch = arch
+        self._codec = codec
+        self._params = params
         self._has_depth = arch.use_depth and has_depth and codec.normalization.depth_range is not None
-        # The state that clips begin with. It is on the parameters' devices, as are the states that passes return, so
-        # that one program takes both.
+        # First states are on the parameters' devices, as are those that passes return, so that one program takes both.
         where = getattr(jax.tree.leaves(params)[0], "sharding", None) or jax.local_devices()[0]
         self._place = partial(jax.device_put, device=where)
-        self._empty = self._place(begin(self._network(Decoding(steps=1)), 1))
 
-    def begin(self, first: Video) -> Moment:
+    def begin(self, first: Video) -> BranchState:
         video = first if self._has_depth else Video(first.rgb)
         grids = self._codec.encode(video)
-        tokens = {name: grid.reshape(-1) for name, grid in grids.items()}
-        cells = {name: jnp.asarray(row[None], jnp.int32) for name, row in tokens.items()}
+        cells = {branch: jnp.asarray(grid.reshape(1, 1, -1), jnp.int32) for branch, grid in grids.items()}
         if self._arch.use_depth:
             cells.setdefault("depth", jnp.zeros_like(cells["rgb"]))
-        state = self._place(replace(restart(self._empty, jnp.ones(1, bool), cells, self._empty.key), cache={}))
-        seen = self._codec.decode_rgb(grids["rgb"])[0, 0]
+        state = replace(self._start(self._sample(Decoding(steps=1)), cells), cache={})
         sums = np.zeros(len(self._codec.normalization.action_mean))
-        return Moment(seen, tokens, None, _Memory(state, None, sums))
+        tokens = {branch: grid.reshape(-1) for branch, grid in grids.items()}
+        return BranchState(self._codec.decode_rgb(grids["rgb"])[0, 0], tokens, None, _Memory(state, None, sums))
 
     def advance(
-        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
-    ) -> list[Moment]:
-        parts = [slice(start, start + self._width) for start in range(0, len(moments), self._width)]
-        return [made for part in parts for made in self._advance(moments[part], actions[part], decodings[part])]
+        self, states: Sequence[BranchState], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[BranchState]:
+        made = []
+        for first in range(0, len(states), self._width):
+            part = slice(first, first + self._width)
+            made += self._advance(states[part], actions[part], decodings[part])
+        return made
 
     def _advance(
-        self, moments: Sequence[Moment], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
-    ) -> list[Moment]:
-        """Advances moments in one run of the program."""
-        count, full = len(moments), [*range(len(moments)), *[0] * (self._width - len(moments))]
-        memories = [cast(_Memory, moments[i].memory) for i in full]
-        scaled = self._codec.normalization.scaled(actions[full])
+        self, states: Sequence[BranchState], actions: Float[np.ndarray, "N A"], decodings: Sequence[Decoding]
+    ) -> list[BranchState]:
+        """Advances clips in one run of the program; the first clip fills lanes that are left over."""
+        count = len(states)
+        lanes = [*range(count), *[0] * (self._width - count)]
+        memories: list[_Memory] = [states[lane].memory for lane in lanes]
+        chosen = [decodings[lane] for lane in lanes]
+        sample = self._sample(chosen[0])
+        scaled = self._codec.normalization.scaled(actions[lanes])
         sums = np.stack([memory.sums for memory in memories]) + scaled
         rows = with_sums(scaled, sums if self._config.departures.integrate_actions else None)
-        net, chosen = self._network(decodings[0]), [decodings[i] for i in full]
-        dials = Dials(
+        caches = []
+        for lane, memory in enumerate(memories):
+            cache = memory.cache
+            if cache is None or lane >= count:  # a pass uses up its caches, so that none can be in two lanes
+                cache = self._start(sample, {name: cells[:, -1:] for name, cells in memory.state.tokens.items()}).cache
+            caches.append(cache)
+        clips = [replace(memory.state, means=_means(self._arch, sample, memory.state)) for memory in memories]
+        new, new_caches, rgb = _advance(
+            self._arch,
+            sample,
+            self._codec.config,
+            self._params,
+            self._codec.params,
+            tuple(caches),
+            tuple(clips),
+            rows,
+            np.array([(each.seed, each.draw) for each in chosen], np.uint32),
             np.array([each.temperature for each in chosen], np.float32),
             np.array([each.guidance for each in chosen], np.float32),
         )
-        seeds = np.array([(each.seed, each.draw) for each in chosen], np.uint32)
-        own = [memory.cache for memory in memories[:count]] + [None] * (self._width - count)
-        caches = tuple(self._empty_cache() if cache is None else cache for cache in own)
-        states = tuple(_fitted(net, memory.state) for memory in memories)
-        codec = self._codec
-        made, caches, rgb = _advance(net, codec.config, self._params, codec.params, caches, states, rows, seeds, dials)
         pictures = np.asarray(rgb)
-        return [self._moment(_Memory(made[i], caches[i], sums[i]), pictures[i]) for i in range(count)]
+        return [self._branch_state(_Memory(new[i], new_caches[i], sums[i]), pictures[i]) for i in range(count)]
 
-    def lightened(self, moment: Moment) -> Moment:
+    def lightened(self, state: BranchState) -> BranchState:
         """Leaves out the cache if the window is full, as it is then encoded again; otherwise, the whole memory."""
-        memory = moment.memory
+        memory = state.memory
         if memory is None or memory.cache is None:
-            return moment
-        full = not self._arch.departures.rotary and int(memory.state.position[0]) == self._arch.frames
-        return replace(moment, memory=replace(memory, cache=None) if full else None)
+            return state
+        if self._arch.departures.rotary or int(memory.state.position) < self._arch.frames:
+            return replace(state, memory=None)
+        return replace(state, memory=replace(memory, cache=None))
 
-    def depth(self, moment: Moment) -> Float32[np.ndarray, "H W"] | None:
-        cells = (moment.means or moment.tokens).get("depth")
+    def depth(self, state: BranchState) -> Float32[np.ndarray, "H W"] | None:
+        cells = (state.means or state.tokens).get("depth")
         if cells is None:
             return None
         return self._codec.decode_depth(cells.reshape(1, self._arch.grid, self._arch.grid, *cells.shape[1:]))[0]
 
-    def _network(self, decoding: Decoding) -> Network:
+    def _sample(self, decoding: Decoding) -> SampleConfig:
         """Returns the settings of a decoding's program, which takes temperature and guidance as arguments.
 
         A model that can be guided always is, so that its cache always has the same shape.
         """
-        drawn, guided = float(decoding.temperature > 0), 2.0 if self._arch.departures.action_dropout else 1.0
-        sample = replace(self._config.sample, seed=0, temperature=drawn, guidance=guided)
-        sample = replace(sample, steps=decoding.steps, top_k=decoding.top_k)
-        return Network(self._arch, sample, self._has_depth, True)
+        return replace(
+            self._config.sample,
+            seed=0,
+            temperature=float(decoding.temperature > 0),
+            guidance=2.0 if self._arch.departures.action_dropout else 1.0,
+            steps=decoding.steps,
+            top_k=decoding.top_k,
+        )
 
-    def _empty_cache(self) -> Cache:
-        return jax.tree.map(jnp.copy, self._empty.cache)  # a pass uses up the cache that it gets
+    def _start(self, sample: SampleConfig, tokens: dict[str, Int[Array, "1 1 S"]]) -> State:
+        """Returns the state of one clip after its first frame."""
+        hidden = jnp.ones(1, bool) if self._arch.use_depth and not self._has_depth else None
+        actions = jnp.zeros((1, 1, self._arch.action_inputs))
+        state: State = self._place(_start(self._arch, sample, self._params, tokens, actions, None, hidden))
+        return state
 
-    def _moment(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> Moment:
+    def _branch_state(self, memory: _Memory, rgb: UInt8[np.ndarray, "H W 3"]) -> BranchState:
         state = memory.state
-        last = {
-            kind: {name: np.asarray(cells[0, -1]) for name, cells in of.items() if name == "rgb" or self._has_depth}
-            for kind, of in (("tokens", state.tokens), ("means", state.means))
-        }
+        branches = self._arch.branches if self._has_depth else ("rgb",)
+        tokens = {branch: np.asarray(state.tokens[branch][0, -1]) for branch in branches}
+        means = {branch: np.asarray(cells[0, -1]) for branch, cells in state.means.items() if branch in branches}
+        assert state.entropy is not None
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(memory.cache))
-        return Moment(rgb, last["tokens"], np.asarray(cast(Array, state.entropy)[0]), memory, size, last["means"])
+        without = replace(memory, state=replace(state, entropy=None))
+        return BranchState(rgb, tokens, np.asarray(state.entropy[0]), without, size, means)
 
 
 def program_clips(lanes: int) -> int:
@@ -156,17 +181,21 @@ def program_clips(lanes: int) -> int:
     return 1 if jax.default_backend() == "cpu" else lanes
 
 
-def _fitted(net: Network, state: State) -> State:
-    """Returns the state with mean codes if the settings show them; frames that have none get their tokens' codes."""
-    if not net.sample.shows_means:
-        return replace(state, means={})
-    codes = {name: lfq.tokens_to_codes(cells, net.arch.code_bits) for name, cells in state.tokens.items()}
-    return replace(state, means=state.means or codes)
+def _means(arch: Architecture, sample: SampleConfig, state: State) -> mean_codes.Means:
+    """Returns a state's mean codes if the settings show them; frames that have none get their tokens' codes."""
+    codes = mean_codes.codes_of(sample, state.tokens, arch.code_bits)
+    if codes and state.means:
+        return state.means
+    return codes
 
 
-@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(4,))
+_start = jax.jit(start, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=(5,))
 def _advance(
-    net: Network,
+    arch: Architecture,
+    sample: SampleConfig,
     tokenizer: TokenizerConfig,
     params: Params,
     tokenizer_params: Params,
@@ -174,16 +203,25 @@ def _advance(
     states: tuple[State, ...],
     actions: Float[Array, "N A"],
     seeds: Int[Array, "N 2"],
-    dials: Dials,
+    temperature: Float[Array, " N"],
+    guidance: Float[Array, " N"],
 ) -> tuple[tuple[State, ...], tuple[Cache, ...], UInt8[Array, "N H W 3"]]:
     """Returns the states and caches after the next frame, and the frames."""
     keys = jax.vmap(lambda row: jax.random.fold_in(jax.random.key(row[0]), row[1]))(seeds)
-    state: State = jax.tree.map(lambda *rows: jnp.concatenate(rows), *states)
-    cache: Cache = jax.tree.map(lambda *clips: jnp.concatenate(clips, axis=1), *caches)
-    state = advance(net, params, replace(state, cache=cache, key=keys), actions, dials)
-    grid = last_frame(net, state, "rgb")
-    pixels = cast(Array, Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode"))
-    numbers = [slice(i, i + 1) for i in range(len(states))]
-    parts = tuple(jax.tree.map(lambda x, at=at: x[at], replace(state, cache={})) for at in numbers)
-    kept = tuple(jax.tree.map(lambda x, at=at: x[:, at], state.cache) for at in numbers)
-    return parts, kept, jnp.round(pixels).astype(jnp.uint8)
+    stacked: State = jax.tree.map(lambda *clips: jnp.stack(clips), *states)
+    stacked = replace(
+        stacked,
+        cache=jax.tree.map(lambda *clips: jnp.stack(clips, axis=1), *caches),
+        key=keys[:, None],
+        temperature=temperature[:, None],
+        guidance=guidance[:, None],
+        entropy=jnp.zeros((len(states), 1, arch.grid**2)),
+    )
+    stacked, frame = step(arch, sample, params, stacked, actions[:, None])
+    grid = frame["rgb"].reshape(len(states), arch.grid, arch.grid, *frame["rgb"].shape[3:])
+    pixels: Any = Tokenizer(tokenizer).apply({"params": tokenizer_params}, grid, method="decode")
+    kept = replace(stacked, cache={}, key=None, temperature=None, guidance=None)
+    numbers = range(len(states))
+    parts = tuple(jax.tree.map(lambda x, i=i: x[i], kept) for i in numbers)
+    new_caches = tuple(jax.tree.map(lambda x, i=i: x[:, i], stacked.cache) for i in numbers)
+    return parts, new_caches, jnp.round(pixels).astype(jnp.uint8)

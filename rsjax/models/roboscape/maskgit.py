@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, Key
 
 from rsjax.clip import Array
 from rsjax.config import SampleConfig
+from rsjax.models.roboscape.departures import mean_codes
 from rsjax.tokenizers import lfq
 
 
@@ -103,7 +104,7 @@ def unmask_step(
         keys: one per clip.
         logits: of this frame, by branch.
         no_depth: True for clips without depth, whose depth tokens are meaningless.
-        temperature: one per clip, above 0, instead of that of ``config``.
+        temperature: one per clip, above 0, instead of that of ``config`` unless that is 0.
     """
     return jax.vmap(partial(_unmask_clip, config, code_bits, step))(keys, frame, logits, no_depth, temperature)
 
@@ -116,22 +117,26 @@ def _unmask_clip(
     frame: Frame,
     logits: dict[str, Array],
     no_depth: Array | None,
-    temperature: Array | None,
+    temperature: float | Array | None,
 ) -> Frame:
     order_key, *branch_keys = jax.random.split(key, len(logits) + 1)
-    tokens, confidence, entropy, means = {}, jnp.zeros(frame.mask.shape), frame.entropy, {}
-    temperature = config.temperature if temperature is None else temperature
+    tokens = {}
+    confidence = jnp.zeros(frame.mask.shape)
+    entropy = frame.entropy
+    if temperature is None or config.temperature == 0:
+        temperature = config.temperature
     if entropy is not None:
         entropy = jnp.where(frame.mask, token_entropy(logits["rgb"]), entropy)
     for branch_key, (branch, branch_logits) in zip(branch_keys, logits.items(), strict=True):
         drawn, log_p = sample_tokens(branch_key, branch_logits, temperature, code_bits, config.top_k)
         tokens[branch] = jnp.where(frame.mask, drawn, frame.tokens[branch])
-        if branch in frame.means:
-            mean = lfq.mean_codes(branch_logits, code_bits)
-            means[branch] = jnp.where(frame.mask[:, None], mean, frame.means[branch])
-        confidence += log_p if branch == "rgb" or no_depth is None else jnp.where(no_depth, 0.0, log_p)
+        if branch == "depth" and no_depth is not None:
+            log_p = jnp.where(no_depth, 0.0, log_p)
+        confidence += log_p
+    means = mean_codes.decided(frame.mask, logits, frame.means, code_bits)
     if config.unmask == "random":
         confidence = jax.random.uniform(order_key, frame.mask.shape)
     # Cells that are already decided stay decided: they get the highest rank.
     rank = jnp.argsort(jnp.argsort(jnp.where(frame.mask, confidence, jnp.inf)))
-    return Frame(tokens, rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step], entropy, means)
+    still_masked = rank < jnp.asarray(masked_after(config.steps, frame.mask.shape[-1]))[step]
+    return Frame(tokens, still_masked, entropy, means)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
@@ -18,6 +19,7 @@ from rsjax.data.codec import Record
 from rsjax.data.normalization import Normalization
 from rsjax.data.order import Arrays, Transform
 from rsjax.data.store import Store
+from rsjax.devices import divide
 from rsjax.models.base import Assets, TeacherForced, WorldModel, implements
 from rsjax.models.roboscape import masking, objective, pretrained, records
 from rsjax.models.roboscape.architecture import Architecture
@@ -26,9 +28,10 @@ from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.departures.whole_frames import hidden
 from rsjax.models.roboscape.flops import forward_flops
-from rsjax.models.roboscape.generate import generate, plan, teacher_forced
-from rsjax.models.roboscape.imagine import Imagined
+from rsjax.models.roboscape.imagine import TokenImagination
 from rsjax.models.roboscape.records import Batch
+from rsjax.models.roboscape.sample import Tokens, encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
 from rsjax.tokenizers.codec import Codec
 from rsjax.tokenizers.tokenize import tokenize_store
@@ -124,7 +127,14 @@ class RoboScape(WorldModel[Batch]):
         index: Int[np.ndarray, " B"] | None = None,
         depth: bool = True,
     ) -> Video:
-        return generate(self.config, self.architecture, self._codec(assets), params, prompt, actions, index, depth)
+        """Encodes the prompt, rolls out tokens and decodes them. T may exceed the trained positions."""
+        arch = self.architecture
+        sample = self.config.sample
+        tokens, has_depth = self._tokens(assets, prompt)
+        tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
+        key = jax.random.key(sample.seed)
+        made = rollout(arch, sample, params, tokens, inputs, key, index=index, no_depth=~has_depth)
+        return self._codec(assets).decode(made, has_depth & depth)
 
     def plan(
         self,
@@ -135,10 +145,29 @@ class RoboScape(WorldModel[Batch]):
         depth: bool = True,
         last: int | None = None,
     ) -> Video:
-        return plan(self.config, self.architecture, self._codec(assets), params, prompt, actions, depth, last)
+        """Encodes the prompt once, and continues it under every action sequence.
 
-    def imagine(self, params: Params, assets: Assets, clips: int) -> Imagined:
-        return Imagined(self.config, self.architecture, self._codec(assets), params, clips)
+        Raises:
+            ValueError: the candidates' actions into the prompt's frames differ.
+        """
+        arch = self.architecture
+        sample = self.config.sample
+        candidates = len(actions)
+        past = prompt.rgb.shape[1]
+        if np.any(actions[:, 1:past] != actions[:1, 1:past]):
+            raise ValueError(f"the candidates' actions differ in rows before {past}, which led into the one prompt")
+        tokens, has_depth = self._tokens(assets, prompt)
+        inputs = self._action_inputs(assets, actions)
+        encoded = encode_prompt(arch, sample, params, tokens, inputs[:1, :past], no_depth=~has_depth)
+        same_draws = jnp.zeros(candidates, jnp.int32)
+        key = jax.random.key(sample.seed)
+        made = rollout_from(arch, sample, params, encoded, inputs[:, past:], key, same_draws)
+        if last is not None:
+            made = {branch: grid[:, -last:] for branch, grid in made.items()}
+        return self._codec(assets).decode(made, np.repeat(has_depth & depth, candidates))
+
+    def imagine(self, params: Params, assets: Assets, clips: int) -> TokenImagination:
+        return TokenImagination(self.config, self.architecture, self._codec(assets), params, clips)
 
     def branching(self, params: Params, assets: Assets, has_depth: bool, lanes: int = 1) -> TokenBranching:
         codec = self._codec(assets)
@@ -151,8 +180,13 @@ class RoboScape(WorldModel[Batch]):
     def teacher_forced(
         self, params: Params, assets: Assets, video: Video, actions: Float[np.ndarray, "B T A"], prompt_frames: int = 1
     ) -> TeacherForced:
-        inputs = (params, video, actions, prompt_frames)
-        return teacher_forced(self.config, self.architecture, self._codec(assets), *inputs)
+        """Predicts each frame from the true frames before it. T may exceed the trained positions."""
+        arch = self.architecture
+        tokens, has_depth = self._tokens(assets, video)
+        if arch.use_depth and "depth" not in tokens:
+            tokens["depth"] = jnp.zeros_like(tokens["rgb"])
+        tokens, inputs = divide((tokens, self._action_inputs(assets, actions)), params)
+        return score_tokens(arch, self.config.sample, params, tokens, inputs, ~has_depth, prompt_frames)
 
     def pretrained_shapes(self, directory: Path) -> Params:
         return pretrained.shapes(self.architecture, directory)
@@ -170,3 +204,12 @@ class RoboScape(WorldModel[Batch]):
     def _codec(self, assets: Assets) -> Codec:
         assert assets.tokenizer is not None
         return Codec(self.tokenizer, assets.tokenizer, assets.normalization)
+
+    def _tokens(self, assets: Assets, video: Video) -> tuple[Tokens, np.ndarray]:
+        """Returns a video's tokens by branch (depth if the model and a clip have it), and which clips have depth."""
+        seen = video if self.architecture.use_depth else Video(video.rgb)
+        return {branch: jnp.asarray(grid) for branch, grid in self._codec(assets).encode(seen).items()}, seen.has_depth
+
+    def _action_inputs(self, assets: Assets, actions: Float[np.ndarray, "B T A"]) -> Float[Array, "B T A2"]:
+        """Returns what the action encoder reads."""
+        return jnp.asarray(assets.normalization.action_inputs(actions, self.config.departures.integrate_actions))

@@ -21,8 +21,8 @@ from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.departures.read_previous import frame_before
 from rsjax.models.roboscape.maskgit import sample_tokens
+from rsjax.models.roboscape.sample import cache_slots, window_actions, window_start
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
-from rsjax.models.roboscape.window import window_actions, window_start
 from rsjax.tokenizers import lfq
 from rsjax.trainable import Params
 
@@ -54,7 +54,8 @@ def score_tokens(
     parts = []
     for base in dict.fromkeys(starts[past:]):
         window = {name: _window(grid, base, size) for name, grid in tokens.items()}
-        rows = window_actions(arch, _window(actions, 0, frames + size), base, base, size)
+        rows = _window(actions, base, size)
+        rows = window_actions(arch, rows, rows[:, 0], 0)
         scores = _score_window(replace(arch, unroll=1), params, window, rows, no_depth)
         scored = [t - base for t in range(past, frames) if starts[t] == base]
         parts.append(jax.tree.map(lambda x, scored=scored: np.asarray(x)[:, scored], scores))
@@ -78,9 +79,9 @@ def _score_window(
     """Returns cross-entropy and accuracy of each frame's tokens by branch; frame 0 is predicted from none."""
     clips, frames = actions.shape[:2]
     transformer = partial(Transformer(arch).apply, {"params": params}, no_depth=no_depth if arch.use_depth else None)
-    slots = max(arch.frames + 1, frames) if arch.departures.rotary else frames
     visible = jnp.zeros((clips, frames, arch.grid, arch.grid), bool)
-    _, cache = transformer(tokens, visible, actions, 0, empty_cache(arch, clips, slots))
+    empty = empty_cache(arch, clips, cache_slots(arch, frames + arch.uncommitted))
+    _, cache = transformer(tokens, visible, actions, 0, empty)
     before = {name: frame_before(grid.reshape(clips, frames, -1)) for name, grid in tokens.items()}
 
     def score(t: Array) -> tuple[Scores, Scores]:

@@ -23,7 +23,7 @@ from rsjax.data.store import open_store, write_store
 from rsjax.errors import UserError
 from rsjax.models.base import create_autoencoder, create_model
 from rsjax.models.roboscape.model import RoboScape
-from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.sample import rollout
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.bench import inputs
 from rsjax.tools.bench.timing import median_seconds

@@ -27,10 +27,9 @@ from rsjax.layers.platform import attend_cells, convolve, gelu
 from rsjax.models.base import create_model
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
-from rsjax.models.roboscape.guidance import apply_guided, guided_cache
 from rsjax.models.roboscape.model import RoboScape
+from rsjax.models.roboscape.sample import apply_network, cache_slots, new_cache
 from rsjax.models.roboscape.transformer import Cache, StackedCache
-from rsjax.models.roboscape.window import cache_slots
 from rsjax.tokenizers.flops import products as count_products
 from rsjax.tokenizers.magvit2 import Tokenizer
 from rsjax.tools.bench import inputs
@@ -201,14 +200,14 @@ def cached_pass(model: RoboScape, batch: int) -> Callable[[Params, Cache], Any]:
 
     def run(params: Params, cache: Cache) -> Any:
         start = jnp.asarray(arch.frames - 1)
-        return apply_guided(arch, sample, params, tokens, hidden, actions, start, cache, previous=tokens)[0]
+        return apply_network(arch, sample, params, tokens, hidden, actions, start, cache, previous=tokens)[0]
 
     return run
 
 
 def full_cache(model: RoboScape, batch: int) -> StackedCache:
     """Returns a cache of a full window."""
-    return guided_cache(model.architecture, model.config.sample, batch, cache_slots(model.architecture, 1))
+    return new_cache(model.architecture, model.config.sample, batch, cache_slots(model.architecture, 1))
 
 
 def pass_flops(arch: Architecture, cache: StackedCache) -> int:

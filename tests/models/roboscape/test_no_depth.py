@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rsjax.config import SampleConfig
-from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy import blind, depart
 from tests.models.roboscape.toy_sample import DUAL, KEY, RGB, given, random_params
 

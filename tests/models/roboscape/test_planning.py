@@ -8,7 +8,7 @@ import pytest
 
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import encode_prompt, rollout, rollout_from
+from rsjax.models.roboscape.sample import encode_prompt, rollout, rollout_from
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rsjax.config import SampleConfig
-from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.sample import rollout
 from rsjax.models.roboscape.transformer import TokenEmbed, Transformer
 from rsjax.tokenizers import lfq
 from tests.models.roboscape.toy import depart

@@ -10,8 +10,7 @@ import pytest
 
 from rsjax.config import SampleConfig
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import rollout
-from rsjax.models.roboscape.stepping import Network, advance, begin, last_frame, restart
+from rsjax.models.roboscape.sample import CLIPS, State, rollout, start, step, where
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
 
@@ -46,20 +45,27 @@ def test_stepping_recomputes_a_rollout_though_clips_begin_at_different_times(
 ) -> None:
     params, (tokens, actions) = random_params(model), given(model, 1, FRAMES)
     expected = rollout(model, sample, params, tokens, actions, KEY, cached=False)
-    net, late = Network(model, sample, True), 4
-    first = {name: jnp.asarray(grid.reshape(BATCH, -1)) for name, grid in tokens.items()}
-    keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(BATCH))
-    step = jax.jit(partial(advance, net))
-    state = restart(begin(net, BATCH), jnp.ones(BATCH, bool), first, keys)
-    made: dict[str, list[list[np.ndarray]]] = {name: [[], []] for name in first}
+    late = 4
+    cells = {name: jnp.asarray(grid.reshape(BATCH, 1, 1, -1)) for name, grid in tokens.items()}
+    keys = jax.vmap(partial(jax.random.fold_in, KEY))(jnp.arange(BATCH))[:, None]
+    no_actions = jnp.zeros((1, 1, model.action_inputs))
+
+    def begin(cells: dict[str, jax.Array], key: jax.Array) -> State:
+        return start(model, sample, params, cells, no_actions, key, None)
+
+    begin_each = jax.vmap(begin, out_axes=CLIPS)
+    next_frame = jax.jit(partial(step, model, sample))
+    state = begin_each(cells, keys)
+    made: dict[str, list[list[np.ndarray]]] = {name: [[], []] for name in tokens}
     for number in range(1, FRAMES):
         if number == late:  # the second clip starts over, in the middle of its window
-            state = restart(state, jnp.array([False, True]), first, keys)
+            restarted = jax.vmap(where, (0, CLIPS, CLIPS), CLIPS)
+            state = restarted(jnp.array([False, True]), begin_each(cells, keys), state)
         rows = np.stack([actions[0, number], actions[1, number if number < late else number - late + 1]])
-        state = step(params, state, rows)
-        for name in state.tokens:
+        state, frame = next_frame(params, state, rows[:, None])
+        for name, grid in frame.items():
             for clip in range(BATCH):
-                made[name][clip].append(np.asarray(last_frame(net, state, name)[clip]))
+                made[name][clip].append(np.asarray(grid[clip, 0]).reshape(expected[name].shape[2:]))
     same = partial(np.testing.assert_allclose, rtol=0, atol=1e-4)  # tokens are whole numbers, mean codes are not
     for name, grid in expected.items():
         truth = np.asarray(grid)

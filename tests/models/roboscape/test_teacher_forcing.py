@@ -9,10 +9,9 @@ import pytest
 from rsjax.config import SampleConfig
 from rsjax.models.base import TeacherForced
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import rollout
+from rsjax.models.roboscape.sample import rollout, window_actions, window_start
 from rsjax.models.roboscape.teacher_forcing import score_tokens
 from rsjax.models.roboscape.transformer import Transformer
-from rsjax.models.roboscape.window import window_actions, window_start
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, RGB, given, random_params
 
@@ -32,7 +31,8 @@ def by_definition(model: Architecture, past: int, frames: int, no_depth: np.ndar
     for t in range(past, frames):
         base = int(window_start(model, SAMPLE, t))
         room = [(0, 0), (0, length), (0, 0)]
-        rows = window_actions(model, np.pad(actions, room), base, base, length)
+        rows = np.pad(actions, room)[:, base : base + length]
+        rows = window_actions(model, rows, rows[:, 0], 0)
         seen = {name: np.pad(grid, [*room, (0, 0)])[:, base : base + length] for name, grid in tokens.items()}
         mask = np.zeros((BATCH, length, 3, 3), bool)
         mask[:, t - base :] = True

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from rsjax.config import SampleConfig
 from rsjax.data.normalization import Normalization
-from rsjax.models.roboscape import rollout as module
+from rsjax.models.roboscape import sample as module
 from rsjax.models.roboscape.architecture import Architecture
-from rsjax.models.roboscape.rollout import rollout
-from rsjax.models.roboscape.window import room, window_actions, window_start
+from rsjax.models.roboscape.sample import rollout, window_actions, window_start
 from tests.models.roboscape.toy import depart
 from tests.models.roboscape.toy_sample import BATCH, DUAL, KEY, NO_PARAMS, RGB, count_model, given, random_params
 
@@ -25,15 +24,13 @@ SUMS = depart(replace(RGB, action_inputs=4), integrate_actions=True)
 
 
 @drawn(window=st.integers(2, 20), by=st.integers(0, 19), frames=st.integers(2, 90))
-def test_a_full_window_jumps_by_its_stride_and_all_windows_find_room(window: int, by: int, frames: int) -> None:
+def test_a_full_window_jumps_by_its_stride(window: int, by: int, frames: int) -> None:
     model, sample = Architecture(frames=window), SampleConfig(window_stride=by % window)
     base, by = 0, by % window or window // 2
     for t in range(frames):
         if t - base == window:
             base += by
         assert window_start(model, sample, t) == base
-        assert base + window <= room(model, sample, frames)
-    assert frames <= room(model, sample, frames)
 
 
 @pytest.mark.parametrize("integrate", [False, True])
@@ -42,10 +39,11 @@ def test_a_windows_actions_are_those_of_a_clip_that_begins_there(base: int, inte
     model = SUMS if integrate else RGB
     raw = np.random.default_rng(0).normal(size=(BATCH, 7, 2)).astype(np.float32)
     units = Normalization((0.1, -0.2), (0.5, 2.0), (0.0, 1.0))
-    seen = window_actions(model, units.action_inputs(raw, integrate), base, base, 4)
+    whole = units.action_inputs(raw, integrate)
+    seen = window_actions(model, whole[:, base : base + 4], whole[:, base], 0)
     expected = units.action_inputs(raw[:, base : base + 4].copy(), integrate)
     np.testing.assert_allclose(seen, expected, atol=1e-5)
-    later = window_actions(model, units.action_inputs(raw, integrate), base, base + 2, 2)
+    later = window_actions(model, whole[:, base + 2 : base + 4], whole[:, base], 2)
     np.testing.assert_allclose(later, expected[:, 2:], atol=1e-5)
 
 
@@ -70,7 +68,7 @@ def test_each_frame_is_that_of_a_short_rollout_from_its_window() -> None:
     out = rollout(SUMS, sample, params, tokens, actions, KEY)["rgb"]
     for t in (5, 6, 7, 8, 11):
         base = int(window_start(SUMS, sample, t))
-        seen = window_actions(SUMS, actions, base, base, t + 1 - base)
+        seen = window_actions(SUMS, actions[:, base : t + 1], actions[:, base], 0)
         short = rollout(SUMS, sample, params, {"rgb": out[:, base:t]}, seen, KEY)["rgb"]
         np.testing.assert_array_equal(out[:, t], short[:, -1])
 

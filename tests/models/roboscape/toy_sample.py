@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.models.roboscape import decode, guidance
+from rsjax.models.roboscape import sample
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 
@@ -39,10 +39,11 @@ def count_model(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Takes model and decoding out; counts the calls, and the frames of all clips, that would go to the model."""
     seen: Counter[str] = Counter()
 
-    def apply(_: Any, __: Any, tokens: Any, mask: Any, actions: Any, start: Any, cache: Any, *___: Any) -> Any:
+    def apply(*inputs: Any, **_: Any) -> Any:
+        tokens, mask, cache = inputs[3], inputs[4], inputs[7]
         seen.update(calls=1, frames=mask.shape[0] * mask.shape[1])
         return {name: jnp.zeros((*mask.shape, 2, 8)) for name in tokens}, cache
 
-    monkeypatch.setattr(guidance, "_apply", apply)
-    monkeypatch.setattr(decode, "unmask_step", lambda config, code_bits, keys, step, frame, *_: frame)
+    monkeypatch.setattr(sample, "apply_network", apply)
+    monkeypatch.setattr(sample, "unmask_step", lambda config, code_bits, keys, step, frame, *_, **__: frame)
     return seen

@@ -1,0 +1,638 @@
+"""Generation frame by frame (paper Eq. 1): each frame is decoded from those before it and the actions.
+
+:func:`step` generates the next frame of some clips; :func:`rollout` repeats it. Within a frame, MaskGIT
+(``maskgit.py``) decodes the cells in ``sample.steps`` passes of the network. A temporal cache holds keys and values of
+the frames before. Frame t-1 enters it with its final tokens in the first pass of frame t; what a pass writes for masked
+cells is overwritten before it is read. So cached rollouts equal those that recompute every pass.
+
+**Windows.** A clip may be longer than the ``arch.frames`` positions. Rotary positions roll on with the clip. Learned
+positions count from the window's first frame, so the cache is valid only while the window stays in place. When it is
+full, it moves by a stride, and the frames that stay in it are encoded again.
+
+Axes: B clips, P prompt frames, T frames, F of them generated, K frames kept, H×W = S cells, D code bits, A numbers per
+frame that the action encoder reads, n vocabularies of V codes, L blocks.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Bool, Float, Int, Key
+
+from rsjax.clip import Array
+from rsjax.config import SampleConfig
+from rsjax.layers.unstacked_params import apart, together
+from rsjax.models.roboscape.architecture import Architecture
+from rsjax.models.roboscape.departures import guidance, mean_codes
+from rsjax.models.roboscape.maskgit import Frame, unmask_step
+from rsjax.models.roboscape.transformer import Cache, Cells, StackedCache, Transformer, empty_cache
+from rsjax.trainable import Params
+
+Tokens = dict[str, Int[Array, "B T H W"]]
+Decoded = dict[str, Int[Array, "B T H W"] | Float[Array, "B T H W D"]]  # tokens, or codes if ``sample.shows_means``
+
+
+@struct.dataclass
+class State:
+    """B clips between two frames, all at the same position.
+
+    Clips at different positions are a stack of N states of one clip each: arrays have another axis, as ``CLIPS`` says.
+
+    Attributes:
+        tokens: of the last K frames by branch.
+        means: mean codes of these frames; empty unless ``sample.shows_means``.
+        actions: those that lead into these frames, as in a whole clip's inputs (sums since its first frame).
+        base: those that lead into the window's first frame.
+        cache: of the window's frames except the last ``Architecture.uncommitted``.
+        position: the next frame's position in its window.
+        frame: the next frame's number in its clip.
+        key: decides each clip's draws.
+        no_depth: True for clips without depth, whose depth cells are masked; None: all clips have depth.
+        temperature: of each clip, above 0, instead of that of ``sample``, which still decides whether tokens are drawn.
+        guidance: of each clip instead of that of ``sample``, which still decides whether there is guidance.
+        entropy: of the last frame's RGB tokens in nats; None: not requested.
+    """
+
+    tokens: dict[str, Int[Array, "B K S"]]
+    means: dict[str, Float[Array, "B K S D"]]
+    actions: Float[Array, "B K A"]
+    base: Float[Array, "B A"]
+    cache: Cache
+    position: Int[Array, ""]
+    frame: Int[Array, ""]
+    key: Key[Array, " B"] | None
+    no_depth: Bool[Array, " B"] | None = None
+    temperature: Float[Array, " B"] | None = None
+    guidance: Float[Array, " B"] | None = None
+    entropy: Float[Array, "B S"] | None = None
+
+
+# Axes of a stack of states; the blocks stay the cache's first axis.
+CLIPS: Any = State(0, 0, 0, 0, cache=1, position=0, frame=0, key=0, no_depth=0, temperature=0, guidance=0, entropy=0)  # type: ignore[arg-type]
+
+
+@struct.dataclass
+class Prompt:
+    """Prompt frames encoded by :func:`encode_prompt`, from which any number of rollouts may start."""
+
+    tokens: dict[str, Int[Array, "B P S"]]
+    state: State
+    # Settings that the cache depends on and a rollout must share; the stride is resolved.
+    settings: tuple[tuple[str, Any], ...] = struct.field(pytree_node=False)
+
+
+def start(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    tokens: dict[str, Int[Array, "B P S"]],
+    actions: Float[Array, "B P A"],
+    key: Key[Array, " B"] | None,
+    no_depth: Bool[Array, " B"] | None,
+) -> State:
+    """Encodes prompt frames, and returns the state before the first frame after them."""
+    clips, past = tokens["rgb"].shape[:2]
+    base = int(window_start(arch, sample, past))
+    cache: Any = new_cache(arch, sample, clips, cache_slots(arch, past))
+    known = slice(base, past - arch.uncommitted)
+    if known.stop > base:
+        seen = {branch: cells[:, known] for branch, cells in tokens.items()}
+        mask = jnp.zeros(seen["rgb"].shape, bool)
+        rows = window_actions(arch, actions[:, known], actions[:, base], 0)
+        _, cache = apply_network(arch, sample, params, seen, mask, rows, 0, cache, no_depth)
+
+    kept = remembered_frames(arch, sample)
+
+    def last(x: Array) -> Array:
+        x = x[:, -kept:]
+        return jnp.pad(x, [(0, 0), (kept - x.shape[1], 0), *[(0, 0)] * (x.ndim - 2)])
+
+    return State(
+        tokens=jax.tree.map(last, tokens),
+        means=jax.tree.map(last, mean_codes.codes_of(sample, tokens, arch.code_bits)),
+        actions=last(actions),
+        base=actions[:, base],
+        cache=cache,
+        position=jnp.asarray(past - base, jnp.int32),
+        frame=jnp.asarray(past, jnp.int32),
+        key=key,
+        no_depth=no_depth,
+    )
+
+
+def step(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    state: State,
+    actions: Float[Array, "B A"],
+    beyond: bool = True,
+) -> tuple[State, dict[str, Array]]:
+    """Generates the next frame.
+
+    Args:
+        state: of B clips, or a stack of N states of one clip.
+        actions: those that lead into that frame, as in a whole clip's inputs; of a stack, (N, 1, A).
+        beyond: False promises that no window is full, which leaves its renewal out of the program.
+
+    Returns:
+        The state after the frame, and what the frame is decoded from by branch: tokens (B, S), or mean codes (B, S, D)
+        if ``sample.shows_means``.
+    """
+    renew: Any = partial(_renew_window, arch, sample, params)
+    decode: Any = partial(_decode_frame, arch, sample, params)
+    if state.position.ndim > 0:
+        renew = jax.vmap(renew, (CLIPS, 0), CLIPS)
+        decode = jax.vmap(decode, (CLIPS, 0), CLIPS)
+    if beyond and not arch.departures.rotary:
+        full = state.position == arch.frames
+        state = jax.lax.cond(full.any(), renew, lambda state, full: state, state, full)
+    state = decode(state, actions)
+    cells = (state.means or state.tokens).items()
+    frames_axis = state.position.ndim + 1
+    return state, {branch: jnp.take(x, -1, axis=frames_axis) for branch, x in cells}
+
+
+def _decode_frame(
+    arch: Architecture, sample: SampleConfig, params: Params, state: State, actions: Float[Array, "B A"]
+) -> State:
+    """Decodes the next frame of B clips at one position.
+
+    The first pass covers the last frame, which it commits to the cache, and the next one; later passes cover the next
+    one alone. With ``whole_frames`` every pass is final, so that the last frame is in the cache already.
+    """
+    clips, _, cells = state.tokens["rgb"].shape
+    read = mean_codes.read(sample, state.tokens, state.means)
+    last = {branch: x[:, -1:] for branch, x in read.items()}
+    before_last = {branch: x[:, -2:-1] if x.shape[1] > 1 else x for branch, x in read.items()}
+    pair = {branch: jnp.concatenate([x, x], axis=1) for branch, x in last.items()}  # the second is masked, not read
+    previous = {branch: jnp.concatenate([before_last[branch], x], axis=1) for branch, x in last.items()}
+    mask = jnp.broadcast_to(jnp.array([False, True])[None, :, None], (clips, 2, cells))
+    rows = jnp.stack([state.actions[:, -1], actions], axis=1)
+    rows = window_actions(arch, rows, state.base, state.position - 1)
+    network = partial(apply_network, arch, sample, params, no_depth=state.no_depth, strength=state.guidance)
+    unmask = partial(unmask_step, sample, arch.code_bits, no_depth=state.no_depth, temperature=state.temperature)
+    keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, state.frame), sample.steps))(state.key)
+
+    first = 1 - arch.uncommitted  # frame of the first pass
+    seen, seen_rows, seen_previous = jax.tree.map(lambda x: x[:, first:], (pair, rows, previous))
+    begin = state.position - 1 + first
+    logits, cache = network(seen, mask[:, first:], seen_rows, begin, state.cache, previous=seen_previous)
+    undecided = {branch: jnp.zeros((clips, cells), jnp.int32) for branch in read}
+    entropy = None if state.entropy is None else jnp.zeros((clips, cells))
+    frame = Frame(undecided, mask[:, 1], entropy, mean_codes.codes_of(sample, undecided, arch.code_bits))
+    frame = unmask(keys[:, 0], 0, frame, {branch: x[:, -1] for branch, x in logits.items()})
+
+    def later_pass(number: Array, frame: Frame) -> Frame:
+        seen = {branch: x[:, None] for branch, x in mean_codes.read(sample, frame.tokens, frame.means).items()}
+        logits, _ = network(seen, frame.mask[:, None], rows[:, 1:], state.position, cache, previous=last)
+        return unmask(keys[:, number], number, frame, {branch: x[:, 0] for branch, x in logits.items()})
+
+    frame = jax.lax.fori_loop(1, sample.steps, later_pass, frame)
+
+    def appended(kept: Array, new: Array) -> Array:
+        return jnp.concatenate([kept[:, 1:], new[:, None]], axis=1)
+
+    return replace(
+        state,
+        tokens=jax.tree.map(appended, state.tokens, frame.tokens),
+        means=jax.tree.map(appended, state.means, frame.means),
+        actions=appended(state.actions, actions),
+        cache=cache,
+        position=state.position + 1,
+        frame=state.frame + 1,
+        entropy=frame.entropy,
+    )
+
+
+def _renew_window(
+    arch: Architecture, sample: SampleConfig, params: Params, state: State, full: Bool[Array, ""]
+) -> State:
+    """Moves a full window by its stride: encodes the frames that stay in it from position 0 on."""
+    kept = arch.frames - stride(arch, sample)
+    newest = slice(-kept, None)
+    base = state.actions[:, -kept]
+    cache = state.cache
+    if encoded := kept - arch.uncommitted:
+        read = mean_codes.read(sample, state.tokens, state.means)
+        seen = {branch: x[:, newest][:, :encoded] for branch, x in read.items()}
+        rows = window_actions(arch, state.actions[:, newest][:, :encoded], base, 0)
+        mask = jnp.zeros(seen["rgb"].shape[:3], bool)
+        _, cache = apply_network(arch, sample, params, seen, mask, rows, 0, cache, state.no_depth)
+    moved = replace(state, base=base, cache=cache, position=jnp.full_like(state.position, kept))
+    return where(full, moved, state)
+
+
+def where(which: Bool[Array, ""], new: State, old: State) -> State:
+    """Returns one of two states."""
+    chosen: State = jax.tree.map(partial(jnp.where, which), new, old)
+    return chosen
+
+
+def apply_network(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    tokens: dict[str, Cells],
+    mask: Bool[Array, "B T S"],
+    actions: Float[Array, "B T A"],
+    start: Any,
+    cache: Cache | None,
+    no_depth: Bool[Array, " B"] | None = None,
+    previous: dict[str, Cells] | None = None,
+    strength: Float[Array, " B"] | None = None,
+) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
+    """Returns the logits of a pass and the cache; arguments as for :class:`Transformer`, ``strength`` for guidance.
+
+    Args:
+        params: with stacked blocks, or split by :mod:`rsjax.layers.unstacked_params`.
+        cache: from :func:`new_cache` or an earlier call.
+    """
+    inputs = (tokens, mask, actions, no_depth, previous)
+    (tokens, mask, actions, no_depth, previous), drop = guidance.doubled(sample, inputs, len(mask))
+    shape = (*mask.shape[:2], arch.grid, arch.grid)
+    grids = {branch: cells.reshape(*shape, *cells.shape[3:]) for branch, cells in tokens.items()}
+    whole = params | {"blocks": together(params["blocks"])}
+    logits, cache = Transformer(arch).apply(
+        {"params": whole}, grids, mask.reshape(shape), actions, start, cache, drop, no_depth, previous
+    )
+    return guidance.guided(sample, logits, strength), cache
+
+
+def new_cache(arch: Architecture, sample: SampleConfig, clips: int, slots: int) -> StackedCache:
+    """Returns an empty cache for :func:`apply_network`."""
+    return empty_cache(arch, guidance.copies(sample) * clips, slots, jnp.dtype(sample.cache_dtype))
+
+
+# Windows
+
+
+def stride(arch: Architecture, sample: SampleConfig) -> int:
+    """Returns the number of frames by which a full window moves (learned positions)."""
+    return sample.window_stride or arch.frames // 2
+
+
+def window_start(arch: Architecture, sample: SampleConfig, frame: Int[Array, ""] | int) -> Int[Array, ""] | int:
+    """Returns the first frame of the window that ``frame`` is decoded in: 0 for the first ``arch.frames`` frames."""
+    if arch.departures.rotary:
+        return 0
+    by = stride(arch, sample)
+    excess = frame + 1 - arch.frames
+    return (excess + by - 1) // by * by * (excess > 0)
+
+
+def remembered_frames(arch: Architecture, sample: SampleConfig) -> int:
+    """Returns K: how many frames stay in a window when it moves, but at least those that the next frame reads."""
+    least = 2 if arch.departures.read_previous else 1
+    if arch.departures.rotary:
+        return least
+    return max(arch.frames - stride(arch, sample), least)
+
+
+def cache_slots(arch: Architecture, past: int) -> int:
+    """Returns the number of slots of the temporal cache of a rollout with ``past`` prompt frames.
+
+    In the pass over frames (t-1, t), frame t-1 still attends to t - ``arch.frames``, so a rolling cache has one slot
+    more than the window. A longer prompt is encoded in one pass and must fit.
+    """
+    if not arch.departures.rotary:
+        return arch.frames
+    return max(arch.frames + 1, past - arch.uncommitted)
+
+
+def window_actions(
+    arch: Architecture, rows: Float[Array, "B T A"], base: Float[Array, "B A"], position: Int[Array, ""] | int
+) -> Float[Array, "B T A"]:
+    """Returns the actions into the frames from ``position`` on, as in a clip that begins with the window.
+
+    The first frame of a clip has no action, and the sums of ``model.departures.integrate_actions`` start there.
+
+    Args:
+        base: those that lead into the window's first frame.
+    """
+    if arch.departures.integrate_actions:
+        is_sum = jnp.arange(rows.shape[-1]) >= rows.shape[-1] // 2
+        rows = rows - jnp.where(is_sum, base[:, None], 0.0)
+    first = position + jnp.arange(rows.shape[1]) == 0
+    return jnp.where(first[None, :, None], 0.0, rows)
+
+
+# Rollouts
+
+
+def rollout(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: Tokens,
+    actions: Float[Array, "B T A"],
+    key: Key[Array, ""],
+    cached: bool = True,
+    index: Int[Array, " B"] | None = None,
+    no_depth: Bool[Array, " B"] | None = None,
+) -> Decoded:
+    """Generates the frames after the prompt.
+
+    One program is compiled for each number of clips, each number of prompt frames and each length, rounded up to a
+    multiple of ``arch.frames``.
+
+    Args:
+        prompt: the tokens of P frames by branch. If "depth" is missing for a model with that branch, no clip has depth.
+        actions: of all T frames, normalised; row t led into frame t, row 0 is not read.
+        key: of the random draws; the draws do not depend on actions.
+        cached: False recomputes all frames of the window in every pass, for comparison.
+        index: each clip's number, which decides its draws together with ``key``; 0, 1, … by default.
+        no_depth: True for clips without depth; None: all have depth. Such clips' depth is masked in every frame, as in
+            training, and zeros in the result.
+
+    Returns:
+        Tokens of all T frames by branch; the first P are the prompt. If ``sample.shows_means``, the prompt's codes and
+        the others' mean codes instead, from which the tokenizer can decode pictures too.
+
+    Raises:
+        ConfigError: the model does not support these settings.
+        ValueError: T leaves nothing to generate; prompt, actions and ``no_depth`` differ in their number of clips; or
+            the prompt lacks depth tokens of clips with depth.
+    """
+    arch.check_sampling(sample)
+    clips, past = prompt["rgb"].shape[:2]
+    frames = actions.shape[1]
+    _check_lengths(past, frames)
+    if clips != len(actions):
+        raise ValueError(f"{clips} prompts and {len(actions)} action sequences; encode_prompt shares one among many")
+    tokens, no_depth = _prompt_tokens(arch, prompt, no_depth)
+    program = _rollout if cached else _recomputed
+    keys = _clip_keys(key, index, clips)
+    rows = _padded(arch, actions, frames)
+    made = program(arch, replace(sample, seed=0), params, tokens, no_depth, rows, jnp.asarray(frames), keys)
+    return {branch: grid[:, :frames] for branch, grid in made.items()}
+
+
+def encode_prompt(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: Tokens,
+    actions: Float[Array, "B P A"],
+    no_depth: Bool[Array, " B"] | None = None,
+) -> Prompt:
+    """Encodes a prompt for :func:`rollout_from`.
+
+    Args:
+        prompt: tokens by branch, as for :func:`rollout`.
+        actions: those that led into the prompt's frames, normalised.
+        no_depth: as for :func:`rollout`.
+
+    Raises:
+        ConfigError: the model does not support these settings.
+        ValueError: ``no_depth`` has another number of clips, or the prompt lacks depth tokens of clips with depth.
+    """
+    arch.check_sampling(sample)
+    tokens, no_depth = _prompt_tokens(arch, prompt, no_depth)
+    state = _start(arch, replace(sample, seed=0), params, tokens, actions, None, no_depth)
+    return Prompt(tokens, state, _cache_settings(arch, sample))
+
+
+def rollout_from(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: Prompt,
+    actions: Float[Array, "N F A"],
+    key: Key[Array, ""],
+    index: Int[Array, " N"] | None = None,
+) -> Decoded:
+    """Generates the F frames after an encoded prompt, under N action sequences.
+
+    Args:
+        prompt: of N clips, or of one clip that all start from.
+        actions: those that lead into the F frames, normalised.
+        key: as for :func:`rollout`.
+        index: as for :func:`rollout`; clips with the same number have the same draws.
+
+    Returns:
+        All P + F frames by branch, the same as from :func:`rollout` with the prompt repeated.
+
+    Raises:
+        ConfigError: the model does not support these settings.
+        ValueError: F is 0; the prompt has neither one clip nor N; or it was encoded with other settings of guidance
+            (on or off), window stride or cache type.
+    """
+    arch.check_sampling(sample)
+    for (name, made), (_, wanted) in zip(prompt.settings, _cache_settings(arch, sample), strict=True):
+        if made != wanted:
+            raise ValueError(f"the prompt was encoded with {name} = {made!r}, the rollout has {wanted!r}; encode anew")
+    clips, past = prompt.tokens["rgb"].shape[:2]
+    frames = past + actions.shape[1]
+    _check_lengths(past, frames)
+    if clips not in (1, len(actions)):
+        raise ValueError(f"a prompt of {clips} clips and {len(actions)} action sequences; give one prompt, or as many")
+    keys = _clip_keys(key, index, len(actions))
+    rows = _padded(arch, actions, frames)
+    made = _continue(arch, replace(sample, seed=0), params, prompt, rows, jnp.asarray(frames), keys)
+    return {branch: grid[:, :frames] for branch, grid in made.items()}
+
+
+def _cache_settings(arch: Architecture, sample: SampleConfig) -> tuple[tuple[str, Any], ...]:
+    """Returns the settings that a prompt's cache depends on."""
+    return (
+        ("guided", sample.guidance != 1),
+        ("window_stride", stride(arch, sample)),
+        ("cache_dtype", sample.cache_dtype),
+    )
+
+
+def _prompt_tokens(
+    arch: Architecture, prompt: Tokens, no_depth: Any
+) -> tuple[dict[str, Int[Array, "B P S"]], Array | None]:
+    """Checks and returns the prompt's tokens of the model's branches, and ``no_depth`` if the model needs it."""
+    cells = {branch: jnp.asarray(grid, jnp.int32).reshape(*grid.shape[:2], -1) for branch, grid in prompt.items()}
+    if not arch.use_depth:
+        return {"rgb": cells["rgb"]}, None
+    clips = len(cells["rgb"])
+    if no_depth is not None and np.shape(no_depth) != (clips,):
+        raise ValueError(f"no_depth has shape {np.shape(no_depth)}; the prompt has {clips} clips, each needs one value")
+    if "depth" in cells:
+        if isinstance(no_depth, np.ndarray) and not no_depth.any():  # the program without it is smaller
+            no_depth = None
+        return {branch: cells[branch] for branch in arch.branches}, no_depth
+    if no_depth is not None and not np.all(no_depth):
+        raise ValueError('no_depth says that clips have depth, but the prompt has no tokens "depth"')
+    return cells | {"depth": jnp.zeros_like(cells["rgb"])}, jnp.ones(clips, bool)
+
+
+def _check_lengths(past: int, frames: int) -> None:
+    if not 0 < past < frames:
+        raise ValueError(f"{frames} frames with a prompt of {past}; a rollout needs a prompt and a frame to generate")
+
+
+def _clip_keys(key: Key[Array, ""], index: Int[Array, " B"] | None, clips: int) -> Key[Array, " B"]:
+    numbers = jnp.arange(clips) if index is None else jnp.asarray(index)
+    return jax.vmap(partial(jax.random.fold_in, key))(numbers)
+
+
+def _padded(arch: Architecture, actions: Float[Array, "B T A"], frames: int) -> Float[Array, "B T2 A"]:
+    """Pads actions as if a clip of ``frames`` frames went on to a multiple of ``arch.frames``."""
+    return jnp.pad(actions, ((0, 0), (0, -frames % arch.frames), (0, 0)))
+
+
+_start = jax.jit(start, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _rollout(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    tokens: dict[str, Int[Array, "B P S"]],
+    no_depth: Bool[Array, " B"] | None,
+    actions: Float[Array, "B T A"],
+    frames: Int[Array, ""],
+    keys: Key[Array, " B"],
+) -> Decoded:
+    past = tokens["rgb"].shape[1]
+    state = start(arch, sample, params, tokens, actions[:, :past], keys, no_depth)
+    return _repeat_step(arch, sample, params, tokens, state, actions[:, past:], frames)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _continue(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: Prompt,
+    actions: Float[Array, "N F A"],
+    frames: Int[Array, ""],
+    keys: Key[Array, " N"],
+) -> Decoded:
+    """Continues a prompt, which is repeated for all action sequences if it has one clip."""
+    clips = len(actions)
+
+    def repeated(x: Array) -> Array:
+        return jnp.broadcast_to(x, (clips, *x.shape[1:]))
+
+    def repeated_cache(x: Float[Array, "L c S h N e"]) -> Float[Array, "L cB S h N e"]:
+        copies = guidance.copies(sample)
+        each = x.reshape(len(x), copies, -1, *x.shape[2:])
+        return jnp.broadcast_to(each, (len(x), copies, clips, *x.shape[2:])).reshape(len(x), -1, *x.shape[2:])
+
+    tokens = jax.tree.map(repeated, prompt.tokens)
+    state = prompt.state
+    state = replace(
+        state,
+        tokens=jax.tree.map(repeated, state.tokens),
+        means=jax.tree.map(repeated, state.means),
+        actions=repeated(state.actions),
+        base=repeated(state.base),
+        cache=jax.tree.map(repeated_cache, state.cache),
+        key=keys,
+        no_depth=None if state.no_depth is None else repeated(state.no_depth),
+    )
+    return _repeat_step(arch, sample, params, tokens, state, actions, frames)
+
+
+def _repeat_step(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: dict[str, Int[Array, "B P S"]],
+    state: State,
+    actions: Float[Array, "B F A"],
+    frames: Int[Array, ""],
+) -> Decoded:
+    """Generates frames P to ``frames`` - 1 by repeated :func:`step`."""
+    past = prompt["rgb"].shape[1]
+    beyond = past + actions.shape[1] > arch.frames
+    params = _unstacked(arch, params)
+    state = replace(state, cache=apart(state.cache, arch.blocks, arch.unroll))
+    known = mean_codes.codes_of(sample, prompt, arch.code_bits) or prompt
+    made = {branch: _with_room(cells, actions.shape[1]) for branch, cells in known.items()}
+
+    def next_frame(number: Array, carry: tuple[State, dict[str, Array]]) -> tuple[State, dict[str, Array]]:
+        state, made = carry
+        row = jax.lax.dynamic_index_in_dim(actions, number - past, axis=1, keepdims=False)
+        state, frame = step(arch, sample, params, state, row, beyond)
+        return state, _put(made, frame, number)
+
+    state, made = jax.lax.fori_loop(past, frames, next_frame, (state, made))
+    return _grids(arch, made, state.no_depth)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _recomputed(
+    arch: Architecture,
+    sample: SampleConfig,
+    params: Params,
+    prompt: dict[str, Int[Array, "B P S"]],
+    no_depth: Bool[Array, " B"] | None,
+    actions: Float[Array, "B T A"],
+    frames: Int[Array, ""],
+    keys: Key[Array, " B"],
+) -> Decoded:
+    """Eq. 1 without a cache: every pass covers the whole window. The reference for :func:`step`."""
+    past, total = prompt["rgb"].shape[1], actions.shape[1]
+    length = total
+    if not arch.departures.rotary:
+        length = arch.frames
+    actions = jnp.pad(actions, ((0, 0), (0, length), (0, 0)))
+    params = _unstacked(arch, params)
+    tokens = {branch: _with_room(cells, total - past + length) for branch, cells in prompt.items()}
+    means = mean_codes.codes_of(sample, tokens, arch.code_bits)
+
+    def next_frame(t: Array, carry: tuple[dict[str, Array], dict[str, Array]]) -> tuple[Any, Any]:
+        tokens, means = carry
+        base = window_start(arch, sample, t)
+        rows = jax.lax.dynamic_slice_in_dim(actions, base, length, axis=1)
+        rows = window_actions(arch, rows, rows[:, 0], 0)
+        step_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, t), sample.steps))(keys)
+        undecided = {branch: cells[:, 0] for branch, cells in tokens.items()}
+        masked = jnp.ones(undecided["rgb"].shape, bool)
+        frame = Frame(undecided, masked, None, mean_codes.codes_of(sample, undecided, arch.code_bits))
+
+        def one_pass(number: Array, frame: Frame) -> Frame:
+            read = mean_codes.read(sample, tokens, means)
+            clip = _put(read, mean_codes.read(sample, frame.tokens, frame.means), t)
+            window = {
+                branch: jax.lax.dynamic_slice_in_dim(cells, base, length, axis=1) for branch, cells in clip.items()
+            }
+            is_t = jnp.arange(length)[None, :, None] == t - base
+            mask = is_t & frame.mask[:, None]
+            logits, _ = apply_network(arch, sample, params, window, mask, rows, 0, None, no_depth)
+            at_t = {branch: x[:, t - base] for branch, x in logits.items()}
+            return unmask_step(sample, arch.code_bits, step_keys[:, number], number, frame, at_t, no_depth)
+
+        frame = jax.lax.fori_loop(0, sample.steps, one_pass, frame)
+        return _put(tokens, frame.tokens, t), _put(means, frame.means, t)
+
+    tokens, means = jax.lax.fori_loop(past, frames, next_frame, (tokens, means))
+    return _grids(arch, means or tokens, no_depth)
+
+
+def _unstacked(arch: Architecture, params: Params) -> Params:
+    return params | {"blocks": apart(params["blocks"], arch.blocks, arch.unroll)}
+
+
+def _with_room(cells: Array, frames: int) -> Array:
+    """Returns cells followed by zeros for this many frames."""
+    return jnp.pad(cells, [(0, 0), (0, frames), *[(0, 0)] * (cells.ndim - 2)])
+
+
+def _put(clips: dict[str, Array], frame: dict[str, Array], t: Array) -> dict[str, Array]:
+    """Returns the cells of all frames with this frame's at position t."""
+    return {
+        branch: jax.lax.dynamic_update_slice_in_dim(cells, frame[branch][:, None], t, axis=1)
+        for branch, cells in clips.items()
+    }
+
+
+def _grids(arch: Architecture, cells: dict[str, Array], no_depth: Bool[Array, " B"] | None) -> Decoded:
+    """Returns the grids that pictures are decoded from, with zeros as depth of clips that have none."""
+    grids = {branch: x.reshape(*x.shape[:2], arch.grid, arch.grid, *x.shape[3:]) for branch, x in cells.items()}
+    if no_depth is not None:
+        hidden = no_depth.reshape(-1, *[1] * (grids["depth"].ndim - 1))
+        grids["depth"] = jnp.where(hidden, 0, grids["depth"])
+    return grids
