@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from rsjax.clip import Video
-from rsjax.models.branch_states import Branching, Decoding, Moment
+from rsjax.models.branch_states import Branching, BranchState, Decoding
 from rsjax.models.trained import TrainedModel
 
 Say = Callable[[str, bool], None]  # a line for the person who waits, and whether work goes on
@@ -23,17 +23,17 @@ class Work:
     """One frame to generate.
 
     Attributes:
-        moment: the frame before; generating the next frame uses up its memory.
+        state: the frame before; generating the next frame uses up its memory.
         has_depth: whether the clip has depth.
         say: called, in the engine's thread, when a program is compiled for this frame.
     """
 
-    moment: Moment
+    state: BranchState
     action: Float32[np.ndarray, " A"]
     decoding: Decoding
     has_depth: bool
     say: Say
-    done: "Future[Moment]" = field(default_factory=Future)
+    done: "Future[BranchState]" = field(default_factory=Future)
 
     @property
     def key(self) -> tuple[bool, tuple[int, int, bool]]:
@@ -77,11 +77,11 @@ class Engine:
                 self._branching[has_depth] = self._model.model.branching(*inputs)
             return self._branching[has_depth]
 
-    def begin(self, first: Video) -> Moment:
+    def begin(self, first: Video) -> BranchState:
         """Returns a clip's first frame, (1, 1, …), with depth or without."""
         return self.branching(first.depth is not None).begin(first)
 
-    def submit(self, work: Work) -> "Future[Moment]":
+    def submit(self, work: Work) -> "Future[BranchState]":
         """Requests a frame."""
         with self._wake:
             if self._closed:
@@ -107,14 +107,14 @@ class Engine:
             if not works:
                 continue
             try:
-                moments = self._advance(works)
+                states = self._advance(works)
             except Exception as error:  # a bug, or out of memory: only the sessions of this pass fail
                 for work in works:
                     work.done.set_exception(error)
                 continue
             self.frames += len(works)
-            for work, moment in zip(works, moments, strict=True):
-                work.done.set_result(moment)
+            for work, state in zip(works, states, strict=True):
+                work.done.set_result(state)
 
     def _next(self) -> list[Work]:
         """Waits for work and returns the work of the next pass; an empty list once the engine is closed."""
@@ -128,13 +128,13 @@ class Engine:
                 self._waiting.remove(work)
             return works
 
-    def _advance(self, works: list[Work]) -> list[Moment]:
+    def _advance(self, works: list[Work]) -> list[BranchState]:
         key = works[0].key
         fresh = works[0].key not in self._compiled
         if fresh:
             _tell(works, f"compiling for {_count(key[1][0], 'decoding step')} …", True)
         try:
-            inputs = ([work.moment for work in works], np.stack([work.action for work in works]))
+            inputs = ([work.state for work in works], np.stack([work.action for work in works]))
             return self.branching(key[0]).advance(*inputs, [work.decoding for work in works])
         finally:
             if fresh:
@@ -144,12 +144,12 @@ class Engine:
 
 def warm_up(engine: Engine, first: Video, width: int, decoding: Decoding) -> float:
     """Compiles the program for these settings and returns the seconds that a frame takes afterwards."""
-    moment = engine.begin(first)
+    state = engine.begin(first)
     seconds = 0.0
     for _ in range(2):
         began = time.monotonic()
-        work = Work(moment, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None)
-        moment = engine.submit(work).result()
+        work = Work(state, np.zeros(width, np.float32), decoding, first.depth is not None, lambda text, busy: None)
+        state = engine.submit(work).result()
         seconds = time.monotonic() - began
     return seconds
 

@@ -90,7 +90,7 @@ def record(session: Session, path: Path, number: int, panes: list[str], fps: flo
 
 def pane_frames(session: Session, nodes: list[Node], pane: str) -> UInt8[np.ndarray, "T S S 3"]:
     """Returns a pane's pictures for these frames; a shorter branch holds its last frame, a missing truth is grey."""
-    own = [node.moment.rgb for node in nodes]
+    own = [node.state.rgb for node in nodes]
     if pane == "rgb":
         return np.stack(own)
     if pane == "truth":
@@ -103,7 +103,7 @@ def pane_frames(session: Session, nodes: list[Node], pane: str) -> UInt8[np.ndar
     kind, _, number = pane.partition(":")
     if kind != "branch" or not number.isdecimal() or len(number) > 5:
         raise Refused("bad_message", f"panes has {pane!r:.40}; there are rgb, depth, truth and branch:NUMBER")
-    others = [node.moment.rgb for node in session.grown.branch(int(number)).nodes]
+    others = [node.state.rgb for node in session.grown.branch(int(number)).nodes]
     return np.stack([others[min(frame, len(others) - 1)] for frame in range(len(nodes))])
 
 
@@ -153,7 +153,7 @@ def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str
     else:
         steps = controls_of(start.clip, manifest)
     made: dict[str, Any] = {
-        "rgb": np.stack([node.moment.rgb for node in nodes]),
+        "rgb": np.stack([node.state.rgb for node in nodes]),
         "actions": np.stack(actions),  # type: ignore[arg-type]
         "task": "unknown" if start is None or start.clip is None else start.clip["task"],
         "episode": f"{session.name}-{branch.number}-{first}",
@@ -176,7 +176,7 @@ def _clip(session: Session, branch: Branch, first: int, length: int) -> dict[str
 
 
 def _depth(session: Session, node: Node) -> np.ndarray:
-    depth = session.engine.branching(True).depth(node.moment)
+    depth = session.engine.branching(True).depth(node.state)
     assert depth is not None
     return depth
 

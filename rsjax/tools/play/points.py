@@ -57,6 +57,6 @@ def _followed(before: UInt8[np.ndarray, "S S 3"], after: UInt8[np.ndarray, "S S 
 
 def _picture(node: Node, pane: str) -> UInt8[np.ndarray, "S S 3"]:
     if pane == "rgb":
-        return node.moment.rgb
+        return node.state.rgb
     assert node.truth is not None
     return node.truth.rgb

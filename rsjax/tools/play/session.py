@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from rsjax.clip import Video
 from rsjax.config import Config
 from rsjax.data.codec import Record
-from rsjax.models.branch_states import Decoding, Moment
+from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.tools.play.engine import Engine, Work
 from rsjax.tools.play.messages import Refused, number, whole
 from rsjax.tools.play.pictures import Upload
@@ -152,7 +152,7 @@ class Session:
     @property
     def has_depth(self) -> bool:
         """Whether the session's frames have depth."""
-        return self.tree is not None and "depth" in self.grown.node(0, 0).moment.tokens
+        return self.tree is not None and "depth" in self.grown.node(0, 0).state.tokens
 
     def describe(self) -> dict[str, Any]:
         """Returns the description of a session that has a start, for a page."""
@@ -175,11 +175,11 @@ class Session:
             assert start.upload is not None
             first = Video(start.upload.rgb[None, None])
             draw = 0
-        moment = await asyncio.to_thread(self.engine.begin, first)
+        state = await asyncio.to_thread(self.engine.begin, first)
         self.forget()
         self.start = start
         self.seed = seed
-        self.tree = Tree(Node(moment), draw)
+        self.tree = Tree(Node(state), draw)
 
     def clip_start(self, number: int) -> Start:
         """Returns a clip as a start."""
@@ -207,7 +207,7 @@ class Session:
         self.grown.drop(number)
         if len(branch.nodes) - 1 > int(branch.fork or 0):  # otherwise the parent has its last frame
             self._memories.forget(branch.nodes[-1])
-            branch.nodes[-1].moment = self._lighten(branch.nodes[-1].moment)
+            branch.nodes[-1].state = self._lighten(branch.nodes[-1].state)
 
     async def step(self, number: int, action: Float32[np.ndarray, " A"], decoding: Decoding | None = None) -> int:
         """Generates a branch's next frame and returns its number.
@@ -222,8 +222,8 @@ class Session:
             raise Refused("full", f"a session can have {self.limits['frames']} frames; begin again, or drop a branch")
         how = decoding or self.settings.decoding(self.seed, branch.draw)
         await self._recall(branch.nodes)
-        moment = await self._advance(branch.nodes[-1], action, how)
-        node = Node(moment, action, how)
+        state = await self._advance(branch.nodes[-1], action, how)
+        node = Node(state, action, how)
         self._memories.note(node, self._lighten)
         return tree.append(number, node)
 
@@ -238,25 +238,25 @@ class Session:
     async def _recall(self, nodes: list[Node]) -> None:
         """Restores the last frame's memory, by generating the frames again from the nearest one that has its memory."""
         known = len(nodes) - 1
-        while nodes[known].moment.memory is None:
+        while nodes[known].state.memory is None:
             known -= 1
         for before, node in zip(nodes[known:], nodes[known + 1 :], strict=False):
             assert node.action is not None and node.decoding is not None
-            node.moment = await self._advance(before, node.action, node.decoding)
+            node.state = await self._advance(before, node.action, node.decoding)
 
-    async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> Moment:
-        moment = node.moment
+    async def _advance(self, node: Node, action: Float32[np.ndarray, " A"], how: Decoding) -> BranchState:
+        state = node.state
         loop = asyncio.get_running_loop()
         self._memories.forget(node)
-        node.moment = self._lighten(moment)
+        node.state = self._lighten(state)
 
         def say(text: str, busy: bool) -> None:
             loop.call_soon_threadsafe(self.send, {"type": "status", "text": text, "busy": busy})
 
-        work = Work(moment, action, how, self.has_depth, say)
+        work = Work(state, action, how, self.has_depth, say)
         made = await asyncio.wrap_future(self.engine.submit(work))
         self.used = time.monotonic()
         return made
 
-    def _lighten(self, moment: Moment) -> Moment:
-        return self.engine.branching(self.has_depth).lightened(moment)
+    def _lighten(self, state: BranchState) -> BranchState:
+        return self.engine.branching(self.has_depth).lightened(state)

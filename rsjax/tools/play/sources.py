@@ -84,7 +84,7 @@ class Sources:
             return self.run.policy.actor(session.seed)
         settings = PlanSettings(methods=("cem",))
         planner = actors(self.run.trained, self.run.data.run, settings)["cem"]
-        return planner(session.seed, branch.nodes[0].moment.rgb)
+        return planner(session.seed, branch.nodes[0].state.rgb)
 
 
 def reasons(run: PlayRun) -> dict[str, str]:
@@ -102,9 +102,9 @@ def reasons(run: PlayRun) -> dict[str, str]:
 
 def _seen(session: Session, node: Node) -> dict[str, np.ndarray]:
     """Returns a policy's observation of a frame."""
-    seen = {"rgb": node.moment.rgb[None]}
+    seen = {"rgb": node.state.rgb[None]}
     if session.has_depth:
-        depth = session.engine.branching(True).depth(node.moment)
+        depth = session.engine.branching(True).depth(node.state)
         seen |= {} if depth is None else {"depth": depth[None]}
     return seen
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from rsjax.models.branch_states import Decoding, Moment
+from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.tools.play.messages import Refused
 
 BYTES = 2**30  # of memory that the frames of all sessions keep
@@ -19,14 +19,14 @@ class Node:
     """One frame, and how it was made.
 
     Attributes:
-        moment: the frame; its memory may be used up.
+        state: the frame; its memory may be used up.
         action: the action that led to the frame, after clipping; None for a first frame.
         decoding: how the frame was decoded; None for a first frame.
         truth: the simulator's frame after the same actions, once it is there.
         points: (K, 3) keypoints, x and y in 0–1 and whether they are seen, by pane; computed on request.
     """
 
-    moment: Moment
+    state: BranchState
     action: Float32[np.ndarray, " A"] | None = None
     decoding: Decoding | None = None
     truth: "Truth | None" = None
@@ -125,16 +125,16 @@ class Memories:
         self._least = least
         self._most = most
         self._bytes = 0
-        self._nodes: OrderedDict[int, tuple[Node, int, Callable[[Moment], Moment]]] = OrderedDict()
+        self._nodes: OrderedDict[int, tuple[Node, int, Callable[[BranchState], BranchState]]] = OrderedDict()
 
-    def note(self, node: Node, lighten: Callable[[Moment], Moment]) -> None:
+    def note(self, node: Node, lighten: Callable[[BranchState], BranchState]) -> None:
         """Notes that a frame has a large memory, and how to remove it."""
-        self._nodes[id(node)] = node, node.moment.size, lighten
-        self._bytes += node.moment.size
+        self._nodes[id(node)] = node, node.state.size, lighten
+        self._bytes += node.state.size
         while self._bytes > self._most and len(self._nodes) > self._least:
             oldest, _, lighter = next(iter(self._nodes.values()))
             self.forget(oldest)
-            oldest.moment = lighter(oldest.moment)
+            oldest.state = lighter(oldest.state)
 
     def forget(self, node: Node) -> None:
         """Notes that a frame no longer has a large memory."""

@@ -114,7 +114,7 @@ class Follower:
             made = helper(Job(self._task, seed, node.action, node.truth is None), SECONDS)
             self._applied.append(node)
             if made is not None:
-                node.truth = Truth(made.rgb, made.depth, made.success, _psnr(made.rgb, node.moment.rgb))
+                node.truth = Truth(made.rgb, made.depth, made.success, _psnr(made.rgb, node.state.rgb))
                 filled.append(number)
         return filled
 

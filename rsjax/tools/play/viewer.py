@@ -42,13 +42,13 @@ class Side:
 
 def send_rgb(session: Session, place: Place, node: Node) -> None:
     """Sends a frame's picture."""
-    session.send(pictures.picture("rgb", place, node.moment.rgb))
+    session.send(pictures.picture("rgb", place, node.state.rgb))
 
 
 def send_uncertainty(session: Session, place: Place, node: Node) -> None:
     """Sends the entropy of a frame's tokens; a first frame has none."""
-    if node.moment.entropy is not None:
-        session.send(pictures.uncertainty(place, node.moment.entropy, session.run.bits), droppable=True)
+    if node.state.entropy is not None:
+        session.send(pictures.uncertainty(place, node.state.entropy, session.run.bits), droppable=True)
 
 
 async def send_depth(session: Session, side: Side, place: Place, node: Node) -> None:
@@ -59,7 +59,7 @@ async def send_depth(session: Session, side: Side, place: Place, node: Node) -> 
 
 
 def _depth_message(session: Session, place: Place, node: Node) -> bytes | None:
-    depth = session.engine.branching(session.has_depth).depth(node.moment)
+    depth = session.engine.branching(session.has_depth).depth(node.state)
     near_far = session.run.trained.assets.normalization.depth_range
     if depth is None or near_far is None:
         return None
@@ -229,9 +229,9 @@ class Viewer:
 
     def mean_bits(self, node: Node) -> float | None:
         """Returns the mean entropy of a frame's tokens in bits."""
-        if node.moment.entropy is None:
+        if node.state.entropy is None:
             return None
-        return round(float(node.moment.entropy.mean() / np.log(2)), 4)
+        return round(float(node.state.entropy.mean() / np.log(2)), 4)
 
     def _later(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)

@@ -9,7 +9,7 @@ from rsjax.clip import Video
 from rsjax.config import SampleConfig
 from rsjax.data.store import Store
 from rsjax.models.base import create_model
-from rsjax.models.branch_states import Branching, Decoding, Moment
+from rsjax.models.branch_states import Branching, BranchState, Decoding
 from rsjax.models.trained import TrainedModel
 from tests.tools.pipeline import toy
 
@@ -42,15 +42,15 @@ def rows(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (FRAMES, 28)).astype(np.float32)
 
 
-def alone(branching: Branching, moment: Moment, actions: np.ndarray, decoding: Decoding) -> list[Moment]:
+def alone(branching: Branching, state: BranchState, actions: np.ndarray, decoding: Decoding) -> list[BranchState]:
     made = []
     for row in actions:
-        [moment] = branching.advance([moment], row[None], [decoding])
-        made.append(moment)
+        [state] = branching.advance([state], row[None], [decoding])
+        made.append(state)
     return made
 
 
-def assert_same(one: Moment, other: Moment) -> None:
+def assert_same(one: BranchState, other: BranchState) -> None:
     np.testing.assert_array_equal(one.rgb, other.rgb)
     assert one.entropy is not None and other.entropy is not None
     np.testing.assert_array_equal(one.entropy, other.entropy)
@@ -62,7 +62,7 @@ def test_frames_are_those_of_generate(lanes: Branching, model: TrainedModel, cli
     actions, clip = rows(1), clips.source("test")[1]
     made = alone(lanes, lanes.begin(first(clips, 1)), actions[1:], replace(DRAWN, draw=0))
     video = model.generate(clip["rgb"][:1], actions, clip["depth"][:1])
-    rgb = np.stack([moment.rgb for moment in made])
+    rgb = np.stack([state.rgb for state in made])
     assert np.abs(rgb.astype(int) - video.rgb[1:]).max() <= 1  # pictures decoded in other numbers differ by a level
     depth = lanes.depth(made[-1])
     assert video.depth is not None and depth is not None
@@ -80,7 +80,7 @@ def test_frames_of_mean_codes_are_those_of_generate_and_drawn_ones_may_come_betw
     video = shown.generate(clip["rgb"][:1], actions, clip["depth"][:1])
     tokens = with_sample(model, replace(means, mean_codes=False)).generate(clip["rgb"][:1], actions, clip["depth"][:1])
     # Of the first frames: what is read of mean codes that differ in rounding drifts apart.
-    rgb = np.stack([moment.rgb for moment in made[:3]]).astype(int)
+    rgb = np.stack([state.rgb for state in made[:3]]).astype(int)
     assert np.abs(rgb - video.rgb[1:4]).max() <= 1
     assert np.abs(rgb - tokens.rgb[1:4]).max() > 10
     depth = lanes.depth(made[2])
@@ -138,18 +138,18 @@ def test_clips_that_one_program_generates_together_are_the_same_but_for_rounding
 
 
 def test_going_on_from_a_lightened_memory_gives_the_same_bits(lanes: Branching, clips: Store) -> None:
-    actions, moment = rows(4), lanes.begin(first(clips, 2))
-    moments, light = [], {0: lanes.lightened(moment)}
+    actions, state = rows(4), lanes.begin(first(clips, 2))
+    states, light = [], {0: lanes.lightened(state)}
     for number, row in enumerate(actions, 1):
-        [moment] = lanes.advance([moment], row[None], [DRAWN])
-        moments.append(moment)
-        light[number] = lanes.lightened(moment)
+        [state] = lanes.advance([state], row[None], [DRAWN])
+        states.append(state)
+        light[number] = lanes.lightened(state)
     stops = [number for number, each in light.items() if each.memory is not None]
     assert stops == [0, 5, 8]  # the first frame, and those that fill the window of 6, which then moves by 3
     for stop in stops:
         for _ in range(2):  # a small memory is not used up
             again = alone(lanes, light[stop], actions[stop:], DRAWN)
-            assert_same(again[-1], moments[-1])
+            assert_same(again[-1], states[-1])
 
 
 def test_draws_follow_from_seed_and_draw_and_temperature_counts(lanes: Branching, clips: Store) -> None:
@@ -160,7 +160,7 @@ def test_draws_follow_from_seed_and_draw_and_temperature_counts(lanes: Branching
 
 
 def test_entropy_is_that_of_tokens(lanes: Branching, model: TrainedModel, clips: Store) -> None:
-    moment, *_ = lanes.advance([lanes.begin(first(clips, 0))], rows(6)[:1], [DRAWN])
+    state, *_ = lanes.advance([lanes.begin(first(clips, 0))], rows(6)[:1], [DRAWN])
     bits = model.config.tokenizer.code_bits
-    assert moment.entropy is not None
-    assert moment.entropy.min() > 0 and moment.entropy.max() <= bits * np.log(2) * (1 + 1e-5)
+    assert state.entropy is not None
+    assert state.entropy.min() > 0 and state.entropy.max() <= bits * np.log(2) * (1 + 1e-5)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rsjax.clip import Video
 from rsjax.data.normalization import Normalization
-from rsjax.models.branch_states import Decoding, Moment
+from rsjax.models.branch_states import BranchState, Decoding
 from rsjax.tools.play.engine import Engine
 from rsjax.tools.play.hub import Hub
 from rsjax.tools.play.play_run import PlayRun
@@ -47,27 +47,29 @@ class FakeBranching:
     gate: threading.Event = field(default_factory=threading.Event)
     fail: bool = False
 
-    def begin(self, first: Video) -> Moment:
-        return self._moment(Memory(first.rgb[0, 0], 0, True), None)
+    def begin(self, first: Video) -> BranchState:
+        return self._branch_state(Memory(first.rgb[0, 0], 0, True), None)
 
-    def advance(self, moments: Sequence[Moment], actions: np.ndarray, decodings: Sequence[Decoding]) -> list[Moment]:
-        assert 0 < len(moments) <= self.lanes and len({how.program for how in decodings}) == 1
-        self.passes.append(len(moments))
+    def advance(
+        self, states: Sequence[BranchState], actions: np.ndarray, decodings: Sequence[Decoding]
+    ) -> list[BranchState]:
+        assert 0 < len(states) <= self.lanes and len({how.program for how in decodings}) == 1
+        self.passes.append(len(states))
         self.gate.wait(60)
         if self.fail:
             raise FloatingPointError("out of everything")
-        return [self._next(*each) for each in zip(moments, actions, decodings, strict=True)]
+        return [self._next(*each) for each in zip(states, actions, decodings, strict=True)]
 
-    def lightened(self, moment: Moment) -> Moment:
-        memory = moment.memory
-        return moment if memory is None or memory.light else replace(moment, memory=None)
+    def lightened(self, state: BranchState) -> BranchState:
+        memory = state.memory
+        return state if memory is None or memory.light else replace(state, memory=None)
 
-    def depth(self, moment: Moment) -> np.ndarray | None:
-        tokens = moment.tokens
+    def depth(self, state: BranchState) -> np.ndarray | None:
+        tokens = state.tokens
         return np.full((64, 64), 1.0, np.float32) + tokens["depth"][0] / 100 if "depth" in tokens else None
 
-    def _next(self, moment: Moment, action: np.ndarray, how: Decoding) -> Moment:
-        memory = moment.memory
+    def _next(self, state: BranchState, action: np.ndarray, how: Decoding) -> BranchState:
+        memory = state.memory
         assert not memory.used, "a memory that was used up"
         memory.used = not memory.light
         frame = memory.frame + 1
@@ -75,13 +77,13 @@ class FakeBranching:
         rng = np.random.default_rng([*numbers, *np.frombuffer(action.tobytes(), np.uint32).tolist()])
         rgb = np.roll(memory.rgb, int(4 * action[0]), axis=1).copy()
         rgb[:2, :8] = rng.integers(0, 256, (2, 8, 3), np.uint8)
-        return self._moment(Memory(rgb, frame, frame % LIGHT == 0), rng.uniform(0, 2, 16))
+        return self._branch_state(Memory(rgb, frame, frame % LIGHT == 0), rng.uniform(0, 2, 16))
 
-    def _moment(self, memory: Memory, entropy: np.ndarray | None) -> Moment:
+    def _branch_state(self, memory: Memory, entropy: np.ndarray | None) -> BranchState:
         tokens = {"rgb": memory.rgb[:4, :4, 0].reshape(-1).astype(np.int32)}
         if self.has_depth:
             tokens["depth"] = tokens["rgb"] + 1
-        return Moment(memory.rgb, tokens, entropy, memory, 0 if memory.light else 1000)
+        return BranchState(memory.rgb, tokens, entropy, memory, 0 if memory.light else 1000)
 
 
 class Fakes:
