@@ -105,11 +105,13 @@ def train_localiser(clips: Sequence[Record], steps: int) -> Localiser:
     recorded = recorded_places(clips)
     assert recorded is not None
     frames = np.concatenate([clip["rgb"] for clip in clips])
-    xy, lifted = recorded[0].xy.reshape(-1, 2, 2), recorded[0].lifted.reshape(-1)
+    xy = recorded[0].xy.reshape(-1, 2, 2)
+    lifted = recorded[0].lifted.reshape(-1)
 
     params = Network().init(jax.random.key(0), frames[:1])
     optimizer = optax.adam(optax.cosine_decay_schedule(3e-3, steps))
-    state, rng = optimizer.init(params), np.random.default_rng(0)
+    state = optimizer.init(params)
+    rng = np.random.default_rng(0)
     step = _make_step(optimizer)
     with Progress("localiser", steps, "steps") as progress:
         for number in range(steps):

@@ -120,7 +120,8 @@ def paired_bootstrap(
         raise ValueError(f"a paired interval needs a finite number per seed and clip, not {a.shape} and {b.shape}")
     if a.shape[1] == 1:
         return Estimate(float(a.mean() - b.mean()), None, None)
-    rng, summarise = np.random.default_rng([seed, 1]), _SUMMARIES[statistic]  # rng draws seeds only, not clips
+    rng = np.random.default_rng([seed, 1])  # draws seeds only, not clips
+    summarise = _SUMMARIES[statistic]
 
     def over_seeds(scores: Float[np.ndarray, "S B"]) -> Float[np.ndarray, " R"]:
         by_seed = _resampled(scores, seed, resamples, statistic)
@@ -166,10 +167,12 @@ def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float =
     Args:
         a, b: one number per seed, such as a run's mean over clips.
     """
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    a = np.asarray(a, np.float64)
+    b = np.asarray(b, np.float64)
     if min(len(a), len(b)) < 2:
         return None
-    difference, parts = float(a.mean() - b.mean()), (a.var(ddof=1) / len(a), b.var(ddof=1) / len(b))
+    difference = float(a.mean() - b.mean())
+    parts = (a.var(ddof=1) / len(a), b.var(ddof=1) / len(b))
     error = float(np.sqrt(sum(parts)))
     if not error:
         same = difference == 0
@@ -178,7 +181,8 @@ def welch(a: Float[np.ndarray, " S"], b: Float[np.ndarray, " Z"], level: float =
             interval, 0.0 if same else float(np.copysign(np.inf, difference)), len(a) + len(b) - 2.0, float(same)
         )
     df = error**4 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1))
-    t, half = difference / error, float(stdtrit(df, (1 + level) / 2)) * error
+    t = difference / error
+    half = float(stdtrit(df, (1 + level) / 2)) * error
     return Welch(
         Estimate(difference, difference - half, difference + half), t, float(df), float(2 * stdtr(df, -abs(t)))
     )
@@ -192,8 +196,10 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> Estimate:
     """
     if not 0 <= successes <= trials or not trials:
         raise ValueError(f"{successes} successes of {trials} trials have no share")
-    share, z = successes / trials, float(ndtri((1 + level) / 2))
-    centre, scale = share + z**2 / (2 * trials), 1 + z**2 / trials
+    share = successes / trials
+    z = float(ndtri((1 + level) / 2))
+    centre = share + z**2 / (2 * trials)
+    scale = 1 + z**2 / trials
     half = z * np.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
     return Estimate(share, float(max(0, (centre - half) / scale)), float(min(1, (centre + half) / scale)))
 
@@ -242,5 +248,14 @@ def verdict(interval: Estimate | None, direction: Direction = "higher", margin: 
     """
     if interval is None or interval.low is None or interval.high is None:
         return "cannot tell"
-    low, high = (interval.low, interval.high) if direction == "higher" else (-interval.high, -interval.low)
-    return "holds" if low > margin else "does not hold" if high < margin else "cannot tell"
+    if direction == "higher":
+        low = interval.low
+        high = interval.high
+    else:
+        low = -interval.high
+        high = -interval.low
+    if low > margin:
+        return "holds"
+    if high < margin:
+        return "does not hold"
+    return "cannot tell"

@@ -150,7 +150,8 @@ def align(
     least squares, and disparities are kept ≥ 1e-3. "l1_scale": multiplied by s, the minimiser of Σ|s·d̂ - d|, found by
     10 reweighted least-squares steps that start at mean(d) / mean(d̂); s ≥ 1e-3.
     """
-    d, p = truth[mask].astype(np.float64), prediction[mask].astype(np.float64)
+    d = truth[mask].astype(np.float64)
+    p = prediction[mask].astype(np.float64)
     full = prediction.astype(np.float64)
     match alignment:
         case "none":

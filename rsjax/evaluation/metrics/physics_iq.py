@@ -81,7 +81,8 @@ def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
     Raises:
         Unavailable: the frames are smaller than 4×4 pixels.
     """
-    height, width = videos.shape[2] // _SHRINK, videos.shape[3] // _SHRINK
+    height = videos.shape[2] // _SHRINK
+    width = videos.shape[3] // _SHRINK
     if not height or not width:
         raise Unavailable(f"frames of {videos.shape[2]}×{videos.shape[3]} pixels; Physics-IQ takes a quarter of them")
 
@@ -94,7 +95,8 @@ def shrink(videos: UInt8[np.ndarray, "B T H W 3"]) -> Small:
 
 def four_metrics(truth: Small, prediction: Small, first: int = 0) -> Four:
     """Scores the frames from ``first`` on. Where both masks are empty, the score is 1."""
-    a, b = truth.masks[:, first:], prediction.masks[:, first:]
+    a = truth.masks[:, first:]
+    b = prediction.masks[:, first:]
     one, other = (videos.frames[:, first:].astype(np.float32) / 255 for videos in (truth, prediction))
     return Four(
         spatial=_iou(np.any(a, axis=1), np.any(b, axis=1)),
@@ -106,7 +108,8 @@ def four_metrics(truth: Small, prediction: Small, first: int = 0) -> Four:
 
 def _iou(one: np.ndarray, other: np.ndarray) -> Float[np.ndarray, "..."]:
     """Returns Σmin / Σmax over the last two axes, 1 where both are zero."""
-    shared, either = np.minimum(one, other).sum((-2, -1)), np.maximum(one, other).sum((-2, -1))
+    shared = np.minimum(one, other).sum((-2, -1))
+    either = np.maximum(one, other).sum((-2, -1))
     return np.where(either == 0, 1.0, shared / np.where(either == 0, 1, either))
 
 
@@ -124,7 +127,8 @@ def physics_iq_score(prediction: Four, second_take: Four) -> float:
     Raises:
         Unavailable: ST₂, S₂ or W₂ is 0, because the motions of the two takes do not overlap.
     """
-    mean, limit = _means(prediction), _means(second_take)
+    mean = _means(prediction)
+    limit = _means(second_take)
     limit = {name: round(value, 5 if name == "spatial" else 4) for name, value in limit.items()}
     if empty := [name for name, value in limit.items() if name != "mse" and not value]:
         raise Unavailable(f"the second take's motion and the first's have nothing in common ({', '.join(empty)} IoU 0)")

@@ -30,7 +30,8 @@ def same_frames(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"
     Raises:
         ValueError: the shapes differ, or are not [..., H, W, C].
     """
-    truth, prediction = jnp.asarray(truth), jnp.asarray(prediction)
+    truth = jnp.asarray(truth)
+    prediction = jnp.asarray(prediction)
     if truth.shape != prediction.shape or truth.ndim < 3:
         raise ValueError(
             f"frames to compare have shapes {truth.shape} and {prediction.shape}; both must be the same [..., H, W, C]"

@@ -47,7 +47,8 @@ def ssim(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"]) -> F
     height, width = truth.shape[-3:-1]
     if min(height, width) < _WINDOW:
         raise ValueError(f"SSIM needs frames of at least {_WINDOW}×{_WINDOW} pixels, not {height}×{width}")
-    rows, columns = _blur_matrix(height), _blur_matrix(width)
+    rows = _blur_matrix(height)
+    columns = _blur_matrix(width)
 
     def blur(x: Array) -> Array:
         # The GPU's default precision is too low: the variances are small differences of large numbers.
@@ -57,7 +58,8 @@ def ssim(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"]) -> F
     variance_x = blur(truth**2) - mean_x**2
     variance_y = blur(prediction**2) - mean_y**2
     covariance = blur(truth * prediction) - mean_x * mean_y
-    c1, c2 = (_K1 * PEAK) ** 2, (_K2 * PEAK) ** 2
+    c1 = (_K1 * PEAK) ** 2
+    c2 = (_K2 * PEAK) ** 2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity /= (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
     return similarity.mean((-3, -2, -1))
