@@ -108,7 +108,8 @@ class Generation:
                 yield from self._row(run, SAMPLE, sample)
 
     def _row(self, run: int, kind: str, draw: int) -> Iterator[Batch]:
-        count, size = len(self.clips.rgb), batch_size(self.trained)
+        count = len(self.clips.rgb)
+        size = batch_size(self.trained)
         yield from (Batch(run, kind, draw, start, min(size, count - start)) for start in range(0, count, size))
 
     @cached_property
@@ -146,7 +147,8 @@ class Generation:
 
     def _generate(self, batch: Batch) -> Record:
         """Generates a batch; the last batch is padded to full size, so that only one program is compiled."""
-        sampled, rows = batch.kind == SAMPLE, np.arange(batch.start, batch.start + batch.clips)
+        sampled = batch.kind == SAMPLE
+        rows = np.arange(batch.start, batch.start + batch.clips)
         padded = np.minimum(np.arange(batch.start, batch.start + batch_size(self.trained)), rows[-1])
         own = self.draws[OWN][0]
         actions = own if sampled else self.draws[batch.kind][batch.draw]
@@ -173,7 +175,9 @@ def teacher_forced(trained: TrainedModel, protocol: Protocol, clips: Clips) -> T
     This costs less than one of the several rollouts of each clip, so the result is neither kept nor divided among
     processes.
     """
-    size, video, parts = batch_size(trained), clips.video, list[TeacherForced]()
+    size = batch_size(trained)
+    video = clips.video
+    parts = list[TeacherForced]()
     count = len(clips.rgb)
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)  # the last batch is padded to full size
@@ -203,7 +207,8 @@ def rolled_out(
         own: the clips' own actions, which led to the recorded frames that generation starts from.
         actions: the actions that lead to the generated frames.
     """
-    prompt, frames = protocol.prompt_frames, actions.shape[1]
+    prompt = protocol.prompt_frames
+    frames = actions.shape[1]
 
     def after(past: int, until: int) -> Video:
         return generate(truth.frames(0, past), np.concatenate([own[:, :past], actions[:, past:until]], axis=1))

@@ -158,7 +158,8 @@ def find(name: str, config: Config) -> Protocol:
     if name not in PROTOCOLS:
         known = (*PROTOCOLS, OWN)
         raise UserError(f"unknown protocol {name!r}{did_you_mean(name, known)} (protocols: {', '.join(known)})")
-    found, settings = PROTOCOLS[name], config.eval
+    found = PROTOCOLS[name]
+    settings = config.eval
     if found.samples > 1:
         return found
     repetitions = max(found.repetitions, settings.repetitions)

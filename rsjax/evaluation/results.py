@@ -145,7 +145,8 @@ def read_result(folder: Path) -> Result:
     Raises:
         FileError: the file is missing, damaged or of another version.
     """
-    path, cure = folder / NAME, "python -m experiments.evaluate makes it again"
+    path = folder / NAME
+    cure = "python -m experiments.evaluate makes it again"
     try:
         return Result(**read_json(path, cure=cure))
     except TypeError as error:

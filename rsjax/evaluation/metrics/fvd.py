@@ -81,7 +81,8 @@ def _features(scene: Scene, videos: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    network, parts = _load(scene.settings.fvd_weights).to(device), []
+    network = _load(scene.settings.fvd_weights).to(device)
+    parts = []
     frames = np.moveaxis(videos[:, scene.prompt_frames :], -1, 1)
     with Progress("FVD", len(frames), "videos") as progress, torch.no_grad():
         for start in range(0, len(frames), _CLIPS):

@@ -30,7 +30,8 @@ def lifted_accuracy(scene: Scene) -> Scores:
 
 
 def _errors(scene: Scene, name: str) -> Scores:
-    located, k = _located(scene), OBJECTS.index(name)
+    located = _located(scene)
+    k = OBJECTS.index(name)
     return {
         part: np.linalg.norm(places.xy - located.truth.xy, axis=-1)[:, k] / located.width
         for part, places in located.read().items()

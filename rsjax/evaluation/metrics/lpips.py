@@ -41,7 +41,8 @@ def vgg_score(scene: Scene) -> PerClip:
 def _frames(scene: Scene, net: str, path: str, option: str) -> PerFrame:
     if not path:
         raise Unavailable(f"no weights: {option} FILE (python -m experiments.convert lpips makes it)")
-    params, side = load_lpips(path, net), min(scene.truth.rgb.shape[2:4])
+    params = load_lpips(path, net)
+    side = min(scene.truth.rgb.shape[2:4])
     if side < min_size(params):
         raise Unavailable(f"frames of {side} pixels; LPIPS with {net} needs {min_size(params)}")
     pairs = zip(scene.truth.rgb, scene.prediction.rgb, strict=True)

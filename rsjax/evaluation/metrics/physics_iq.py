@@ -171,7 +171,8 @@ def _register(kind: Kind, title: str, better: Literal["higher", "lower"], **sett
 
 def _masks(scene: Scene) -> tuple[Bool[np.ndarray, "B P h w"], Bool[np.ndarray, "B P h w"]]:
     """Returns the pixels that move in the predicted frames of truth and prediction."""
-    truth, prediction = scene.of_truth(_small_truth), scene.shared(_small)
+    truth = scene.of_truth(_small_truth)
+    prediction = scene.shared(_small)
     return truth.masks[:, scene.prompt_frames :], prediction.masks[:, scene.prompt_frames :]
 
 

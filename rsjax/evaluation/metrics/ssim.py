@@ -54,7 +54,8 @@ def ssim(truth: Num[Array, "*B H W C"], prediction: Num[Array, "*B H W C"]) -> F
         # The GPU's default precision is too low: the variances are small differences of large numbers.
         return jnp.einsum("ih,...hwc,jw->...ijc", rows, x, columns, precision=jax.lax.Precision.HIGHEST)
 
-    mean_x, mean_y = blur(truth), blur(prediction)
+    mean_x = blur(truth)
+    mean_y = blur(prediction)
     variance_x = blur(truth**2) - mean_x**2
     variance_y = blur(prediction**2) - mean_y**2
     covariance = blur(truth * prediction) - mean_x * mean_y

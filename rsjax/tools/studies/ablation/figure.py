@@ -12,8 +12,11 @@ from rsjax.evaluation.registry import Metric
 from rsjax.tools.studies.ablation.table import Row, best
 from rsjax.tools.studies.tables import ABSENT
 
-PLAIN, BEST, FAINT = "#3b7dd8", "#d9480f", "#868e96"
-PANEL, LINE = 2.3, 0.42  # width of a panel and height of a line, in inches
+PLAIN = "#3b7dd8"
+BEST = "#d9480f"
+FAINT = "#868e96"
+PANEL = 2.3  # width of a panel in inches
+LINE = 0.42  # height of a line in inches
 MAX_LINES = 150  # viewers refuse taller pictures
 LEGEND = "circles: seeds; bar: mean ± sample standard deviation; orange: best mean, which may be chance"
 

@@ -93,7 +93,8 @@ def parse_axes(base: Config, texts: Sequence[str]) -> dict[str, tuple[Value, ...
     Raises:
         ConfigError: a field does not exist, is repeated or is the seed; a value has another type or is repeated.
     """
-    known, axes = config_fields(base), dict[str, tuple[Value, ...]]()
+    known = config_fields(base)
+    axes = dict[str, tuple[Value, ...]]()
     for text in texts:
         name, _, values = text.partition("=")
         field = name.strip().lstrip("-").replace("-", "_")
@@ -145,7 +146,8 @@ def expand(base: Config, axes: Mapping[str, Sequence[Value]], seeds: Sequence[in
     flag = f"--seeds {' '.join(map(str, seeds))}"
     require(0 < len(seeds) == len(set(seeds)), f"{flag}: name one or more, each once")
     require(all(0 <= seed < 2**32 for seed in seeds), f"{flag}: a seed lies between 0 and 2^32 - 1")
-    cells, wrong = dict[str, Config](), list[str]()
+    cells = dict[str, Config]()
+    wrong = list[str]()
     for seed, combination in itertools.product(seeds, itertools.product(*axes.values())):
         values = dict(zip(axes, combination, strict=True))
         try:
@@ -176,7 +178,8 @@ def cell_name(values: Mapping[str, Value], seed: int) -> str:
 
 def repeated_cells(grid: Grid) -> list[str]:
     """Returns one line per field that varies among cells in which its switch is off, so that it has no effect."""
-    cells, lines = [config_fields(config) for config in grid.cells.values()], []
+    cells = [config_fields(config) for config in grid.cells.values()]
+    lines = []
     for field, switch in SWITCHES.items():
         off = {known[field].value for known in cells if field in known and switch in known and not known[switch].value}
         if field in grid.fields and len(off) > 1:

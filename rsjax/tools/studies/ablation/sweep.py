@@ -167,8 +167,10 @@ def link_stage(source: Run, run: Run, name: str) -> None:
     """
     if run.finished(name):
         return
-    target, temporary = run.directory / name, run.directory / f"{name}.linking"
-    folder, output = source.directory / name, source.output(name)
+    target = run.directory / name
+    temporary = run.directory / f"{name}.linking"
+    folder = source.directory / name
+    output = source.output(name)
     ignored = shutil.ignore_patterns("checkpoints", ".*.lock")
 
     def copy(path: str, to: str) -> None:
@@ -224,7 +226,8 @@ def print_table(out: Path, data: Path) -> None:
 def print_cells(new: Grid, choice: Choice, out: Path, data: Path) -> None:
     """Prints the chosen cells with their numbers and states, and writes nothing. Errors as in :func:`run_sweep`."""
     grid, names = merge(read_grid(out), new, out)
-    chosen, runs = choice.of(names), runs_of(grid, out, data)
+    chosen = choice.of(names)
+    runs = runs_of(grid, out, data)
     for number, name in enumerate(names):
         if name in chosen:
             print(f"{number:4}  {read_run(runs[name]).state:11}  {name}")

@@ -51,7 +51,8 @@ def parse_group(text: str) -> tuple[str, tuple[Path, ...]]:
         return Path(text).resolve().name, (Path(text),)
     name, separator, runs = text.partition("=")
     require(bool(separator and name), f"{text}: no run directory; write RUN, or NAME=RUN,RUN for several seeds")
-    pieces, found = runs.split(","), list[Path]()
+    pieces = runs.split(",")
+    found = list[Path]()
     while pieces:
         whole = [",".join(pieces[:count]) for count in range(len(pieces), 0, -1)]
         fitting = next(((each, paths) for each in whole if (paths := _directories(each))), None)
@@ -144,9 +145,11 @@ def check_alike(groups: Sequence[Group]) -> None:
 
 def check_seeds(group: Group) -> None:
     """Raises :class:`UserError` if a group's runs differ in more than their seed, or two are the same training."""
-    first, trained = group.results[0].model, dict[str, str]()
+    first = group.results[0].model
+    trained = dict[str, str]()
     for model in (result.model for result in group.results):
-        there, here = _deciding(first), _deciding(model)
+        there = _deciding(first)
+        here = _deciding(model)
         pairs = {name: (there[name], here[name]) for name in there if name in here}  # older results lack some fields
         lines = [f"model.{name} is {a} in the first, {b} in the other" for name, (a, b) in pairs.items() if a != b]
         runs = f"{group.name}: {first['run']} and {model['run']}"
@@ -176,7 +179,8 @@ def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...]
     """Returns a line for each of the wanted fields in which two results are known to differ."""
     lines = []
     for section, names in wanted.items():
-        there, here = getattr(first, section), getattr(other, section)
+        there = getattr(first, section)
+        here = getattr(other, section)
         for name in names or dict.fromkeys((*there, *here)):
             values: tuple[Any, Any] = there.get(name), here.get(name)
             unknown = name in MAYBE_UNKNOWN and None in values
@@ -187,7 +191,8 @@ def differing(first: Result, other: Result, wanted: Mapping[str, tuple[str, ...]
 
 def noted(groups: Sequence[Group]) -> list[str]:
     """Returns the differences between results that do not forbid a comparison, one per line."""
-    first, lines = groups[0].results[0], []
+    first = groups[0].results[0]
+    lines = []
     for group in groups:
         found = dict.fromkeys(line for result in group.results for line in differing(first, result, NOTED))
         lines += [f"{groups[0].name} and {group.name}: {line}" for line in found]

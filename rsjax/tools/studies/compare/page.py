@@ -78,7 +78,9 @@ def strips(comparison: Comparison) -> list[ComparedClip]:
     except UserError as error:
         note(f"no film strips: {error}")
         return []
-    clips, prompt, out = comparison.groups[0].results[0].clips, comparison.protocol["prompt_frames"], []
+    clips = comparison.groups[0].results[0].clips
+    prompt = comparison.protocol["prompt_frames"]
+    out = []
     for row, why in _chosen(comparison, reduce(np.intersect1d, [frames["rows"] for frames in kept])).items():
         here = [_of_clip(frames, row) for frames in kept]
         truth = here[0]["truth"]
@@ -100,9 +102,11 @@ def _chosen(comparison: Comparison, rows: Int[np.ndarray, " n"]) -> dict[int, st
     Args:
         rows: the rows of the clips whose frames every group has.
     """
-    results, name = comparison.reference.group.results, comparison.reference.name
+    results = comparison.reference.group.results
+    name = comparison.reference.name
     own = np.mean([each.per_clip["psnr"] for each in results], axis=0)
-    still, every = np.array(results[0].per_clip["psnr_repeat_first"]), np.arange(len(own))
+    still = np.array(results[0].per_clip["psnr_repeat_first"])
+    every = np.arange(len(own))
     pool = every if np.isin(np.concatenate(extremes(still)), rows).all() else rows  # older results lack the ends
     chosen: dict[int, str] = {}
     for scores, among, ends, of in (
@@ -156,7 +160,8 @@ def _lines(comparison: Comparison, metric: Metric) -> list[tuple[str, np.ndarray
 def _chart(comparison: Comparison, metric: Metric) -> Chart:
     def draw(axes: Axes) -> None:
         for number, (label, frames, points) in enumerate(_lines(comparison, metric)):
-            color, marker = COLORS[number % len(COLORS)], "o" if len(frames) == 1 else None
+            color = COLORS[number % len(COLORS)]
+            marker = "o" if len(frames) == 1 else None
             axes.plot(frames, points, color=color, marker=marker, linewidth=1.3, label=label)
         axes.set_title(metric.heading, fontsize=9, loc="left")
         axes.set_xlabel("frame", fontsize=8)

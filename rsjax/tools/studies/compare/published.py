@@ -40,10 +40,12 @@ _FAMILIES |= {"cogvideox": "CogVideoX"}
 
 def published_name(model: Mapping[str, Any]) -> str | None:
     """Returns the row of the paper's tables that corresponds to a model's family and settings, if there is one."""
-    name, settings = _FAMILIES.get(model["family"]), model.get("settings", {})
+    name = _FAMILIES.get(model["family"])
+    settings = model.get("settings", {})
     if name != "RoboScape":
         return name
-    depth, keypoints = settings.get("use_depth", True), settings.get("loss", {}).get("use_keypoints", True)
+    depth = settings.get("use_depth", True)
+    keypoints = settings.get("loss", {}).get("use_keypoints", True)
     missing = {(False, True): " w/o depth", (True, False): " w/o keypoints", (False, False): " w/o both"}
     return name + missing.get((depth, keypoints), "")
 

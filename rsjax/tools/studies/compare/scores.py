@@ -129,7 +129,8 @@ def columns(groups: Sequence[Group], only: Sequence[str] = ()) -> list[Metric]:
 
 def _depth_suffix(groups: Sequence[Group]) -> str:
     protocol = groups[0].results[0].protocol
-    alignment, source = protocol["depth_alignment"], protocol["depth_source"]
+    alignment = protocol["depth_alignment"]
+    source = protocol["depth_source"]
     return "" if alignment == "none" else f"_{alignment}_{source}"
 
 
@@ -143,7 +144,8 @@ def _parts(names: Collection[str]) -> list[Metric]:
     found = []
     for name in names:
         base = base_of(name)
-        part, whole = name.removeprefix(base), name.rpartition("_")[0]
+        part = name.removeprefix(base)
+        whole = name.rpartition("_")[0]
         bound = part.endswith(("_low", "_high")) and whole in names
         if base and part and not bound and not part.startswith(tuple(BASELINES)):
             best = part.removeprefix("_best").removesuffix(BEST) if part.endswith(BEST) else ""
@@ -155,7 +157,8 @@ def _parts(names: Collection[str]) -> list[Metric]:
 
 def score_of(entry: Entry, metric: Metric) -> Score:
     """Returns an entry's score of a metric."""
-    seeds, clips = entry.seeds(metric), entry.per_clip(metric)
+    seeds = entry.seeds(metric)
+    clips = entry.per_clip(metric)
     if not seeds:
         return Score(None, None, entry.reason(metric))
     interval = None if clips is None else paired_bootstrap(clips, 0 * clips[:1], statistic=metric.statistic)
@@ -164,10 +167,12 @@ def score_of(entry: Entry, metric: Metric) -> Score:
 
 def difference(entry: Entry, reference: Entry, metric: Metric) -> Difference | None:
     """Compares an entry with the reference; None where one of them has no score."""
-    seeds, others = entry.seeds(metric), reference.seeds(metric)
+    seeds = entry.seeds(metric)
+    others = reference.seeds(metric)
     if not seeds or not others:
         return None
-    clips, base = entry.per_clip(metric), reference.per_clip(metric)
+    clips = entry.per_clip(metric)
+    base = reference.per_clip(metric)
     paired = clips is not None and base is not None and clips.shape[1] == base.shape[1]
     interval = paired_bootstrap(clips, base, statistic=metric.statistic) if paired else None  # type: ignore[arg-type]
     test = None if entry.suffix or reference.suffix else welch(np.array(seeds), np.array(others))

@@ -66,7 +66,8 @@ def compare(groups: Sequence[Group], only: Sequence[str] = (), against: str = ""
     """
     names = [group.name for group in groups]
     require(not against or against in names, f"--against {against}: no such group{did_you_mean(against, names)}")
-    entries, chosen = entries_of(groups), columns(groups, only)
+    entries = entries_of(groups)
+    chosen = columns(groups, only)
     reference = entries[names.index(against) if against else 0]
     protocol = groups[0].results[0].protocol["name"]
     rows = dict.fromkeys(published_name(result.model) for group in groups for result in group.results)
@@ -143,7 +144,8 @@ def difference_table(comparison: Comparison) -> Table:
 
 def legend(comparison: Comparison) -> list[str]:
     """Returns the paragraphs below the tables."""
-    name, counts = comparison.reference.name, {len(group.results) for group in comparison.groups}
+    name = comparison.reference.name
+    counts = {len(group.results) for group in comparison.groups}
     lines = [
         "Scores: mean ± sample standard deviation over n seeds, [95 % interval over seeds and clips].",
         f'Differences are from {name}, paired by clip; intervals resample seeds and clips. "better" and "worse" stand '

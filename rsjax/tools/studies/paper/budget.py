@@ -19,7 +19,8 @@ from rsjax.tokenizers.flops import tokenizer_flops
 
 EPISODE = 0.41  # seconds to simulate an episode
 TOKENS = 1 / 26  # seconds to make the tokens of a clip or of a moved copy of it
-STEP, RATE = 0.06, 1.4e11  # a world model's step: fixed seconds, and operations per second for the rest
+STEP = 0.06  # fixed seconds of a world model's step
+RATE = 1.4e11  # operations per second of the rest of the step
 # Operations per second of the tokenizer's training, with Muon: 4.1e10 in float32; a step in bf16 takes 0.89 × the time.
 TOKENIZER_RATE = 4.6e10
 START = 15.0  # seconds until a training's first step: 27 for the first training with its shapes, 9 for the next
@@ -29,14 +30,23 @@ FAMILY_STEPS = {"irasim": (0.13, 0.34), "cogvideox": (0.85, 0.50), "ivideogpt": 
 # Seconds by which an imagined episode of Lift takes longer than a simulated one, on 2 cores of an Intel Ice Lake: each
 # of its 30 frames takes these families a whole video.
 FAMILY_EPISODES = {"irasim": 29.0, "ivideogpt": 3.4}
-EVALUATION, LOCALISER, ROLLOUT = 30.0, 0.106, 0.18  # seconds per evaluation, step of the localiser, and rollout
+EVALUATION = 30.0  # seconds per evaluation
+LOCALISER = 0.106  # seconds per step of the localiser
+ROLLOUT = 0.18  # seconds per rollout
 
-COLLECT_SHARE, TOKENIZER_SHARE, SPENT_IN_CELLS = 0.06, 0.08, 0.85  # shares of a budget
-ROLLOUTS_SHARE, LOCALISER_SHARE = 0.12, 0.04  # shares of a cell
+COLLECT_SHARE = 0.06  # shares of a budget
+TOKENIZER_SHARE = 0.08
+SPENT_IN_CELLS = 0.85
+ROLLOUTS_SHARE = 0.12  # shares of a cell
+LOCALISER_SHARE = 0.04
 # The number of trainings of the base preset that a budget of half an hour is divided into (those of Tables 1 and 2 with
 # three seeds, six of which are cheaper because they are without depth), and how it grows with the budget.
-CELLS, GROWTH = 13.7, 0.4
-LEAST_STEPS, LEAST_TOKENIZER_STEPS, LEAST_EPISODES, LEAST_CLIPS = 40, 100, 60, 2
+CELLS = 13.7
+GROWTH = 0.4
+LEAST_STEPS = 40
+LEAST_TOKENIZER_STEPS = 100
+LEAST_EPISODES = 60
+LEAST_CLIPS = 2
 SEEDS = 3
 _UNITS = {"s": 1, "sec": 1, "min": 60, "m": 60, "h": 3600, "d": 86400}
 _TERM = re.compile(r"(\d+(?:\.\d+)?)\s*(" + "|".join(sorted(_UNITS, key=len, reverse=True)) + r")\s*")
@@ -72,10 +82,13 @@ class Scale:
 
 def scale(preset: Config, seconds: float) -> Scale:
     """Returns the preset with as many episodes, steps and scored clips as the budget allows, at most its own."""
-    sim, tokenizer, evaluation = preset.sim, preset.tokenizer_train, preset.eval
+    sim = preset.sim
+    tokenizer = preset.tokenizer_train
+    evaluation = preset.eval
     each = SPENT_IN_CELLS * seconds / (CELLS * (seconds / (HOUR / 2)) ** GROWTH)
     episodes = min(sim.episodes, max(LEAST_EPISODES, _round(COLLECT_SHARE * seconds / EPISODE)))
-    rollouts, draws = ROLLOUTS_SHARE * each / ROLLOUT, evaluation.action_draws
+    rollouts = ROLLOUTS_SHARE * each / ROLLOUT
+    draws = evaluation.action_draws
     draws = draws if rollouts >= evaluation.clips * (1 + 2 * draws) else 1
     clips = max(LEAST_CLIPS, min(_round(rollouts / (1 + 2 * draws)), episodes // 6))
     clips = min(evaluation.clips, sim.test_episodes, clips)
@@ -153,7 +166,8 @@ def tokenizer_step_seconds(config: Config) -> float:
     """Returns the seconds of a step of the tokenizer."""
     if config.model.family in FAMILY_STEPS:
         return FAMILY_STEPS[config.model.family][0]
-    loop, flops = config.tokenizer_train, _image_flops(config.tokenizer, config.clips.image_size)
+    loop = config.tokenizer_train
+    flops = _image_flops(config.tokenizer, config.clips.image_size)
     return 3 * loop.batch_size * loop.frames_per_clip * flops / TOKENIZER_RATE
 
 

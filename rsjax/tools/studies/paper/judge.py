@@ -145,7 +145,8 @@ def _judge_claim(claim: Claim, plan: Plan, results: Mapping[str, RunResult], rea
 
 def _judge(claim: Claim, comparison: Comparison, arms: Mapping[str, Trained], read: Mapping[Any, Any]) -> Judged:
     metric = metrics().get(comparison.metric) or Metric(comparison.metric, comparison.metric, "", "higher", 3)
-    better, than = arms[comparison.better], arms[comparison.than]
+    better = arms[comparison.better]
+    than = arms[comparison.than]
     judged = Judged(comparison, metric, (len(better.finished), len(than.finished)), _published(claim, comparison))
     try:
         a, b = _paired(better, than, comparison, read)
@@ -208,7 +209,8 @@ def _scores(arm: Trained, score: str, comparison: Comparison, read: Mapping[Any,
 
 def _published(claim: Claim, comparison: Comparison) -> float | None:
     better, than = (claim.arm(name).published for name in (comparison.better, comparison.than))
-    score, other = comparison.score or comparison.metric, comparison.than_score or comparison.metric
+    score = comparison.score or comparison.metric
+    other = comparison.than_score or comparison.metric
     return better[score] - than[other] if score in better and other in than else None
 
 
@@ -217,7 +219,8 @@ def _wider(interval: Estimate, test: Welch) -> Estimate:
 
     For a single score per seed, such as a correlation, there is no bootstrap interval, and Welch's is returned.
     """
-    low, high = test.difference.low, test.difference.high
+    low = test.difference.low
+    high = test.difference.high
     if interval.low is None or interval.high is None or low is None or high is None:
         return test.difference
     return Estimate(interval.value, min(interval.low, low), max(interval.high, high))

@@ -16,7 +16,7 @@ from rsjax.tools.studies.paper.claim import Arm, Claim
 from rsjax.tools.studies.paper.measurements import seconds_of
 
 SLACK = 1.05  # share of the budget that the estimates may take
-TOLD = 2  # seeds of each arm that a verdict needs
+VERDICT_SEEDS = 2  # seeds of each arm that a verdict needs
 KEPT = ("prompt_frames", "sim", "data", "eval")  # parts of the base preset's configuration that all arms have
 
 
@@ -95,7 +95,8 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
             absent[claim.name, arm.name] = str(error)
             continue
         keys = Run(config, Path(), data).keys()
-        key, use = keys["evaluation"], (claim.name, arm.name)
+        key = keys["evaluation"]
+        use = (claim.name, arm.name)
         if key not in cells:
             cells[key] = Cell(f"{cell_name(_label(arm), seed)}-{key[:8]}", config, ())
             seconds = _new_seconds(config, keys, made) + budget.evaluation_seconds(config)
@@ -104,7 +105,9 @@ def make_plan(claims: Sequence[Claim], scale: Scale, data: Path, seeds: int = bu
         for name in claim.measurements(arm.name):
             task = Task(cells[key].name, name, claim.name, seconds_of(name, config))
             tasks.setdefault((key, name), task)
-    fits, left_out, spent = list[Task](), list[Task](), 0.0
+    fits = list[Task]()
+    left_out = list[Task]()
+    spent = 0.0
     for number, task in enumerate(tasks.values()):
         spent += task.seconds
         (fits if spent <= SLACK * scale.seconds or not number else left_out).append(task)
@@ -125,10 +128,11 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
 
 
 def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
-    """Returns (claim, arm, seed) in order: rank 0 with all seeds; other claims with ``TOLD`` seeds; further seeds."""
+    """Returns (claim, arm, seed) in order: rank 0 with all seeds; other claims with ``VERDICT_SEEDS`` seeds; further seeds."""
     first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
-    few, more = seeds[:TOLD], seeds[TOLD:]
+    few = seeds[:VERDICT_SEEDS]
+    more = seeds[VERDICT_SEEDS:]
     return [
         *((claim, arm, seed) for claim in first for seed in seeds for arm in claim.arms),
         *((claim, arm, seed) for claim in others for seed in few for arm in claim.arms),
@@ -172,7 +176,8 @@ def _equal(config: Config, base: Config, unit: Literal["seconds", "flops"], alon
         alone: whether the autoencoder is its own, so that its training is scaled too; otherwise it is the base
             preset's.
     """
-    (tokenizer, model), whole = budget.training_cost(config, unit), sum(budget.training_cost(base, unit))
+    tokenizer, model = budget.training_cost(config, unit)
+    whole = sum(budget.training_cost(base, unit))
     if alone:
         return budget.cut(config, whole / (tokenizer + model))
     steps = round(config.train.steps * (whole - tokenizer) / model) if model else config.train.steps
@@ -190,7 +195,8 @@ def _small(arm: Arm, base: Config) -> Config:
 
 def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
     """Returns the stages of an arm's training, for about as many steps as the configuration has."""
-    clips, drawn = config.sim.episodes - config.sim.test_episodes, config.train.steps * config.train.batch_size
+    clips = config.sim.episodes - config.sim.test_episodes
+    drawn = config.train.steps * config.train.batch_size
     if arm.data < 1:
         some = max(1, round(arm.data * clips))
         return (CurriculumStageConfig((ComponentConfig(clips=some),), drawn / some),)

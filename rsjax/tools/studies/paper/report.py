@@ -109,7 +109,8 @@ def _summary(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 def _claim(outcome: Outcome) -> dict[str, Any]:
     """Returns a claim's part of the report, JSON-ready, with texts as the pages show them."""
-    claim, columns = outcome.claim, _columns(outcome)
+    claim = outcome.claim
+    columns = _columns(outcome)
     return {
         "name": claim.name,
         "title": claim.title,
@@ -243,9 +244,11 @@ def _spread(arm: Trained, column: Metric) -> str:
 
 
 def _comparison(judged: Judged) -> dict[str, Any]:
-    compared, metric = judged.comparison, judged.metric
+    compared = judged.comparison
+    metric = judged.metric
     digits = metric.decimals
-    own, other = compared.score or compared.metric, compared.than_score or compared.metric
+    own = compared.score or compared.metric
+    other = compared.than_score or compared.metric
     sides = (compared.better, compared.than) if compared.better != compared.than else (own, other)
     return {
         "what": f"{sides[0]} − {sides[1]}",
@@ -267,7 +270,8 @@ def _comparison(judged: Judged) -> dict[str, Any]:
 
 def _numbers(judged: Judged) -> dict[str, Any]:
     """Returns the unrounded numbers of a comparison; the texts of the report are rounded."""
-    interval, test = judged.difference or Estimate(math.nan, None, None), judged.test
+    interval = judged.difference or Estimate(math.nan, None, None)
+    test = judged.test
     welch = test.difference if test else Estimate(math.nan, None, None)
     return {
         "sides": None if judged.sides is None else list(map(float, judged.sides)),

@@ -67,7 +67,8 @@ def write(plan: Plan, out: Path, data: Path, command: str) -> Path:
 
 def print_plan(plan: Plan, out: Path, data: Path) -> None:
     """Prints the tasks in order with their states, estimated minutes and claims."""
-    runs, base = runs_of(plan, out, data), plan.scale.base
+    runs = runs_of(plan, out, data)
+    base = plan.scale.base
     print(
         f"{base.name} in {duration(plan.scale.seconds)}: {base.sim.episodes} episodes, {base.tokenizer_train.steps} "
         f"steps of the tokenizer, {base.train.steps} of the model, {base.eval.clips} test clips"

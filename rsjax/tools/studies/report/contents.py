@@ -27,8 +27,13 @@ def describe(store: Store, most: int = 200) -> tuple[list[str], list[str]]:
         Lines of text, and the messages of damaged records, which the lines include as well.
     """
     damaged: list[str] = []
-    lengths, cameras, rates = Counter[int](), Counter[str](), Counter[str]()
-    tracks, speeds, actions, deep = list[float](), list[float](), list[np.ndarray](), 0
+    lengths = Counter[int]()
+    cameras = Counter[str]()
+    rates = Counter[str]()
+    tracks = list[float]()
+    speeds = list[float]()
+    actions = list[np.ndarray]()
+    deep = 0
     for _, _, record in sampled(store, most, damaged):
         provenance = record["provenance"]
         lengths[len(record["actions"])] += 1
@@ -129,7 +134,8 @@ def sampled(store: Store, most: int, damaged: list[str]) -> Iterator[tuple[str, 
 
 def _rate(provenance: Mapping[str, Any]) -> list[str]:
     """Returns, in words, at which rate a record's frames were taken from its recording, if its provenance says so."""
-    fps, frames = provenance.get("fps"), provenance.get("frames", [])
+    fps = provenance.get("fps")
+    frames = provenance.get("frames", [])
     if not fps or len(frames) < 2:
         return []
     step = (frames[-1] - frames[0]) / (len(frames) - 1)
@@ -153,7 +159,8 @@ def _ranges(actions: Sequence[np.ndarray]) -> str:
     rows = [one for one in actions if one.size]
     if not rows:
         return ""
-    low, high = min(one.min() for one in rows), max(one.max() for one in rows)
+    low = min(one.min() for one in rows)
+    high = max(one.max() for one in rows)
     mean = sum(float(one.sum()) for one in rows) / sum(one.size for one in rows)
     return f"{rows[0].shape[-1]} dimensions, {low:.3g} to {high:.3g}, mean {mean:.3g}"
 

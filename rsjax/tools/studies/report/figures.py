@@ -63,7 +63,8 @@ class ClipFigure:
     def __post_init__(self) -> None:
         shape = self.truth.shape
         for name in ("prediction", "reconstruction", "other_actions", "true_depth", "predicted_depth"):
-            value, expected = getattr(self, name), shape[:3] if "depth" in name else shape
+            value = getattr(self, name)
+            expected = shape[:3] if "depth" in name else shape
             if value is not None and value.shape != expected:
                 raise ValueError(f"{name} of clip {self.title!r} has shape {value.shape}; it must be {expected}")
         if self.tracks is not None and (self.visible is None or self.tracks.shape[:2] != self.visible.shape):
@@ -134,7 +135,8 @@ def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
     rows = clip.rows()
     scale = _scale(clip, _CELL_ANIMATION)
     height, width = (side * scale for side in clip.truth.shape[1:3])
-    top, bottom = 46, 30
+    top = 46
+    bottom = 30
     cells = [resize(frames, scale) for _, frames in rows]
     low = SCALE + _GAP if clip.has_depth() else 0
     empty, draw = _sheet(_GAP + len(rows) * (width + _GAP), top + height + low + bottom)
@@ -155,7 +157,8 @@ def animation(clip: ClipFigure) -> UInt8[np.ndarray, "T h w 3"]:
         y = top + height + low + bottom // 2
         name = f"frame {t + 1} of {count}" + (", prompt" if t < clip.prompt_frames else "")
         draw.text((_GAP, y), name, fill=_FAINT, font=font(13), anchor="lm")
-        start, end = 170, sheet.width - _GAP
+        start = 170
+        end = sheet.width - _GAP
         draw.line((start, y, end, y), fill=(60, 64, 70), width=3)
         draw.line((start, y, start + (end - start) * (t + 1) // count, y), fill=_TEXT, width=3)
         sheets.append(np.asarray(sheet))

@@ -40,7 +40,8 @@ def rerun_view(store: Store, clips: int = 4, file: Path | None = None) -> list[s
         import rerun
     except ImportError as error:
         raise UserError("--rerun and --rerun-file need the viewer: pip install -e '.[rerun]'") from error
-    damaged, shown = list[str](), 0
+    damaged = list[str]()
+    shown = 0
     recording = rerun.RecordingStream("rsjax")
     with _reported(file):
         for _, _, record in clips_of(store, clips, damaged):

@@ -44,7 +44,9 @@ def _curve_chart(curves: Curves, metric: Metric) -> Chart:
                 continue
             low, high = (_numbers(curves[f"{name}_{side}"]) for side in ("low", "high"))
             marker = "o" if len(frames) == 1 else None
-            line, dash, color = _numbers(curves[name]), _DASHES[suffix], _COLORS[suffix]
+            line = _numbers(curves[name])
+            dash = _DASHES[suffix]
+            color = _COLORS[suffix]
             axes.plot(frames, line, linestyle=dash, marker=marker, color=color, linewidth=1.3, label=label)
             axes.fill_between(frames, low, high, color=color, alpha=0.18, linewidth=0)
         axes.set_title(metric.heading, fontsize=9, loc="left")

@@ -52,7 +52,7 @@ def test_one_seed_each_is_paired_by_clip(make: Make) -> None:
     assert findings == [None, "better", "worse", "better"]
 
 
-def test_better_is_only_said_where_seeds_bear_it_out(make: Make) -> None:
+def test_a_difference_is_better_only_where_seeds_agree(make: Make) -> None:
     a = [toy.result(gain, seed) for seed, gain in enumerate((-1.0, 0.0, 1.0))]
     b = [toy.result(gain, seed) for seed, gain in enumerate((0.5, 1.0, 1.5))]
     c = [toy.result(gain, seed) for seed, gain in enumerate((3.9, 4.0, 4.1))]

@@ -27,7 +27,8 @@ FRAME = "seconds a frame"
 @measurement(FRAME, lambda config: 20.0)
 def speed(run: Run) -> Scores:
     """Measures the time per generated frame of a single clip, from pixels to pixels."""
-    trained, clip = load(run.directory), run.open_clips().source("test")[0]
+    trained = load(run.directory)
+    clip = run.open_clips().source("test")[0]
     first = run.config.prompt_frames
     prompt = Video(clip["rgb"][None, :first], None if clip["depth"] is None else clip["depth"][None, :first])
     inputs = (trained.params, trained.assets, prompt, clip["actions"][None])

@@ -32,7 +32,10 @@ from rsjax.tools.studies.paper.measurements import FOLDER, Scores, measurement
 
 STRONG = 0.9  # correlation with success in the simulator that counts as strong
 # Seconds on 2 cores; a decision considers 96 sequences.
-POLICY_STEP, JUDGE_STEP, EPISODE, DECISION = 0.31, 0.12, 1.7, 6.5
+POLICY_STEP = 0.31
+JUDGE_STEP = 0.12
+EPISODE = 1.7
+DECISION = 6.5
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ def _place(run: Run, size: Size) -> Path:
 def judged(run: Run) -> Scores:
     """Rolls out eight checkpoints of a policy in the simulator and in the run's world model."""
     size = Size.of(run.config)
-    data, place = _judged(run, size), _place(run, size)
+    data = _judged(run, size)
+    place = _place(run, size)
     with making(place, wait=True), open_lift(data.simulator, size.trials) as simulator:
         demos = data.demos()
         policies = policy_evaluation.checkpoints(
@@ -135,7 +139,9 @@ def judged(run: Run) -> Scores:
 def learned(run: Run) -> Scores:
     """Trains policies on few and on many demonstrations, synthetic, real and both together, and runs their trials."""
     size = Size.of(run.config)
-    data, place, own = _judged(run, size), _place(run, size), run.directory / FOLDER / "policies"
+    data = _judged(run, size)
+    place = _place(run, size)
+    own = run.directory / FOLDER / "policies"
     real = data.demos()
     many = min(size.demos, len(real))
     limits = action_range(data.config, data.trained.assets.normalization)
@@ -158,9 +164,11 @@ def learned(run: Run) -> Scores:
 def improved(run: Run) -> Scores:
     """Trains a policy on few real demonstrations, and improves it in the run's world model."""
     size = Size.of(run.config)
-    data, place = _judged(run, size), _place(run, size)
+    data = _judged(run, size)
+    place = _place(run, size)
     settings = Improvement(imagined=size.demos, steps=size.policy.train.steps // 4, max_steps=size.trials.max_steps)
-    demos, model = data.demos().first(size.few), data.world(size.trials.together)
+    demos = data.demos().first(size.few)
+    model = data.world(size.trials.together)
     with making(place, wait=True), open_lift(data.simulator, size.trials) as simulator:
         policy = train_policy(size.policy, demos, place / "few")
         starts = data.first_frames(settings.imagined * settings.rounds)
