@@ -128,7 +128,7 @@ def _new_seconds(config: Config, keys: Mapping[str, str], made: set[str]) -> flo
 
 
 def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, int]]:
-    """Returns (claim, arm, seed) in order: rank 0 with all seeds; other claims with ``VERDICT_SEEDS`` seeds; further seeds."""
+    """Returns (claim, arm, seed) in order: rank 0 with all seeds; the others with ``VERDICT_SEEDS``; further seeds."""
     first = [claim for claim in claims if not claim.rank]
     others = [claim for claim in claims if claim.rank]
     few = seeds[:VERDICT_SEEDS]

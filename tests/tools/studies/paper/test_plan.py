@@ -99,7 +99,7 @@ def test_the_estimates_keep_to_the_budget_and_the_tables_come_first(hours: float
 
 
 def test_every_other_claim_has_two_seeds_before_the_next_and_a_third_after_all(three_hours: Plan) -> None:
-    """As nothing is told of one seed."""
+    """One seed gives no verdict."""
     tasks = [task for task in (*three_hours.tasks, *three_hours.left_out) if claims()[task.claim].rank]
     made = [(three_hours.cells[task.cell].config.train.seed, task.claim) for task in tasks if not task.measurement]
     third = [seed == 2 for seed, _ in made]
