@@ -158,7 +158,7 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
     Flags are named after fields, without the part's name. A boolean in the part "fields" takes a value, False or True.
     """
     markers = {name: [tyro.conf.arg(name="")] for name in parts}
-    markers.get("fields", []).append(tyro.conf.FlagConversionOff)
+    markers.get("fields", []).extend([tyro.conf.FlagConversionOff, tyro.conf.AvoidSubcommands])
     kinds = [(name, Annotated[(type(part), *markers[name])]) for name, part in parts.items()]  # type: ignore[misc]
     default: Any = dataclasses.make_dataclass("Command", kinds)(**parts)
 

@@ -27,6 +27,8 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
         config["runtime"] = {name: config["train"][name] for name in SHARED if name in config["train"]}
         for section in ("tokenizer_train", "train"):
             upgrade_training(config[section])
+    if config.get("data") and not config["data"]["key"]:
+        config["data"] = None
     model = config["model"]
     if model["family"] in ("roboscape", "genie") and "departures" not in model:
         upgrade_model(model)

@@ -88,6 +88,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _token_key(run: Run) -> str:
+    assert run.config.data is not None
     return tokens_key(run.config.data.key, tokenizer_key(run.config.tokenizer, "None"))
 
 

@@ -19,6 +19,8 @@ def old(config: Config) -> dict[str, Any]:
         values[section] |= runtime | {"skip_budget": 10, "keep_last": 2, "restarts": []}
         optimizer = values[section]["optimizer"]
         optimizer["beta1"], optimizer["beta2"] = optimizer.pop("betas")
+    sizes = dict.fromkeys(("frames", "image_size", "tracks", "action_dim", "test_clips"), 0)
+    values["data"] = {"store": "", "key": "", **sizes}
     model = values["model"]
     model["positions"] = "rotary" if departures.pop("rotary") else "learned"
     model["mask"]["visible_prefix"] = departures.pop("visible_prefix")

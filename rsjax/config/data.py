@@ -1,8 +1,6 @@
 """The shape of a data set's clips, and settings of a store of ingested clips."""
 
-from dataclasses import dataclass
-
-from rsjax.config.fields import require, runtime
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -23,19 +21,13 @@ class DataConfig:
     ``--store`` fills it in (:func:`rsjax.tools.pipeline.run_clips.on_store`).
     """
 
-    store: str = runtime("")  # its path
-    key: str = ""  # its content key, which identifies it wherever it is; empty: episodes are simulated
-    frames: int = 0
-    image_size: int = 0
-    tracks: int = 0
-    action_dim: int = 0
-    test_clips: int = 0
-
-    def __post_init__(self) -> None:
-        require(
-            bool(self.store) == bool(self.key),
-            f"data.store is {self.store!r} and data.key is {self.key!r}; name a store with --store, which sets both",
-        )
+    store: str = field(metadata={"runtime": True})  # its path
+    key: str  # its content key, which identifies it wherever it is
+    frames: int
+    image_size: int
+    tracks: int
+    action_dim: int
+    test_clips: int
 
     @property
     def clips(self) -> ClipShape:

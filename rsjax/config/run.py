@@ -59,7 +59,7 @@ class Config:
     name: str
     prompt_frames: int = 1  # frames that generation starts from; 1 in the paper
     sim: SimConfig = SimConfig()  # ignored if data names a store
-    data: DataConfig = DataConfig()
+    data: DataConfig | None = None  # a store of clips instead of simulated episodes; --store sets it
     tokenizer: TokenizerConfig = TokenizerConfig()  # ignored by a model without tokens or with its own autoencoder
     tokenizer_train: TokenizerTrainConfig = TokenizerTrainConfig()
     model: ModelConfig = RoboScapeConfig()
@@ -75,7 +75,7 @@ class Config:
             f"prompt_frames is {self.prompt_frames} of {clips.frames} frames; at least one frame must be given and "
             f"one left to predict",
         )
-        test_clips = "data.test_clips" if self.data.key else "sim.test_episodes"
+        test_clips = "sim.test_episodes" if self.data is None else "data.test_clips"
         require(
             min(self.eval.clips, clips.test_clips) >= 2,
             f"eval.clips is {self.eval.clips} of {test_clips} {clips.test_clips}; both must be at least 2, "
@@ -101,7 +101,7 @@ class Config:
     @property
     def clips(self) -> ClipShape:
         """The shape of the clips that the run learns from."""
-        return self.data.clips if self.data.key else self.sim.clips
+        return self.sim.clips if self.data is None else self.data.clips
 
     @property
     def autoencoder(self) -> Any:

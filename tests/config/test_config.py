@@ -35,6 +35,8 @@ def keyed(part: Any, prefix: str = "", in_key: bool = True) -> list[tuple[str, b
 
 def other(value: Any) -> Any:
     """A value of the same type that differs."""
+    if value is None:
+        return "x"
     if isinstance(value, bool):
         return not value
     if isinstance(value, (int, float)):

@@ -148,6 +148,7 @@ def test_both_stages_train_and_the_model_reads_what_the_autoencoder_made(
     model = rsjax.load(run.directory)
     assert model.assets.tokenizer is not None and model.assets.tokenizer["gain"] > 0.5, "it has learned"
     prepared = run.open_prepared()
+    assert config.data is not None
     assert prepared.manifest["key"] != config.data.key and prepared.counts() == run.open_clips().counts()
     clip = run.open_clips().source("test")[0]
     kept = clip["rgb"].mean() / 255 * model.assets.tokenizer["gain"]

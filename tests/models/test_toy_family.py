@@ -75,6 +75,7 @@ def test_a_toy_family_trains_generates_and_is_evaluated(config: Config, tmp_path
     rows = [json.loads(line) for line in (run.directory / "world_model" / "log.jsonl").read_text().splitlines()]
     assert any("validation/psnr" in row for row in rows)
 
+    assert config.data is not None
     clip = rsjax.open_store(config.data.store).source("test")[0]
     video = model.generate(clip["rgb"][:1], clip["actions"])
     assert video.rgb.shape == clip["rgb"].shape

@@ -45,7 +45,7 @@ def evaluation_store(run: Run, store: Store, protocol: Protocol) -> Store:
     """Returns the run's store, or a store of longer episodes or unseen scenes, which are simulated if necessary."""
     sim = run.config.sim
     needed = protocol.prompt_frames + protocol.horizon
-    if run.config.data.key:
+    if run.config.data is not None:
         return store
     if _lacking(store.splits, protocol.splits) and not _lacking(unseen_splits(sim), protocol.splits):
         count = min(protocol.clips, sim.test_episodes)

@@ -57,7 +57,9 @@ class Run:
     @property
     def clips(self) -> Path:
         """The path of the store of clips, which all runs on the same episodes share."""
-        return Path(self.config.data.store or self.data_directory / f"{self.config.sim.env}-{self._collect_key}")
+        if self.config.data is not None:
+            return Path(self.config.data.store)
+        return self.data_directory / f"{self.config.sim.env}-{self._collect_key}"
 
     def open_clips(self) -> Store:
         """Opens the store of clips.
@@ -65,7 +67,7 @@ class Run:
         Raises:
             StoreError: the store is missing or damaged, or another store is in its place.
         """
-        key = self.config.data.key
+        key = self.config.data.key if self.config.data is not None else ""
         if key and not (self.clips / MANIFEST).exists():
             raise StoreError(f"{self.clips}: the store is missing; if it was moved, name its new path with --store")
         store = open_store(self.clips)
@@ -89,7 +91,7 @@ class Run:
 
     def _made_of_these_clips(self, prepared: dict[str, Any]) -> bool:
         """Returns whether a store with this manifest was made from the run's clips, which may have moved."""
-        key = self.config.data.key
+        key = self.config.data.key if self.config.data is not None else ""
         if not key or not self.config.model.uses_tokenizer:
             return not key or prepared.get("key") == key
         shifts = prepared.get("shifts", ())
@@ -117,7 +119,7 @@ class Run:
     @property
     def _collect_key(self) -> str:
         cfg = self.config
-        return content_key("store", cfg.data.key) if cfg.data.key else collection_key(cfg.sim)
+        return collection_key(cfg.sim) if cfg.data is None else content_key("store", cfg.data.key)
 
     @property
     def lock_file(self) -> Path:

@@ -50,6 +50,6 @@ def relocated(config: Config, path: Path) -> Config:
     Raises:
         StoreError: the store is missing, or the run's clips were simulated.
     """
-    if not config.data.key:
+    if config.data is None:
         raise StoreError(f"{path}: this run's clips were simulated; name their directory with --data-dir")
     return replace(config, data=replace(config.data, store=str(open_store(path).path.absolute())))

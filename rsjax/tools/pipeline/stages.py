@@ -88,7 +88,7 @@ def _do(run: Run, name: str, work: Callable[..., None], *arguments: Any) -> None
 def check_before_start(run: Run) -> None:
     """Raises for a wrong path, a missing file or package, or a batch that does not fit, before hours of work."""
     cfg = run.config
-    if not cfg.data.key and not run.finished("collect"):
+    if cfg.data is None and not run.finished("collect"):
         check_episodes(cfg.sim, run.clips)
     trained: dict[Literal["tokenizer", "world_model"], Callable[[Config], Any]] = {
         "tokenizer": create_autoencoder,
@@ -117,7 +117,7 @@ def note_changes(run: Run, command: str) -> None:
 
 
 def _where_clips_come_from(run: Run) -> str:
-    if run.config.data.key:
+    if run.config.data is not None:
         return f"the clips of {run.clips}"
     sim = run.config.sim
     if sim.env == "lift":
@@ -128,7 +128,7 @@ def _where_clips_come_from(run: Run) -> str:
 def collect_clips(run: Run) -> None:
     """Stage 1: collects episodes in the simulator, unless another run has done so; or checks an existing store."""
     cfg = run.config
-    if cfg.data.key:
+    if cfg.data is not None:
         if cfg.model.uses_depth and not run.open_clips().manifest.get("depth_range"):
             note(
                 "no clip has depth, so the depth branch trains with its loss masked; "

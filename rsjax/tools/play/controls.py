@@ -95,7 +95,7 @@ def controls_of_run(config: Config, normalization: Normalization, names: Sequenc
     Args:
         names: names of a recording's dimensions, such as "gripper (held)"; "(held)" for a dimension without a name.
     """
-    if not config.data.key:
+    if config.data is None:
         return Controls(_LIFT if config.sim.env == "lift" else _METAWORLD, config.sim.control_steps)
     limits = action_range(config, normalization)
     mean = normalization.action_mean

@@ -93,7 +93,7 @@ def reasons(run: PlayRun) -> dict[str, str]:
     why = {"stick": "", "clip": run.missing, "random": "", "policy": "", "planner": ""}
     if run.policy is None:
         why["policy"] = "no policy was named with --policy"
-    if config.data.key or config.sim.env != "lift":
+    if config.data is not None or config.sim.env != "lift":
         why["planner"] = "planning needs a run on the simulated Lift"
     elif not (run.data.run / FOLDER / FILE).exists():
         why["planner"] = f"the run has no judge; python -m experiments.judge {run.data.run} trains one"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rsjax.clip import Video
-from rsjax.config import Config
+from rsjax.config import Config, DataConfig
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import Assets, create_model
 from rsjax.models.diffusion.config import DenoiseConfig
@@ -184,7 +184,7 @@ def on_width(config: Config, width: int) -> Config:
     """The configuration on clips with actions of another length."""
     clips = config.clips
     shape = {name: getattr(clips, name) for name in ("frames", "image_size", "tracks", "test_clips")}
-    return replace(config, data=replace(config.data, store="x", key="x", action_dim=width, **shape))
+    return replace(config, data=DataConfig(store="x", key="x", action_dim=width, **shape))
 
 
 def test_operations_are_counted_and_described() -> None:

@@ -56,6 +56,7 @@ def test_fields_on_the_command_line_are_checked_against_the_store(clips: Path) -
     argv = ["debug", "--store", str(clips), "--model.max-frames", "7", "--model.loss.num-keypoints", "3"]
     config, _ = parse(argv, "train", "", train.Options())
     assert isinstance(config.model, RoboScapeConfig)
+    assert config.data is not None
     assert (config.model.max_frames, config.model.loss.num_keypoints, config.data.key) == (7, 3, "toy")
     assert config.data.store == str(clips.absolute())
     with pytest.raises(ConfigError, match="clips have 6 frames but model.max_frames is 5"):
@@ -171,7 +172,8 @@ def test_a_damaged_train_clip_does_not_keep_a_run_from_its_scores(tmp_path: Path
     clips = toy.store(tmp_path / "clips")
     damage(clips, "train", 0)
     assert np.isfinite(evaluation.evaluate(toy.trained(clips), clips).metrics["delta_psnr_uniform"])
-    assert on_store(presets.debug(), clips.path).data.key == "toy"
+    data = on_store(presets.debug(), clips.path).data
+    assert data is not None and data.key == "toy"
 
 
 def test_tokens_of_clips_without_depth_train_with_that_term_masked(tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ def compare(
         UserError: the run is of recordings, its model takes no actions, or something that the energy needs is missing.
     """
     config = trained.config
-    if config.data.key:
+    if config.data is not None:
         raise UserError(f"{run}: its clips are recordings; a closed loop needs a run on simulated clips")
     check_takes_actions(config.model, f"{run}: the model")
     policies = policies or {}

@@ -107,7 +107,7 @@ def action_range(config: Config, normalization: Normalization) -> ActionRange:
     deviation; their range is the mean ± ``SPREAD`` standard deviations.
     """
     width = config.clips.action_dim
-    if config.data.key:
+    if config.data is not None:
         mean = np.array(normalization.action_mean)
         std = np.maximum(normalization.action_std, 1e-3)
         low = (mean - SPREAD * std).astype(np.float32)

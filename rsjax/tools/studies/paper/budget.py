@@ -178,7 +178,7 @@ def _image_flops(tokenizer: TokenizerConfig, image_size: int) -> int:
 
 def collect_seconds(config: Config) -> float:
     """Returns the seconds of the simulation."""
-    return 0.0 if config.data.key else EPISODE * config.sim.episodes
+    return 0.0 if config.data is not None else EPISODE * config.sim.episodes
 
 
 def tokenizer_seconds(config: Config) -> float:

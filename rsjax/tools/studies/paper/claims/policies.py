@@ -92,7 +92,7 @@ def _seconds(
 
 
 def _in_lift(config: Config) -> bool:
-    return not config.data.key and config.sim.env == "lift"
+    return config.data is None and config.sim.env == "lift"
 
 
 def _judged(run: Run, size: Size) -> RunData:
