@@ -241,16 +241,16 @@ def apply_network(
     mask: Bool[Array, "B T S"],
     actions: Float[Array, "B T A"],
     start: Any,
-    cache: Cache | None,
+    cache: Any,
     no_depth: Bool[Array, " B"] | None = None,
     previous: dict[str, Cells] | None = None,
     strength: Float[Array, " B"] | None = None,
-) -> tuple[dict[str, Float[Array, "B T S n V"]], Cache | None]:
+) -> tuple[dict[str, Float[Array, "B T S n V"]], Any]:
     """Returns the logits of a pass and the cache; arguments as for :class:`Transformer`, ``strength`` for guidance.
 
     Args:
         params: with stacked blocks, or split by :mod:`rsjax.layers.unstacked_params`.
-        cache: from :func:`new_cache` or an earlier call.
+        cache: from :func:`new_cache` or an earlier call; None: the frames see each other alone.
     """
     inputs = (tokens, mask, actions, no_depth, previous)
     (tokens, mask, actions, no_depth, previous), drop = guidance.doubled(sample, inputs, len(mask))
