@@ -96,11 +96,10 @@ def debug(place: Path) -> dict[str, Any]:
 
 def tokens(place: Path) -> dict[str, str]:
     """Returns digests of the tokens of a greedy rollout by the model that :func:`tiny` trained."""
-    from rsjax.pipeline.run import Run
-    from rsjax.pipeline.trained import load
-    from rsjax.pipeline.videos import resampled
-
     from rsjax.data.clips import Clips
+    from rsjax.models.load_run import load
+    from rsjax.tools.pipeline.run import Run
+    from rsjax.tools.pipeline.videos import resampled
 
     trained = resampled(load(place / "tiny"), {"temperature": 0.0, "unmask": "greedy", "steps": 3})
     source = Run(trained.config, place / "tiny", place / "data").open_clips().source("test")
