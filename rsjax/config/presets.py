@@ -62,10 +62,9 @@ def tiny() -> Config:
         name="tiny",
         sim=SimConfig(episodes=800, test_episodes=100, camera="near"),
         # Six vocabularies of 8 codes: many codes of a validation clip never occur in the training clips, but their
-        # sub-tokens do. Chosen on an earlier model; two vocabularies of 512 do as well now (docs/results/paper.md).
+        # sub-tokens do.
         tokenizer=TokenizerConfig(
-            # Patches of 4 pixels: a step takes two thirds of the time that it takes with patches of 2, half of the
-            # channels and a third level (notebooks/miniature.md). The model, which limits quality, gets that time.
+            # Patches of 4 pixels are fast; the time that they save goes to the model, which limits quality.
             patch_size=4,
             channels=64,
             channel_multipliers=(1, 2),
@@ -73,7 +72,7 @@ def tiny() -> Config:
             norm_groups=8,
             local_codes=True,
             vocabularies=6,
-            compute_dtype="bfloat16",  # 0.89 times the time of a step on a CPU with bf16 units
+            compute_dtype="bfloat16",
         ),
         # Small batches, since in a few minutes the number of steps matters most. The weights are chosen for PSNR; the
         # reference's entropy weight (0.1) spreads codes further at the cost of reconstruction.
@@ -111,14 +110,14 @@ def tiny() -> Config:
             embed_std=0.5,
             position_std=0.5,
             compute_dtype="bfloat16",
-            # In so few steps corruption and visible prefixes cost more than they gain (notebooks/miniature.md).
+            # In so few steps, corruption costs more than it gains.
             mask=MaskConfig(random_token_rate=0.0, corruption_probability=0.0),
             sample=SampleConfig(steps=1, mean_codes=True, read_means=True),
         ),
         train=TrainConfig(
             steps=1700,
             batch_size=4,
-            accumulate=2,  # half the memory, and 0.46 s instead of 0.57 s a step (notebooks/cpu-performance.md)
+            accumulate=2,  # half the memory, and faster on a CPU
             optimizer=OptimizerConfig(kind="muon", learning_rate=5e-3, final_share=0.02),
             ema=0.995,
         ),

@@ -108,12 +108,11 @@ class SampleConfig:
     temperature: float = 0.0
     top_k: int = 0  # draw from the k most probable codes of each vocabulary; 0: from all
     unmask: Literal["random", "greedy"] = "random"  # greedy tends to copy the previous frame
-    # Frames are decoded from each cell's mean code under the model's probabilities, not from its most probable one:
-    # 0.45 dB closer to the truth, and blurred where the model is unsure (notebooks/miniature.md). No effect at
-    # temperatures other than 0.
+    # Frames are decoded from each cell's mean code under the model's probabilities, not from its most probable one.
+    # They are closer to the truth, and blurred where the model is unsure. Only at temperature 0.
     mean_codes: bool = False
     # With mean_codes: later frames read the mean codes too, not the most probable ones, so that they know where the
-    # model was unsure: another 0.2 dB, and cube and gripper nearer to their true places (notebooks/miniature.md).
+    # model was unsure.
     read_means: bool = False
     # g in logits = without + g·(with - without the actions). 1: no guidance. Other values need
     # model.departures.action_dropout and double the work.
