@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rsjax.config.fields import fitting_sizes, require, require_range
 from rsjax.config.train import TrainConfig
@@ -91,6 +91,8 @@ class TokenizerTrainConfig(TrainConfig):
     ``batch_size`` counts clips; ``frames_per_clip`` frames are drawn from each. A field ``NAME_weight`` weighs the
     loss term NAME.
     """
+
+    section: ClassVar[str] = "tokenizer_train"
 
     # Not a runtime field here: the entropy, the discriminator's batch norm and LeCAM are computed for each part.
     accumulate: int = 1

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rsjax.config.fields import require, require_range, runtime
 
@@ -86,6 +86,8 @@ class CurriculumStageConfig:
 class TrainConfig:
     """Settings of a training that decide its result, shared by the tokenizer's and the world model's."""
 
+    section: ClassVar[str] = "train"  # of a configuration, for messages
+
     steps: int = 1000
     batch_size: int = 8  # over all devices
     optimizer: OptimizerConfig = OptimizerConfig()
@@ -100,9 +102,9 @@ class TrainConfig:
     accumulate: int = runtime(1)  # parts of a batch computed one after another; raise it where memory runs out
 
     def __post_init__(self) -> None:
-        require_range(self, "training", int(not self.start_from), 2**31 - 1, "steps")
-        require_range(self, "training", 1, math.inf, "batch_size", "accumulate")
-        require_range(self, "training", 0, 1, "ema")
+        require_range(self, self.section, int(not self.start_from), 2**31 - 1, "steps")
+        require_range(self, self.section, 1, math.inf, "batch_size", "accumulate")
+        require_range(self, self.section, 0, 1, "ema")
         require(
             self.batch_size % self.accumulate == 0,
             f"batch_size {self.batch_size} does not divide into accumulate = {self.accumulate} parts; change one",

@@ -151,7 +151,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("train.optimizer", {"betas": (0.9, 1.5)}, "optimizer.betas are (0.9, 1.5); they are two numbers"),
         ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
         ("model.mask", {"corruption_decay": -math.inf}, "model.mask.corruption_decay is -inf; it must be a finite"),
-        ("train", {"ema": math.nan}, "training.ema is nan; it must be 0 … 1"),
+        ("train", {"ema": math.nan}, "train.ema is nan; it must be 0 … 1"),
         ("runtime", {"max_damaged": 2.0}, "runtime.max_damaged is 2.0; it must be 0 … 1"),
         ("runtime", {"log_every": 2**63}, "runtime.log_every is 9223372036854775808; it must fit in 64 bits"),
         ("", {"train": c.TrainConfig(curriculum=(c.CurriculumStageConfig(epochs=math.inf),))}, "epochs is inf"),

@@ -58,7 +58,7 @@ def test_episodes_beyond_the_disk_are_refused(tmp_path: Path) -> None:
 
 def test_steps_end_with_their_counter() -> None:
     TrainConfig(steps=2**31 - 1)
-    with pytest.raises(ConfigError, match="training.steps is 10000000000; it must be 1 … 2147483647"):
+    with pytest.raises(ConfigError, match="train.steps is 10000000000; it must be 1 … 2147483647"):
         TrainConfig(steps=10**10)
 
 

@@ -93,7 +93,7 @@ def test_the_named_fields_exist() -> None:
 
 def test_a_value_as_printed_is_read_back() -> None:
     for name, field in config_fields(DEBUG).items():
-        if not isinstance(field.value, tuple):
+        if field.value is not None and not isinstance(field.value, tuple):
             value = parse_value(name, field.kind, str(field.value))
             assert (value, type(value)) == (field.value, type(field.value)), name
 
