@@ -46,7 +46,8 @@ def main() -> None:
     """Runs the cells that are not finished, then prints the table; exits with 1 if a cell failed."""
     tune_process()
     config, options = parse(sys.argv[1:], PROG, "Runs a grid of configurations and compares them.", Options())
-    out, data = options.out or Path("runs") / f"ablation-{config.name}", options.data_dir
+    out = options.out or Path("runs") / f"ablation-{config.name}"
+    data = options.data_dir
     grid = expand(config, parse_axes(config, options.grid or DEFAULT_AXES), options.seeds)
     number = options.cell
     if number is None and not options.list and (task := os.environ.get(TASK)):

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +42,19 @@ def main() -> None:
     from rsjax.tools.bench.run import PARTS, bench, table
 
     jax.config.update("jax_enable_compilation_cache", False)  # so that compilation itself is measured
-    rival = pytorch_rival(config) if options.torch else None
+    rival = None
+    if options.torch:
+        rival = pytorch_rival(config)
+    parts: tuple[str, ...] = PARTS
+    if options.only:
+        parts = tuple(options.only.split(","))
     console = Console()
-    only = tuple(options.only.split(",")) if options.only else PARTS
-    keep = partial(write_json, options.json) if options.json else lambda numbers: None
-    numbers = bench(config, options.batch, only, options.horizons, rival, say=console.print, keep=keep)
+
+    def keep(numbers: dict[str, Any]) -> None:
+        if options.json:
+            write_json(options.json, numbers)
+
+    numbers = bench(config, options.batch, parts, options.horizons, rival, say=console.print, keep=keep)
     console.print(table(numbers))
 
 

@@ -115,18 +115,21 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
         raise SystemExit(0)
     name, *argv = argv
     refuse_repeated(argv, _adding(options))
-    prog, preset = f"{prog} {name}", presets.get(name)
+    prog = f"{prog} {name}"
+    preset = presets.get(name)
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
     preset = preset_options.apply(preset)
     fields: Any = preset
     if {"-h", "--help"}.intersection(argv):
-        fields, description = _first_fields(preset), f"{description} Every field: {prog} --help-all"
+        fields = _first_fields(preset)
+        description = f"{description} Every field: {prog} --help-all"
     elif "--help-all" in argv:
         argv = ["--help"]
     parsed = _parse({"options": options, "preset": preset_options, "fields": fields}, argv, prog, description)
     config: Config = parsed.fields
     for name in ("train", "tokenizer_train"):
-        loop, flag = getattr(config, name), f"--{name.replace('_', '-')}"
+        loop = getattr(config, name)
+        flag = f"--{name.replace('_', '-')}"
         require(
             not loop.curriculum or loop.steps == getattr(preset, name).steps,
             f"{flag}.steps changes nothing, as the epochs of {flag}.curriculum determine the steps; "
@@ -174,7 +177,8 @@ def _parse(parts: dict[str, Any], argv: Sequence[str], prog: str, description: s
         raise ConfigError(f"{_one_line(report.getvalue(), parts)} (see {prog} --help)") from None
     except BrokenPipeError:  # --help-all | head
         os._exit(0)
-    parsed = parsed[0] if rest else parsed
+    if rest:
+        parsed = parsed[0]
     if "options" in parts:
         check_numbers(parsed.options, "--", dash=True)
     return parsed

@@ -99,7 +99,8 @@ def _print_counts(diagnosis: "Diagnosis", console: "Console") -> None:
         for kind, count in diagnosis.counts().items():
             table.add_row(kind, str(count), KINDS[kind])
         console.print(table, soft_wrap=False)
-    reasons, total = diagnosis.reasons(), len(diagnosis.refs)
+    reasons = diagnosis.reasons()
+    total = len(diagnosis.refs)
     bad = sum(name in reasons for name, _ in diagnosis.refs)
     for kind in diagnosis.usual():
         console.print(f"all are {kind!r}: if that is as it should be, --ignore {kind}")

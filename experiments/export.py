@@ -31,7 +31,8 @@ def main() -> None:
     word, *argv = sys.argv[1:] or [""]
     if word != "lerobot" and not {"-h", "--help"} & {word}:
         raise ConfigError(f"name a format first; usage: {PROG} lerobot STORE OUT; formats: lerobot")
-    argv = argv if word == "lerobot" else ["--help"]
+    if word != "lerobot":
+        argv = ["--help"]
     options = parse_options(argv, f"{PROG} lerobot", "Writes a store as a LeRobotDataset.", Options())
     from rsjax.data.store import open_store
     from rsjax.progress import Progress

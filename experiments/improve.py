@@ -49,10 +49,13 @@ def main() -> None:
     from rsjax.tools.policies.studies.improvement import improve
     from rsjax.tools.policies.studies.trials import open_lift
 
-    run, out = RunData(options.run, options.data_dir), options.out or options.run / "improve"
-    settings, trials = part(options, Improvement), part(options, Trials)
+    run = RunData(options.run, options.data_dir)
+    out = options.out or options.run / "improve"
+    settings = part(options, Improvement)
+    trials = part(options, Trials)
     config = run.simulator  # checks the clips before a policy is trained
-    model, demos = run.world(trials.together, options.judge), run.demos().first(options.demos)
+    model = run.world(trials.together, options.judge)
+    demos = run.demos().first(options.demos)
     if options.policy:
         policy = load_policy(options.policy)
     else:

@@ -24,12 +24,16 @@ def main() -> None:
         raise ConfigError(
             f"name a source and its path first; usage: {PROG} SOURCE PATH --out STORE; sources: {', '.join(FORMATS)}"
         )
-    source, path, rest = ("", "", argv) if wants_help else (argv[0], argv[1], argv[2:])
+    source = path = ""
+    rest = argv  # --help ends the command, so that no source is needed
+    if not wants_help:
+        source, path, *rest = argv
     options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, IngestOptions())
     if options.recipe:  # again, since options change the recipe's settings
         recipe = IngestOptions(recipe=options.recipe, windows=RECIPES[options.recipe])
         options = parse_options(rest, f"{PROG} SOURCE PATH", ABOUT, recipe)
-    plan, runner = make_plan(source, Path(path), options), make_runner(options)
+    plan = make_plan(source, Path(path), options)
+    runner = make_runner(options)
 
     from rsjax.progress import Progress, note
     from rsjax.tools.ingest.ingest import count_steps, ingest, is_up_to_date, list_episodes
@@ -55,7 +59,10 @@ def main() -> None:
     else:
         print(*lines(summary), sep="\n")
         if missing := unfiltered(options.windows):
-            print(f"filters   off: {missing}{'' if options.recipe else '; --recipe paper turns them on (§2.2)'}")
+            hint = "; --recipe paper turns them on (§2.2)"
+            if options.recipe:
+                hint = ""
+            print(f"filters   off: {missing}{hint}")
         if tables := summary.tables():
             print(f"what was left out, and why: {tables} in {plan.folder}")
     print(f"store: {plan.out}")

@@ -4,7 +4,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -63,7 +63,9 @@ def main() -> None:
     limits = (options.episodes, options.max_steps)
     settings = PlanSettings(planner, options.methods, options.energy, options.lpips_weights, *limits)
     trained = load(options.run)
-    policies = {f"policy {options.policy}": load_policy(options.policy)} if options.policy else {}
+    policies: dict[str, Any] = {}
+    if options.policy:
+        policies[f"policy {options.policy}"] = load_policy(options.policy)
     with closing(SimulatorWorld.lift(trained.config.sim, 1)) as simulator:
         result = compare(trained, options.run, simulator, settings, policies)
     Console().print(table(result))

@@ -56,8 +56,10 @@ def main() -> None:
     from rsjax.tools.policies.studies.trials import open_lift
 
     runs = {name: RunData(run, options.data_dir) for name, run in named(options.runs).items()}
-    first, trials = next(iter(runs.values())), part(options, Trials)
-    out, judge = options.out or first.run / "policy_evaluation", options.judge or first.run / FOLDER
+    first = next(iter(runs.values()))
+    trials = part(options, Trials)
+    out = options.out or first.run / "policy_evaluation"
+    judge = options.judge or first.run / FOLDER
     if options.blind:
         print(blind(out, options.blind))
         return

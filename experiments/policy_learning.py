@@ -46,8 +46,11 @@ def main() -> None:
     from rsjax.tools.policies.studies.policy_learning import learn
     from rsjax.tools.policies.studies.trials import open_lift
 
-    run, out = RunData(options.run, options.data_dir), options.out or options.run / "policy_learning"
-    config, learning, trials = sized_policy(options.size, options.steps), part(options, Learning), part(options, Trials)
+    run = RunData(options.run, options.data_dir)
+    out = options.out or options.run / "policy_learning"
+    config = sized_policy(options.size, options.steps)
+    learning = part(options, Learning)
+    trials = part(options, Trials)
     synthetic = Demos((), 1)
     if any(cell.synthetic for cell in learning.chosen()):
         synthetic = synthetic_demos(options.synthetic or options.run / "synthetic" / "clips", options.run)

@@ -38,14 +38,18 @@ def main() -> None:
     from rsjax.tools.pipeline.run_clips import relocated
 
     config = load_config(options.run)
-    run = Run(relocated(config, options.store) if options.store else config, options.run, options.data_dir)
+    if options.store:
+        config = relocated(config, options.store)
+    run = Run(config, options.run, options.data_dir)
     if options.step is None:
         print("\n".join(skipped_steps(run, options.stage)) or f"{options.run}: no step of {options.stage} was skipped")
         return
     for clip in replay(run, options.stage, options.step):
         scalars = ", ".join(f"{name} {value:.4g}" for name, value in clip.scalars.items())
         file = clip.source.get("file", "")
-        mark = "" if clip.finite else "   <-- not finite"
+        mark = ""
+        if not clip.finite:
+            mark = "   <-- not finite"
         print(f"record {clip.source['record']} {file}: {scalars}{mark}")
 
 

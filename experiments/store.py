@@ -79,11 +79,13 @@ def split(options: Split) -> list[Any]:
     """Splits the store, and returns the parts."""
     from rsjax.data.merge import by_label, into_parts, split
 
-    place, into = options.store, options.into
     if options.parts < 0:
         raise ConfigError(f"--parts is {options.parts}; it is how many stores to make")
-    parts = into_parts(place, options.parts, into) if options.parts else by_label(place, options.by, into)
-    return list(split(place, parts).values())
+    if options.parts:
+        parts = into_parts(options.store, options.parts, options.into)
+    else:
+        parts = by_label(options.store, options.by, options.into)
+    return list(split(options.store, parts).values())
 
 
 def tokenize(options: Tokenize) -> list[Any]:
@@ -94,7 +96,8 @@ def tokenize(options: Tokenize) -> list[Any]:
     from rsjax.models.base import Assets, create_model
     from rsjax.models.load_run import load_config, load_tokenizer
 
-    config, clips = load_config(options.run), open_store(options.store)
+    config = load_config(options.run)
+    clips = open_store(options.store)
     assets = Assets(Normalization.create(clips), load_tokenizer(config, options.run))  # normalization of these clips
     prepared = create_model(config).prepare(clips, assets, options.store / "tokens", config.runtime.max_damaged)
     if prepared is None:

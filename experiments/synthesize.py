@@ -38,7 +38,8 @@ def main() -> None:
     from rsjax.tools.policies.studies.synthesis import synthesize
     from rsjax.tools.policies.worlds.actions import action_range
 
-    run, out = RunData(options.run, options.data_dir), options.out or options.run / "synthetic"
+    run = RunData(options.run, options.data_dir)
+    out = options.out or options.run / "synthetic"
     store = open_store(options.store) if options.store else run.clips
     limits = action_range(run.config, run.trained.assets.normalization)
     judge = run.judge() if options.judge else None

@@ -104,7 +104,8 @@ def _cure(error: BaseException) -> str | None:
 
 def _bad_variable(error: BaseException | None) -> str:
     """Says which of jax's environment variables is invalid if that caused the error; "" otherwise."""
-    platforms, jax = os.environ.get("JAX_PLATFORMS"), sys.modules.get("jax")
+    platforms = os.environ.get("JAX_PLATFORMS")
+    jax = sys.modules.get("jax")
     while error is not None:
         if (refused := _JAX_REFUSES.search(str(error))) and (value := os.environ.get(name := refused[1].upper())):
             return f"{name} is {value!r:.80}, which jax does not know; unset it"

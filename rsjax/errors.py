@@ -43,7 +43,8 @@ def storage_limit(error: object) -> str:
 
     Libraries report these limits in their own errors, which contain the operating system's text somewhere.
     """
-    number, text = getattr(error, "errno", None), str(error)
+    number = getattr(error, "errno", None)
+    text = str(error)
     for limit, cure in _LIMITS.items():
         if number == limit or os.strerror(limit) in text:
             return cure

@@ -34,7 +34,8 @@ def main() -> None:
                 times.append(1000 * (time.perf_counter() - began))
                 inside.append(page.wait(number)["ms"])
             page.ask("start", clip=0)
-            rate, half, most = 1000 / np.mean(times), *np.percentile(times, [50, 95])
+            rate = 1000 / np.mean(times)
+            half, most = np.percentile(times, [50, 95])
             line = (
                 f"{rate:.1f} frames a second, {half:.1f} ms (95 %: {most:.1f}), {np.median(inside):.1f} in the server"
             )

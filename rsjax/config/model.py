@@ -127,10 +127,12 @@ def converted(model: ModelConfig, name: str) -> ModelConfig:
 
     Fields that the new family lacks or has of another type, such as its own ``sample``, are dropped.
     """
-    kind, default = family(name), type(model)()
+    kind = family(name)
+    default = type(model)()
     values: dict[str, Any] = {f.name: getattr(model, f.name) for f in fields(model)}
     changed = {name: value for name, value in values.items() if value != getattr(default, name)}
-    here, there = get_type_hints(type(model)), get_type_hints(kind)
+    here = get_type_hints(type(model))
+    there = get_type_hints(kind)
     choices = {name: get_args(there.get(name)) for name in changed}  # of a Literal
     shared = {name: x for name, x in changed.items() if here[name] == there.get(name) or x in choices[name]}
     return model if type(model) is kind else kind(**shared)

@@ -210,7 +210,8 @@ class WorldModel(Trainable[B], Protocol[B]):
             depth: as for :meth:`generate`.
             last: return only this many frames, the last ones; a family need not decode the others.
         """
-        repeated, alike = prompt[np.zeros(len(actions), int)], np.zeros(len(actions), int)
+        repeated = prompt[np.zeros(len(actions), int)]
+        alike = np.zeros(len(actions), int)
         video = self.generate(params, assets, repeated, actions, index=alike, depth=depth)
         return video if last is None else video.frames(-last)
 

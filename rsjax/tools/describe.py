@@ -83,9 +83,12 @@ def figures(config: Config, modules: dict[str, Shapes]) -> dict[str, int]:
       ``model.remat`` "none", the second for "blocks"; "products" is between them.
     - ``bytes_cache_…``: keys and values that one rollout of a clip's length keeps, for a family with a cache.
     """
-    model, world = create_model(config), modules["world_model"]
+    model = create_model(config)
+    world = modules["world_model"]
     counts = {part: count(shapes) for part, shapes in world.items()}
-    frames, flops, activations = config.clips.frames, model.flops(config.clips.frames), activation_bytes(config)
+    frames = config.clips.frames
+    flops = model.flops(config.clips.frames)
+    activations = activation_bytes(config)
     numbers = {
         **{f"params_{part}": n for part, n in counts.items()},
         "params_world_model": sum(counts.values()),

@@ -83,7 +83,8 @@ def _in_strips(
     Returns:
         The last total, and the results put together.
     """
-    (images, height, width, _), around = x.shape, size // 2
+    images, height, width, _ = x.shape
+    around = size // 2
     numbers = width * size * x.shape[-1]  # of a row
     rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * numbers <= STRIP))
     many = max(n for n in range(1, images + 1) if images % n == 0 and (n == 1 or n * height * numbers <= STRIP))
@@ -122,7 +123,8 @@ def _rows(unfolded: BFloat16[Array, "B h2 w jC"], size: int) -> list[BFloat16[Ar
 
 
 def _products(unfolded: BFloat16[Array, "B h2 w jC"], kernel: Float[Array, "i i C D"]) -> Float[Array, "B h w D"]:
-    size, outputs = len(kernel), kernel.shape[-1]
+    size = len(kernel)
+    outputs = kernel.shape[-1]
     # A row at a time: XLA would cast the whole kernel first, and then copy its rows.
     kernels = [row.reshape(-1, outputs).astype(jnp.bfloat16) for row in kernel]
     images, height, width, _ = unfolded.shape

@@ -25,7 +25,8 @@ from rsjax.layers.cpu.matmul import transposed_in_memory
 # transposes cost.
 LARGE_FRAME = 128
 UNROLLED = 16  # frames whose code is written out; more take longer to compile
-BLOCKS, LONG = 4, 256  # blocks of queries in causal attention of at least so many cells
+BLOCKS = 4  # blocks of queries in causal attention …
+LONG = 256  # … of at least so many cells
 SCORES = 2**24  # the most in all frames that run at the same time: 64 MiB
 
 
@@ -91,9 +92,11 @@ def _frame_gradient(
     causal: bool, q: Array, k: Array, v: Array, g: Array, along: Array, log_total: Array
 ) -> tuple[Array, Array, Array]:
     """Returns one frame's gradients: of queries (h, S, e), and of keys and values transposed, (h, e, S)."""
-    parts, cells = [], q.shape[1]
+    parts = []
+    cells = q.shape[1]
     for rows in _blocks(causal, cells):
-        seen, own = (k[:, : rows.stop], v[:, : rows.stop]), (x[:, rows] for x in (q, g, along, log_total))
+        seen = (k[:, : rows.stop], v[:, : rows.stop])
+        own = (x[:, rows] for x in (q, g, along, log_total))
         dq, *of_keys = _block_gradient(causal, *seen, *own)
         parts.append((dq, *(jnp.pad(x, ((0, 0), (0, 0), (0, cells - rows.stop))) for x in of_keys)))
     queries, keys, values = zip(*parts, strict=True)
@@ -115,7 +118,8 @@ def _block_gradient(
 
 def _scores(q: Array, k: Array, causal: bool) -> Array:
     scores = _product("hqe,hke->hqk", q, k)
-    (queries, keys), before = scores.shape[1:], scores.shape[2] - scores.shape[1]
+    queries, keys = scores.shape[1:]
+    before = scores.shape[2] - scores.shape[1]
     return jnp.where(jnp.tri(queries, keys, before, dtype=bool), scores, -jnp.inf) if causal else scores
 
 

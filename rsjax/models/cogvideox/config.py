@@ -9,7 +9,8 @@ from rsjax.config.fields import require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 from rsjax.models.diffusion.config import DenoiseConfig, NoiseConfig, check_grid
 
-ENCODED, DECODED = 8, 2  # frames that the autoencoder encodes and latent frames that it decodes in one piece
+ENCODED = 8  # frames that the autoencoder encodes in one piece
+DECODED = 2  # latent frames that it decodes in one piece
 COMPRESSION = 4  # frames per latent frame, after the first
 
 
@@ -142,7 +143,8 @@ class CogVideoXConfig(ModelConfig):
             self.image == "channels" or not self.image_dropout,
             "model.image_dropout is above 0, but model.image first_latent has no channels to leave out; set it to 0",
         )
-        rotary, head = self.positions == "rotary", self.width // self.heads
+        rotary = self.positions == "rotary"
+        head = self.width // self.heads
         require(
             self.width % self.heads == 0 and (head if rotary else self.width) % 16 == 0,
             f"model.width is {self.width}; it must be divisible by model.heads {self.heads}, and the "

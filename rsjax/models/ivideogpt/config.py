@@ -49,7 +49,8 @@ class ConditionalVQConfig:
         Raises:
             ConfigError: the image does not divide into cells, or its cells do not divide into a later frame's tokens.
         """
-        pixels, most = self.downsampling * self.future_patch, self.attention_size // self.future_patch
+        pixels = self.downsampling * self.future_patch
+        most = self.attention_size // self.future_patch
         require(
             image_size % pixels == 0,
             f"images have {image_size} pixels a side, which {pixels} does not divide (model.autoencoder.patch_size × "
@@ -132,7 +133,8 @@ class IVideoGPTConfig(ModelConfig):
         return {"token": 1.0}
 
     def check(self, clips: ClipShape) -> None:
-        context, cells = self.autoencoder.context_frames, self.autoencoder.grid(clips.image_size) ** 2
+        context = self.autoencoder.context_frames
+        cells = self.autoencoder.grid(clips.image_size) ** 2
         require(
             clips.frames > context,
             f"clips have {clips.frames} frames, of which model.autoencoder.context_frames {context} are context; at "

@@ -61,10 +61,12 @@ class Attention(nn.Module):
             q, k, v = (self._heads(y.swapaxes(1, 2)) for y in (q, k, v))
             out = attend(q, k, v, self._sees(positions, positions)).swapaxes(1, 2)
             return self.proj(out.reshape(x.shape)), None
-        frames, slots = x.shape[1], cache.k.shape[-2]
+        frames = x.shape[1]
+        slots = cache.k.shape[-2]
         if frames > slots:
             raise ValueError(f"{frames} frames do not fit a cache of {slots}")
-        q, new = self._head_major(q), KeyValues(self._head_major(k), self._head_major(v))
+        q = self._head_major(q)
+        new = KeyValues(self._head_major(k), self._head_major(v))
         sees = (self._sees(positions, frames_held(slots, start - 1)), self._sees(positions, positions))
         out = attend_few(q, [(cache, sees[0]), (new, sees[1])]).transpose(0, 3, 1, 2, 4)
         return self.proj(out.reshape(x.shape)), new

@@ -14,7 +14,9 @@ def forward_flops(config: Architecture, frames: int) -> int:
 
     Temporal attention counts every pair of frames, though half of the pairs are masked.
     """
-    cells, width, branches = config.grid**2, config.width, 2 if config.use_depth else 1
+    cells = config.grid**2
+    width = config.width
+    branches = 2 if config.use_depth else 1
     linear = 8 * width**2 + 2 * config.mlp_ratio * width**2  # qkv and proj of both attentions, fc1 and fc2
     attention = 2 * (cells + frames) * width  # scores and weighted sums, over space and over time
     head = width * config.vocabularies * config.vocabulary_size

@@ -104,7 +104,8 @@ class RoboScape(WorldModel[Batch]):
 
     def prepare(self, clips: Store, assets: Assets, folder: Path, max_damaged: float) -> Store:
         """Makes every clip's tokens and stores them next to the clips, for all runs with this tokenizer and shifts."""
-        codec, shifts = self._codec(assets), self.config.token_shifts
+        codec = self._codec(assets)
+        shifts = self.config.token_shifts
         return tokenize_store(clips, codec, self.clips.image_size, folder, max_damaged, shifts)
 
     def transform(self, normalization: Normalization) -> Transform:

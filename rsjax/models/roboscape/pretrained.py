@@ -61,7 +61,8 @@ def shapes(own: Architecture, directory: Path) -> Params:
         raise UserError(f"{directory}: holds no world_model/weights with their settings in config.json")
     saved = read_architecture(directory)
     # A trained action encoder needs the same inputs.
-    free, alike = FREE, ALIKE
+    free = FREE
+    alike = ALIKE
     if saved.action_inputs:
         free = FREE - {"action_encoder"}
         alike = ALIKE | {"integrate_actions"}
@@ -83,7 +84,8 @@ def start(fresh: Params, saved: Params, directory: Path) -> Params:
     Raises:
         UserError: this model lacks a saved array, or has it in another shape.
     """
-    params, own = flatten_dict(saved, sep="/"), flatten_dict(fresh, sep="/")
+    params = flatten_dict(saved, sep="/")
+    own = flatten_dict(fresh, sep="/")
     for path in params:
         if path not in own:
             raise UserError(f"{directory}: its {path} has no place in this model; keep the branches and the actions")

@@ -574,7 +574,8 @@ def _recomputed(
     keys: Key[Array, " B"],
 ) -> Decoded:
     """Eq. 1 without a cache: every pass covers the whole window. The reference for :func:`step`."""
-    past, total = prompt["rgb"].shape[1], actions.shape[1]
+    past = prompt["rgb"].shape[1]
+    total = actions.shape[1]
     length = total
     if not arch.departures.rotary:
         length = arch.frames

@@ -54,7 +54,8 @@ class TokenEmbed(nn.Module):
             sub_tokens = lfq.split_tokens(cells, cfg.code_bits, cfg.vocabularies)
             embedded = sum(table(sub_tokens[..., k]) for k, table in enumerate(tables))
         else:
-            shares, codes = lfq.code_shares(cells, cfg.vocabularies), jnp.arange(cfg.vocabulary_size)
+            shares = lfq.code_shares(cells, cfg.vocabularies)
+            codes = jnp.arange(cfg.vocabulary_size)
             mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a token's code embeds as the token does
             embedded = sum(mean(shares[..., k, :], table(codes)) for k, table in enumerate(tables))
         mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.position_std), (cfg.width,))

@@ -190,5 +190,6 @@ class Expert:
         """Returns the action towards a random target, which changes every third of a second or so."""
         if self._step >= self._until:
             self._until = self._step + int(self._rng.integers(20, 45))
-            self._goal, self._finger = self._rng.uniform(*REACH), 1.0 if self._rng.random() < 0.4 else -1.0
+            self._goal = self._rng.uniform(*REACH)
+            self._finger = 1.0 if self._rng.random() < 0.4 else -1.0
         return np.append(np.clip(GAIN * (self._goal - state[:3]), -1, 1), self._finger)
