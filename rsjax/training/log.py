@@ -233,7 +233,7 @@ def find_wandb() -> ModuleType:
         wandb = importlib.import_module("wandb")
         wandb.init  # noqa: B018  # a folder ./wandb, where W&B keeps its files, can be imported too
     except (ImportError, AttributeError) as error:
-        raise WandbError("--wandb needs Weights & Biases; install it: pip install -e '.[wandb]'") from error
+        raise WandbError("--runtime.wandb needs Weights & Biases; install it: pip install -e '.[wandb]'") from error
     return wandb
 
 
@@ -274,7 +274,7 @@ class WandbRun:
         except Exception as error:  # W&B reports a missing or refused key and a missing network as errors of many types
             raise WandbError(
                 f"Weights & Biases cannot start ({first_line(error)}); log in (wandb login), set WANDB_MODE=offline, "
-                f"or leave --wandb out"
+                f"or leave --runtime.wandb out"
             ) from error
         note(f"Weights & Biases: {self._run.url or f'offline, {self._run.dir}'}")
 

@@ -1,4 +1,4 @@
-"""A loss weight of 0 switches its term off: it is not logged, and the compiled step does not compute it."""
+"""A loss weight of 0 switches its term off: it is neither in the loss nor in the log."""
 
 from typing import Any
 
