@@ -114,7 +114,7 @@ def make_once(
     as half done, and the next call with the same key finds it in place.
 
     Args:
-        folder: created if missing. Content without a mark is left alone if ``refuse`` has a message, otherwise deleted.
+        folder: created if missing. Files that this function has not marked are never deleted.
         key: the content key.
         refuse: the message, after the folder's path, for a folder that holds work of another key, with the cure. None:
             that work is deleted.
@@ -126,7 +126,8 @@ def make_once(
 
     Raises:
         OtherKeyError: the folder holds work of another key, and ``refuse`` has a message.
-        FileError: another process works on the folder, or it cannot be written.
+        FileError: another process works on the folder, it cannot be written, or it would have to be deleted but holds
+            files of something else.
     """
     with making(folder, wait) if locked else nullcontext():
         mark = read_mark(folder)
@@ -134,6 +135,8 @@ def make_once(
             if refuse is not None and (folder / MARK).exists():
                 raise OtherKeyError(f"{folder}: {refuse}")
             if refuse is None and not keep and folder.exists():
+                if not (folder / MARK).exists() and any(folder.iterdir()):
+                    raise FileError(f"{folder}: holds files of something else; move them, or choose another place")
                 with disk_guard(folder):
                     shutil.rmtree(folder)
             mark = Mark(key, finished=False, seconds=0.0)

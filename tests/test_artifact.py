@@ -145,9 +145,15 @@ def test_a_damaged_mark_never_counts_as_finished(tmp_path: Path, damage: bytes) 
         assert not (folder / "old").exists()
 
 
-def test_a_folder_without_a_mark_is_kept_unless_its_content_may_be_deleted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("refuse", [REFUSE, None])
+def test_files_without_a_mark_are_never_deleted(tmp_path: Path, refuse: str | None) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "old").touch()
-    with make_once(folder, "key", refuse=REFUSE):
-        assert (folder / "old").exists()
+    if refuse is None:
+        with pytest.raises(FileError, match="holds files of something else"), make_once(folder, "key", refuse=None):
+            raise AssertionError("the body must not run")
+    else:
+        with make_once(folder, "key", refuse=refuse):
+            pass
+    assert (folder / "old").exists()

@@ -1,6 +1,9 @@
 """Tests that the documentation's links lead somewhere, and that its pages stay short enough to be read."""
 
+import importlib
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,6 +42,21 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not path.exists() or (anchor and path.suffix == ".md" and anchor not in anchors(path)):
             broken.append(link)
     assert not broken
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *USER_PAGES], ids=name_of)
+def test_names_that_a_page_imports_exist(page: Path) -> None:
+    for module, names in re.findall(r"^from (rsjax[\w.]*) import ([\w, ]+)$", page.read_text(), re.MULTILINE):
+        for name in names.split(", "):
+            assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
+
+
+def test_the_page_on_clusters_shows_how_arrays_are_split() -> None:
+    code = re.search(r'python -c "\n(.*?)"\n', (ROOT / "docs" / "cluster.md").read_text(), re.DOTALL)
+    assert code is not None
+    done = subprocess.run([sys.executable, "-c", code[1]], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "params" in done.stdout
 
 
 @pytest.mark.parametrize("page", USER_PAGES, ids=name_of)

@@ -40,8 +40,8 @@ def load_config(run: Path) -> Config:
         return from_dict(Config, read_json(path, cure="the train command of this run writes it again"))
     except (ConfigError, TypeError) as error:
         raise UserError(
-            f"{path}: not a configuration of this version of rsjax ({error}); train the run again with --overwrite, or "
-            f"use the version that made it (run.json names it)"
+            f"{path}: not a configuration of this version of rsjax ({error}); if an older one made it, "
+            f"python -m scripts.convert_old_run {run} upgrades it; otherwise train the run again with --overwrite"
         ) from error
 
 
