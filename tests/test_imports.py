@@ -1,6 +1,7 @@
 """Tests that the core imports no tool, and that no module imports itself through others."""
 
 import ast
+from collections.abc import Collection
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -13,12 +14,13 @@ def modules() -> dict[str, Path]:
     return {name.removesuffix(".__init__"): path for path, name in paths.items()}
 
 
-def imported(path: Path) -> set[str]:
-    """Returns the modules that a file imports anywhere in its code, and the names that it imports from them."""
+def imported(path: Path, known: Collection[str]) -> set[str]:
+    """Returns the modules that a file imports anywhere in its code; ``known`` tells modules from other names."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+            each = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {name if name in known else node.module for name in each}
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
     return names
@@ -26,19 +28,23 @@ def imported(path: Path) -> set[str]:
 
 def test_no_module_imports_itself_through_others() -> None:
     known = modules()
-    edges = {name: (imported(path) & known.keys()) - {name} for name, path in known.items() if name != "rsjax"}
-    for name, path in known.items():
-        parents = {name.rpartition(".")[0]} if path.name != "__init__.py" else set()
-        edges[name] = edges.get(name, set()) - parents
+    edges = {name: (imported(path, known) & known.keys()) - {name} for name, path in known.items() if name != "rsjax"}
     tuple(TopologicalSorter(edges).static_order())  # raises CycleError, which names the cycle, if there is one
 
 
 def test_the_core_imports_no_tool() -> None:
-    core = {name: path for name, path in modules().items() if not name.startswith("rsjax.tools")}
+    known = modules()
+    core = {name: path for name, path in known.items() if not name.startswith("rsjax.tools")}
     wrong = [
         f"{name} imports {target}"
         for name, path in core.items()
-        for target in sorted(imported(path))
+        for target in sorted(imported(path, known))
         if target.startswith(TOOLS)
     ]
     assert not wrong
+
+
+def test_an_installation_holds_every_module() -> None:
+    """Setuptools leaves out a folder without ``__init__.py``, with all folders in it."""
+    folders = {path.parent for path in (ROOT / "rsjax").rglob("*.py")}
+    assert not [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").exists()]

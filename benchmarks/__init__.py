@@ -1,0 +1,1 @@
+"""Benchmarks outside the package: rivals in PyTorch, the soak test, the playground."""

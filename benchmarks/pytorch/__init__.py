@@ -1,0 +1,1 @@
+"""Plain PyTorch networks that the benchmark compares with."""

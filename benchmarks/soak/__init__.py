@@ -1,0 +1,1 @@
+"""The soak test: trainings with faults, compared with an undisturbed one."""

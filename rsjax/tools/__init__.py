@@ -1,0 +1,1 @@
+"""What serves people around the core; the core imports none of it."""

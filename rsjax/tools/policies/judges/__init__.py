@@ -1,0 +1,1 @@
+"""Judges of success, and their training and validation."""

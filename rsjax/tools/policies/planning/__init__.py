@@ -1,0 +1,1 @@
+"""Planning in a world model, and trying the plans in the simulator."""

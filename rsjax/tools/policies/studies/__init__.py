@@ -1,0 +1,1 @@
+"""Experiments on policies: learning, judging, improving, synthesising."""

@@ -1,0 +1,1 @@
+"""Worlds in which policies act: the simulator and world models."""

@@ -1,0 +1,1 @@
+"""Many runs and one answer: ablations, comparisons, the paper's claims, reports."""
