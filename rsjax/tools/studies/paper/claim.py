@@ -23,7 +23,7 @@ class Arm:
             and evaluation. An arm whose preset does not exist is left out.
         equal: whether it trains for as many steps as the base preset, for as many estimated seconds, or for as many
             operations. A family's small preset trains autoencoder and model; both are scaled by the same factor.
-        curriculum: the stages of its training, whose epochs are scaled to the cell's steps.
+        curriculum: the epochs of its training on each difficulty, in order; they are scaled to the cell's steps.
         mixed: mix the clips of these stages instead, each clip as often as in the curriculum.
         data: the share of the training clips that the world model learns from.
         rate: a factor on the learning rate of the world model.
@@ -35,7 +35,7 @@ class Arm:
     model: str = ""
     preset: str = ""
     equal: Literal["steps", "seconds", "flops"] = "steps"
-    curriculum: tuple[str, ...] = ()
+    curriculum: Mapping[str, float] = field(default_factory=dict)
     mixed: bool = False
     data: float = 1.0
     rate: float = 1.0

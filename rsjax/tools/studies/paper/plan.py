@@ -143,7 +143,10 @@ def _ordered(claims: Sequence[Claim], seeds: range) -> list[tuple[Claim, Arm, in
 def _label(arm: Arm) -> dict[str, Value]:
     """Returns the values that an arm varies, for the name of its directory."""
     family = {"model": arm.model or arm.preset} if arm.model or arm.preset else {}
-    stages = {"curriculum": "+".join(arm.curriculum) + " mixed" * arm.mixed} if arm.curriculum else {}
+    stages = {}
+    if arm.curriculum:
+        order = "+".join(f"{name} {epochs:g}" for name, epochs in arm.curriculum.items())
+        stages["curriculum"] = order + " mixed" * arm.mixed
     shares = {name: f"{share:.2g}" for name, share in (("data", arm.data), ("rate", arm.rate)) if share != 1}
     return {**family, **arm.values, **stages, **shares}
 
@@ -204,15 +207,14 @@ def _stages(arm: Arm, config: Config) -> tuple[CurriculumStageConfig, ...]:
         return ()
     simple = _simple_share(config.sim)
     expected = {"simple": simple * clips, "difficult": (1 - simple) * clips}
-    epochs = {name: float(number) for name, _, number in (word.partition(":") for word in arm.curriculum)}
-    read = {name: number * expected[name] for name, number in epochs.items()}
+    read = {name: epochs * expected[name] for name, epochs in arm.curriculum.items()}
     factor = drawn / sum(read.values())
     if arm.mixed:
         parts = tuple(ComponentConfig(difficulties=(name,), weight=number) for name, number in read.items())
         return (CurriculumStageConfig(parts, drawn / clips),)
     return tuple(
-        CurriculumStageConfig((ComponentConfig(difficulties=(name,)),), number * factor)
-        for name, number in epochs.items()
+        CurriculumStageConfig((ComponentConfig(difficulties=(name,)),), epochs * factor)
+        for name, epochs in arm.curriculum.items()
     )
 
 

@@ -152,7 +152,7 @@ def test_a_curriculum_and_its_mixture_read_the_same_clips_in_as_many_steps(prese
     clips = at.base.sim.episodes - at.base.sim.test_episodes
     counts = {"simple": simple * clips, "difficult": (1 - simple) * clips}
     ordered, mixed = (
-        arm_config(Arm("", curriculum=("simple:2", "difficult:3"), mixed=on), at, 0).train for on in (False, True)
+        arm_config(Arm("", curriculum={"simple": 2, "difficult": 3}, mixed=on), at, 0).train for on in (False, True)
     )
     drawn = {
         s.components[0].difficulties[0]: s.epochs * counts[s.components[0].difficulties[0]] for s in ordered.curriculum

@@ -2,7 +2,7 @@
 
 from rsjax.tools.studies.paper.claim import Arm, Claim, pairs, register
 
-_STAGES = ("simple:2", "difficult:3")
+EPOCHS = {"simple": 2, "difficult": 3}
 
 register(
     Claim(
@@ -13,7 +13,7 @@ register(
             "epochs on the simple tasks, then 3 epochs on the difficult tasks."
         ),
         place="§2.2; authors' answers, W10",
-        arms=(Arm("curriculum", curriculum=_STAGES), Arm("mixed", curriculum=_STAGES, mixed=True)),
+        arms=(Arm("curriculum", curriculum=EPOCHS), Arm("mixed", curriculum=EPOCHS, mixed=True)),
         comparisons=pairs("curriculum", "mixed", "psnr", "delta_psnr", "depth_absrel"),
         rank=4,
         notes=(
