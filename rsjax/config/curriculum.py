@@ -31,7 +31,6 @@ def read_curriculum(text: str) -> tuple[CurriculumStageConfig, ...]:
             raise ConfigError(f"curriculum {text:.80}: not JSON ({error}); write a list such as {EXAMPLE}") from error
     else:
         entries = read_json(Path(text), list, cure=f"name a file with a list of stages, such as {EXAMPLE}")
-    require(isinstance(entries, list), f"curriculum {text:.80}: not a list of stages, such as {EXAMPLE}")
     return tuple(_stage(number, entry) for number, entry in enumerate(entries, 1))
 
 

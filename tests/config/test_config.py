@@ -182,6 +182,26 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("model.sample", {"window_stride": 6}, "model.sample.window_stride is 6 of 6 positions"),
         ("eval", {"clips": 1}, "eval.clips is 1 of sim.test_episodes 2"),
         ("eval", {"batch_size": 0}, "eval.batch_size is 0"),
+        ("sim", {"workers": -1}, "sim.workers is -1"),
+        ("sim", {"tasks": ("reach-v3",)}, "sim.tasks names 'reach-v3', but sim.env is lift"),
+        ("sim", {"env": "metaworld", "camera": "near", "tasks": ("raech",)}, "no task of Meta-World; did you mean"),
+        ("sim", {"env": "metaworld"}, "sim.camera is 'agentview', which Meta-World does not have"),
+        (
+            "sim",
+            {"env": "metaworld", "camera": "near", "tasks": ("reach",), "unseen_tasks": ("reach",)},
+            "sim.unseen_tasks has reach, which sim.tasks trains on",
+        ),
+        ("model", {"blocks": 0}, "model.blocks is 0; it must be at least 1"),
+        ("tokenizer_train", {"frames_per_clip": 0}, "tokenizer_train.frames_per_clip is 0"),
+        ("tokenizer_train", {"depth_share": 1.5}, "tokenizer_train.depth_share is 1.5"),
+        ("tokenizer_train", {"entropy_group": 3}, "tokenizer_train.entropy_group is 3; it must divide the 32 images"),
+        ("train.optimizer", {"drop_at": (1.0,)}, "optimizer.drop_at is (1.0,)"),
+        ("train.optimizer", {"final_share": 2.0}, "optimizer.final_share is 2.0"),
+        ("train", {"batch_size": 0}, "train.batch_size is 0"),
+        ("train", {"batch_size": 2, "accumulate": 3}, "batch_size 2 does not divide into accumulate = 3 parts"),
+        ("runtime", {"checkpoint_every": 0}, "runtime.checkpoint_every is 0"),
+        ("runtime", {"eval_every": -1}, "runtime.eval_every is -1"),
+        ("runtime", {"fsdp": 2}, "runtime.fsdp is 2, which needs runtime.sharding mesh; it is auto"),
     ],
 )
 def test_what_cannot_run_is_refused_by_name(path: str, changes: dict[str, Any], names: str) -> None:
@@ -189,6 +209,32 @@ def test_what_cannot_run_is_refused_by_name(path: str, changes: dict[str, Any], 
         with_values(BASE, {f"{path}.{field}".lstrip("."): value for field, value in changes.items()})
     assert names in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"model.autoencoder.res_blocks": 0}, "model.autoencoder.res_blocks is 0"),
+        ({"model.autoencoder.kl_weight": -1.0}, "model.autoencoder.kl_weight is -1.0"),
+        ({"model.autoencoder.widths": (32, 32)}, "model.autoencoder.widths are (32, 32); give one for each level"),
+        ({"model.autoencoder.image_noise": (0.0, -1.0)}, "model.autoencoder.image_noise is (0.0, -1.0)"),
+        ({"model.text.tokens": 0}, "model.text.tokens is 0"),
+        ({"model.text.dropout": 1.0}, "model.text.dropout is 1.0"),
+        ({"model.text.file": "a", "model.text.tasks": ("b",)}, "model.text.tasks have learned tokens"),
+        ({"model.blocks": 0}, "model.blocks is 0"),
+    ],
+)
+def test_what_cogvideox_cannot_run_is_refused_by_name(changes: dict[str, Any], names: str) -> None:
+    with pytest.raises(c.ConfigError) as caught:
+        with_values(presets.get("cogvideox_tiny"), changes)
+    assert names in str(caught.value)
+
+
+@pytest.mark.parametrize("changes", [{"keep_last": 0}, {"keep_every": -1}, {"skip_budget": -1}])
+def test_what_a_loop_cannot_keep_is_refused_by_name(changes: dict[str, int]) -> None:
+    with pytest.raises(c.ConfigError) as caught:
+        c.LoopConfig(**changes)  # type: ignore[arg-type]
+    assert next(iter(changes)) in str(caught.value)
 
 
 def test_the_network_fits_clips_and_tokenizer_by_itself() -> None:
