@@ -1,0 +1,249 @@
+"""Attention within frames and over frames as one kernel a pass (Pallas, Triton), straight from the qkv projection.
+
+A tile of tokens of one head fits on a GPU's multiprocessor: all cells of a frame, or all frames of a few neighbouring
+cells. A program loads the queries, keys and values of its tile from where the projection wrote them, so that scores,
+transposes and copies never go to memory. The gradient recomputes scores from each row's log-sum (FlashAttention-2, Dao
+2023, arXiv 2307.08691); since a tile has all keys of its queries, one loop over queries suffices for it.
+
+Axes: B clips, T frames, S cells of a frame, h heads, e head width; N tiles, R tokens of a tile, q queries, k keys.
+"""
+
+import math
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+from jaxtyping import Array, Float
+
+Over = Literal["cells", "frames"]
+
+ATTENTION = "attention"  # the name of the output and the log-sums in rematerialisation policies
+ROWS = 64  # tokens of a tile over frames
+QUERIES = 128  # of a program of the forward pass
+KEYS = 64  # of one step of the forward pass
+QUERIES_BACKWARD = 32  # of one step of the backward pass
+MOST_ROWS = 256  # of a tile: the backward pass keeps gradients of all its keys and values in registers
+WARPS = 4
+WARPS_BACKWARD = 8
+STAGES = 2
+HEAD_WIDTHS = (16, 32, 64, 128)
+
+
+class Tile(NamedTuple):
+    """The tokens that one program sees: neighbouring cells of all frames it covers."""
+
+    frames: int
+    cells: int
+
+    @property
+    def rows(self) -> int:
+        return self.frames * self.cells
+
+
+def fits(shape: tuple[int, ...], over: Over) -> bool:
+    """Returns whether :func:`attend` takes a qkv of this shape (B, T, S, 3, h, e).
+
+    Head widths are 16, 32, 64 or 128. Over cells, S is a power of two from 16 to 256. Over frames, T is a power of two
+    up to 64, and S is divisible by the 64/T neighbouring cells of a tile.
+    """
+    _, frames, cells, _, _, width = shape
+    if width not in HEAD_WIDTHS:
+        return False
+    if over == "cells":
+        return cells in (16, 32, 64, 128, 256)
+    return frames in (1, 2, 4, 8, 16, 32, 64) and cells % (ROWS // frames) == 0
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(1, 2))
+def attend(qkv: Float[Array, "B T S 3 h e"], over: Over, interpret: bool = False) -> Float[Array, "B T S h e"]:
+    """Returns softmax(q·kᵀ/√e)·v among the cells of each frame, or of each cell over the frames up to its own.
+
+    Products have operands of qkv's type; scores, softmax and sums are float32.
+
+    Args:
+        qkv: a shape that :func:`fits`; bfloat16 is fast, float32 is exact.
+        over: "cells": every cell attends to all cells of its frame; "frames": causally to the same cell.
+        interpret: runs without a GPU, slowly.
+    """
+    return _forward(qkv, over, interpret)[0]
+
+
+def _forward(qkv: Array, over: Over, interpret: bool) -> tuple[Array, tuple[Array, Array, Array]]:
+    tile = _tile(qkv.shape, over)
+    queries = _step(tile, QUERIES)
+    B, T, S, _, heads, width = qkv.shape
+    out_shape = (B, T, S, heads, width)
+    tiles = B * T * S // tile.rows
+    out, log_sum = pl.pallas_call(
+        partial(_forward_kernel, tile=tile, queries=queries, keys=_step(tile, KEYS)),
+        grid=(tile.rows // queries, heads, tiles),
+        in_specs=[_tokens(qkv.shape, tile)],
+        out_specs=[_tokens(out_shape, tile), pl.BlockSpec((None, None, tile.rows), _row_block)],
+        out_shape=[
+            jax.ShapeDtypeStruct(out_shape, qkv.dtype),
+            jax.ShapeDtypeStruct((tiles, heads, tile.rows), jnp.float32),
+        ],
+        compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=STAGES),
+        interpret=interpret,
+        name=f"attend_{over}_forward",
+    )(qkv)
+    out, log_sum = (checkpoint_name(x, ATTENTION) for x in (out, log_sum))
+    return out, (qkv, out, log_sum)
+
+
+def _backward(
+    over: Over, interpret: bool, saved: tuple[Array, Array, Array], cotangent: Array
+) -> tuple[Float[Array, "B T S 3 h e"]]:
+    qkv, out, log_sum = saved
+    tile = _tile(qkv.shape, over)
+    like_out = _tokens(out.shape, tile)
+    like_qkv = _tokens(qkv.shape, tile)
+    gradient = pl.pallas_call(
+        partial(_backward_kernel, tile=tile, queries=_step(tile, QUERIES_BACKWARD)),
+        grid=(1, *log_sum.shape[1::-1]),
+        in_specs=[like_qkv, like_out, like_out, pl.BlockSpec((None, None, tile.rows), _row_block)],
+        out_specs=like_qkv,
+        out_shape=jax.ShapeDtypeStruct(qkv.shape, qkv.dtype),
+        compiler_params=triton.CompilerParams(num_warps=WARPS_BACKWARD if tile.rows > ROWS else 4, num_stages=STAGES),
+        interpret=interpret,
+        name=f"attend_{over}_backward",
+    )(qkv, out, cotangent.astype(qkv.dtype), log_sum)
+    return (gradient,)
+
+
+attend.defvjp(_forward, _backward)
+
+
+def flops(shape: tuple[int, ...], over: Over) -> tuple[int, int]:
+    """Returns the operations of the products of one call, forward and backward, two a multiply-add.
+
+    Of attention over frames only pairs of a query and a key that it sees count, though a tile multiplies all its pairs.
+    The backward pass has four products; that the kernel recomputes scores, half of the forward count, is left out.
+    """
+    B, T, S, _, heads, width = shape
+    pairs = B * T * S * S if over == "cells" else B * S * T * (T + 1) // 2
+    return 4 * pairs * heads * width, 8 * pairs * heads * width
+
+
+def _tile(shape: tuple[int, ...], over: Over) -> Tile:
+    _, frames, cells, _, _, _ = shape
+    if over == "cells":
+        return Tile(1, cells)
+    return Tile(frames, ROWS // frames)
+
+
+def _step(tile: Tile, most: int) -> int:
+    """Returns the tokens of one step of a loop over a tile: all if it has several frames."""
+    return min(most, tile.rows) if tile.frames == 1 else tile.rows
+
+
+def _tokens(shape: tuple[int, ...], tile: Tile) -> pl.BlockSpec:
+    """Returns the block of one tile and head of an array (B, T, S, 3, h, e) or (B, T, S, h, e)."""
+    packed = shape[3:-2]
+    tiles_of_frame = shape[2] // tile.cells
+    tiles_of_clip = shape[1] // tile.frames * tiles_of_frame
+
+    def index(_: Any, head: Any, n: Any) -> tuple[Any, ...]:
+        clip = jax.lax.div(n, tiles_of_clip)
+        frame = jax.lax.div(jax.lax.rem(n, tiles_of_clip), tiles_of_frame)
+        return (clip, frame, jax.lax.rem(n, tiles_of_frame), *(0 for _ in packed), head, 0)
+
+    return pl.BlockSpec((None, tile.frames, tile.cells, *packed, None, shape[-1]), index)
+
+
+def _row_block(_: Any, head: Any, n: Any) -> tuple[Any, ...]:
+    return (n, head, 0)
+
+
+def _forward_kernel(qkv: Any, out: Any, log_sum: Any, *, tile: Tile, queries: int, keys: int) -> None:
+    first = pl.program_id(0) * queries
+    q = _rows(qkv, tile, first, queries, 0)
+    scale = math.log2(math.e) / math.sqrt(q.shape[-1])  # powers of two are faster than those of e
+
+    def step(i: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        total, top, weighted = carry
+        k = _rows(qkv, tile, i * keys, keys, 1)
+        v = _rows(qkv, tile, i * keys, keys, 2)
+        scores = _product(q, k, 1, 1) * scale
+        if tile.frames > 1:
+            seen = _sees(tile, first + jnp.arange(queries)[:, None], i * keys + jnp.arange(keys)[None])
+            scores = jnp.where(seen, scores, jnp.finfo(jnp.float32).min)
+        new_top = jnp.maximum(top, jnp.max(scores, axis=1))
+        weights = jnp.exp2(scores - new_top[:, None])
+        shrink = jnp.exp2(top - new_top)
+        total = total * shrink + jnp.sum(weights, axis=1)
+        weighted = weighted * shrink[:, None] + _product(weights.astype(v.dtype), v, 1, 0)
+        return total, new_top, weighted
+
+    start = (
+        jnp.zeros(queries, jnp.float32),
+        jnp.full(queries, jnp.finfo(jnp.float32).min),
+        jnp.zeros(q.shape, jnp.float32),
+    )
+    total, top, weighted = jax.lax.fori_loop(0, tile.rows // keys, step, start)
+    log_sum[pl.ds(first, queries)] = top + jnp.log2(total)
+    _put(out, tile, first, weighted / total[:, None])
+
+
+def _backward_kernel(
+    qkv: Any, out: Any, cotangent: Any, log_sum: Any, gradient: Any, *, tile: Tile, queries: int
+) -> None:
+    k = _rows(qkv, tile, 0, tile.rows, 1)
+    v = _rows(qkv, tile, 0, tile.rows, 2)
+    root = math.sqrt(k.shape[-1])
+
+    def step(i: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        to_k, to_v = carry
+        first = i * queries
+        q = _rows(qkv, tile, first, queries, 0)
+        g = _rows(cotangent, tile, first, queries)
+        along = jnp.sum(g.astype(jnp.float32) * _rows(out, tile, first, queries).astype(jnp.float32), axis=1)
+        # Transposed, (k, q): so two products of three take weights and their gradients as they are in registers.
+        weights = jnp.exp2(_product(k, q, 1, 1) * (math.log2(math.e) / root) - log_sum[pl.ds(first, queries)][None])
+        if tile.frames > 1:
+            seen = _sees(tile, first + jnp.arange(queries)[None], jnp.arange(tile.rows)[:, None])
+            weights = jnp.where(seen, weights, 0.0)
+        of_scores = (weights * (_product(v, g, 1, 1) - along[None])).astype(q.dtype)
+        to_v = to_v + _product(weights.astype(g.dtype), g, 1, 0)
+        to_k = to_k + _product(of_scores, q, 1, 0)
+        _put(gradient, tile, first, _product(of_scores, k, 0, 0) / root, 0)
+        return to_k, to_v
+
+    zeros = jnp.zeros(k.shape, jnp.float32)
+    to_k, to_v = jax.lax.fori_loop(0, tile.rows // queries, step, (zeros, zeros))
+    _put(gradient, tile, 0, to_k / root, 1)
+    _put(gradient, tile, 0, to_v, 2)
+
+
+def _rows(tokens: Any, tile: Tile, first: Any, count: int, *part: int) -> Float[Array, "R e"]:
+    """Loads so many tokens of a tile; rows are (frame, cell)."""
+    x = tokens[(slice(None), _cells(tile, first, count), *part, slice(None))]
+    return x.reshape(count, x.shape[-1])
+
+
+def _put(tokens: Any, tile: Tile, first: Any, x: Float[Array, "R e"], *part: int) -> None:
+    """Stores tokens of a tile where :func:`_rows` loads them."""
+    where = (slice(None), _cells(tile, first, len(x)), *part, slice(None))
+    tokens[where] = x.reshape(tile.frames, -1, x.shape[-1]).astype(tokens.dtype)
+
+
+def _cells(tile: Tile, first: Any, count: int) -> Any:
+    if tile.frames == 1:
+        return pl.ds(first, count)
+    return slice(None)
+
+
+def _sees(tile: Tile, query: Array, key: Array) -> Array:
+    """Returns whether a query's row and a key's are of one cell and the key's is not of a later frame."""
+    return ((query ^ key) & (tile.cells - 1) == 0) & (query >= key)
+
+
+def _product(a: Array, b: Array, of_a: int, of_b: int) -> Float[Array, "m n"]:
+    """Returns the float32 product along an axis of each operand."""
+    precision = jax.lax.Precision.HIGHEST if a.dtype == jnp.float32 else None
+    dims = (((of_a,), (of_b,)), ((), ()))
+    return jax.lax.dot_general(a, b, dims, precision=precision, preferred_element_type=jnp.float32)

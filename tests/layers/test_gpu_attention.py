@@ -1,0 +1,69 @@
+"""Tests of attention as one kernel a pass on GPUs: values and gradients, by Pallas' interpreter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+from rsjax.layers.attention import attend as plain
+from rsjax.layers.gpu.attention import Over, attend, fits, flops
+
+SHAPES = [
+    ("cells", (2, 3, 16, 3, 2, 16)),
+    ("cells", (1, 1, 256, 3, 1, 32)),  # several steps of both loops
+    ("frames", (2, 16, 8, 3, 2, 32)),
+    ("frames", (1, 4, 16, 3, 1, 16)),
+]
+
+
+def reference(qkv: Array, over: Over) -> Array:
+    q, k, v = (qkv[:, :, :, i] for i in range(3))
+    if over == "cells":
+        return plain(q, k, v, None)
+    mask = jnp.tri(q.shape[1], dtype=bool)
+    return plain(q.swapaxes(1, 2), k.swapaxes(1, 2), v.swapaxes(1, 2), mask).swapaxes(1, 2)
+
+
+@pytest.mark.parametrize(("over", "shape"), SHAPES)
+@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float32, 2e-6), (jnp.bfloat16, 1e-2)])
+def test_values_and_gradients_are_those_of_plain_attention(
+    over: Over, shape: tuple[int, ...], dtype: jnp.dtype, bound: float
+) -> None:
+    assert fits(shape, over)
+    qkv = (2 * jax.random.normal(jax.random.key(0), shape)).astype(dtype)
+    cotangent = jax.random.normal(jax.random.key(1), (*shape[:3], *shape[4:])).astype(dtype)
+    out, gradient = jax.vjp(lambda x: attend(x, over, interpret=True), qkv)
+    true_out, true_gradient = jax.vjp(lambda x: reference(x, over), qkv.astype(jnp.float32))
+    pairs = [(out, true_out), (gradient(cotangent)[0], true_gradient(cotangent.astype(jnp.float32))[0])]
+    for value, truth in pairs:
+        assert value.dtype == dtype
+        largest = float(jnp.max(jnp.abs(truth)))
+        np.testing.assert_allclose(value.astype(jnp.float32) / largest, truth / largest, atol=bound)
+
+
+def test_a_frame_does_not_change_the_frames_before_it() -> None:
+    qkv = jax.random.normal(jax.random.key(0), (1, 16, 4, 3, 1, 16))
+    changed = qkv.at[:, 9].add(1.0)
+    before, after = (attend(x, "frames", interpret=True) for x in (qkv, changed))
+    np.testing.assert_array_equal(before[:, :9], after[:, :9])
+    assert not np.array_equal(before[:, 9:], after[:, 9:])
+
+
+@pytest.mark.parametrize(
+    ("over", "shape"),
+    [
+        ("cells", (1, 16, 8, 3, 1, 16)),  # too few cells
+        ("cells", (1, 16, 320, 3, 1, 16)),  # no power of two
+        ("cells", (1, 16, 256, 3, 1, 24)),  # head width
+        ("frames", (1, 12, 256, 3, 1, 16)),
+        ("frames", (1, 16, 2, 3, 1, 16)),  # fewer cells than a tile
+    ],
+)
+def test_other_shapes_do_not_fit(over: Over, shape: tuple[int, ...]) -> None:
+    assert not fits(shape, over)
+
+
+def test_operations_count_pairs_that_are_seen() -> None:
+    assert flops((2, 4, 16, 3, 2, 32), "cells") == (4 * 8 * 16**2 * 64, 8 * 8 * 16**2 * 64)
+    assert flops((2, 4, 16, 3, 2, 32), "frames") == (4 * 32 * 10 * 64, 8 * 32 * 10 * 64)
