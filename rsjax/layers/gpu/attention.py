@@ -19,6 +19,8 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Float
 
+from rsjax.layers.partition import each_own_clips
+
 Over = Literal["cells", "frames"]
 
 ATTENTION = "attention"  # the name of the output and the log-sums in rematerialisation policies
@@ -73,25 +75,7 @@ def attend(qkv: Float[Array, "B T S 3 h e"], over: Over, interpret: bool = False
 
 
 def _forward(qkv: Array, over: Over, interpret: bool) -> tuple[Array, tuple[Array, Array, Array]]:
-    tile = _tile(qkv.shape, over)
-    queries = _step(tile, QUERIES)
-    B, T, S, _, heads, width = qkv.shape
-    out_shape = (B, T, S, heads, width)
-    tiles = B * T * S // tile.rows
-    out, log_sum = pl.pallas_call(
-        partial(_forward_kernel, tile=tile, queries=queries, keys=_step(tile, KEYS)),
-        grid=(tile.rows // queries, heads, tiles),
-        in_specs=[_tokens(qkv.shape, tile)],
-        out_specs=[_tokens(out_shape, tile), pl.BlockSpec((None, None, tile.rows), _row_block)],
-        out_shape=[
-            jax.ShapeDtypeStruct(out_shape, qkv.dtype),
-            jax.ShapeDtypeStruct((tiles, heads, tile.rows), jnp.float32),
-        ],
-        compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=STAGES),
-        interpret=interpret,
-        name=f"attend_{over}_forward",
-    )(qkv)
-    out, log_sum = (checkpoint_name(x, ATTENTION) for x in (out, log_sum))
+    out, log_sum = (checkpoint_name(x, ATTENTION) for x in _run_forward(over, interpret, qkv))
     return out, (qkv, out, log_sum)
 
 
@@ -99,20 +83,61 @@ def _backward(
     over: Over, interpret: bool, saved: tuple[Array, Array, Array], cotangent: Array
 ) -> tuple[Float[Array, "B T S 3 h e"]]:
     qkv, out, log_sum = saved
+    return (_run_backward(over, interpret, qkv, out, cotangent.astype(qkv.dtype), log_sum),)
+
+
+@partial(each_own_clips, settings=2)
+def _run_forward(
+    over: Over, interpret: bool, qkv: Float[Array, "B T S 3 h e"]
+) -> tuple[Float[Array, "B T S h e"], Float[Array, "B N h R"]]:
+    """Returns the output and the log-sum of each row of scores, to the base 2."""
     tile = _tile(qkv.shape, over)
-    like_out = _tokens(out.shape, tile)
+    queries = _step(tile, QUERIES)
+    clips, frames, cells, _, heads, width = qkv.shape
+    tiles = frames * cells // tile.rows
+    out_shape = (clips, frames, cells, heads, width)
+    log_sum_shape = (clips, tiles, heads, tile.rows)
+    return tuple(
+        pl.pallas_call(
+            partial(_forward_kernel, tile=tile, queries=queries, keys=_step(tile, KEYS)),
+            grid=(tile.rows // queries, heads, clips * tiles),
+            in_specs=[_tokens(qkv.shape, tile)],
+            out_specs=[_tokens(out_shape, tile), _log_sums(log_sum_shape)],
+            out_shape=[
+                jax.ShapeDtypeStruct(out_shape, qkv.dtype),
+                jax.ShapeDtypeStruct(log_sum_shape, jnp.float32),
+            ],
+            compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=STAGES),
+            interpret=interpret,
+            name=f"attend_{over}_forward",
+        )(qkv)
+    )
+
+
+@partial(each_own_clips, settings=2)
+def _run_backward(
+    over: Over,
+    interpret: bool,
+    qkv: Float[Array, "B T S 3 h e"],
+    out: Float[Array, "B T S h e"],
+    cotangent: Float[Array, "B T S h e"],
+    log_sum: Float[Array, "B N h R"],
+) -> Float[Array, "B T S 3 h e"]:
+    tile = _tile(qkv.shape, over)
+    clips, tiles, heads, _ = log_sum.shape
     like_qkv = _tokens(qkv.shape, tile)
-    gradient = pl.pallas_call(
+    like_out = _tokens(out.shape, tile)
+    warps = WARPS_BACKWARD if tile.rows > ROWS else WARPS
+    return pl.pallas_call(
         partial(_backward_kernel, tile=tile, queries=_step(tile, QUERIES_BACKWARD)),
-        grid=(1, *log_sum.shape[1::-1]),
-        in_specs=[like_qkv, like_out, like_out, pl.BlockSpec((None, None, tile.rows), _row_block)],
+        grid=(1, heads, clips * tiles),
+        in_specs=[like_qkv, like_out, like_out, _log_sums(log_sum.shape)],
         out_specs=like_qkv,
         out_shape=jax.ShapeDtypeStruct(qkv.shape, qkv.dtype),
-        compiler_params=triton.CompilerParams(num_warps=WARPS_BACKWARD if tile.rows > ROWS else 4, num_stages=STAGES),
+        compiler_params=triton.CompilerParams(num_warps=warps, num_stages=STAGES),
         interpret=interpret,
         name=f"attend_{over}_backward",
-    )(qkv, out, cotangent.astype(qkv.dtype), log_sum)
-    return (gradient,)
+    )(qkv, out, cotangent, log_sum)
 
 
 attend.defvjp(_forward, _backward)
@@ -155,8 +180,12 @@ def _tokens(shape: tuple[int, ...], tile: Tile) -> pl.BlockSpec:
     return pl.BlockSpec((None, tile.frames, tile.cells, *packed, None, shape[-1]), index)
 
 
-def _row_block(_: Any, head: Any, n: Any) -> tuple[Any, ...]:
-    return (n, head, 0)
+def _log_sums(shape: tuple[int, ...]) -> pl.BlockSpec:
+    """Returns the block of one tile and head of an array (B, N, h, R)."""
+    _, tiles, _, rows = shape
+    return pl.BlockSpec(
+        (None, None, None, rows), lambda _, head, n: (jax.lax.div(n, tiles), jax.lax.rem(n, tiles), head, 0)
+    )
 
 
 def _forward_kernel(qkv: Any, out: Any, log_sum: Any, *, tile: Tile, queries: int, keys: int) -> None:

@@ -1,0 +1,38 @@
+"""Runs a kernel over two devices; tests/layers/test_partition.py starts it where there are two.
+
+XLA_FLAGS=--xla_force_host_platform_device_count=2 python -m tests.layers.sharded_kernel
+"""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+from rsjax.layers.gpu.attention import attend
+
+
+def loss(qkv: Array) -> Array:
+    return jnp.sum(attend(qkv, "cells", interpret=True) ** 2)
+
+
+def main() -> None:
+    qkv = jax.random.normal(jax.random.key(0), (4, 2, 16, 3, 2, 16))
+    truth = jax.grad(loss)(qkv)
+    clips = NamedSharding(Mesh(np.array(jax.devices()), ("data",)), PartitionSpec("data"))
+    sharded = jax.jit(jax.grad(loss)).lower(jax.device_put(qkv, clips)).compile()
+    gradient = sharded(jax.device_put(qkv, clips))
+    by_pmap = jax.pmap(jax.grad(loss))(qkv.reshape(2, 2, *qkv.shape[1:])).reshape(qkv.shape)
+    figures = {
+        "gathers": str(sharded.as_text()).count("all-gather"),
+        "sharded": gradient.sharding.is_equivalent_to(clips, gradient.ndim),
+        "mesh": float(jnp.max(jnp.abs(gradient - truth))),
+        "pmap": float(jnp.max(jnp.abs(by_pmap - truth))),
+    }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
