@@ -183,7 +183,7 @@ def test_curable_errors_are_one_line_and_a_status(
     def main() -> None:
         raise error
 
-    monkeypatch.setattr(os, "_exit", sys.exit)
+    monkeypatch.setattr("rsjax.command.exit_now", sys.exit)
 
     with pytest.raises(SystemExit) as caught:
         main()

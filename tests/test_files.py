@@ -2,6 +2,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from rsjax.tokenizers.lpips import load_lpips
 from rsjax.tools.convert.files import read_tensors
 from rsjax.tools.ingest.annotators.network import require_weights
 from rsjax.tools.ingest.doctor import select
-from rsjax.tools.ingest.episode import SourceError
 from rsjax.tools.pipeline.videos import Request, _foreign_actions
 from rsjax.training.log import read_rows
 from tests.tools.ingest.toy import Source
@@ -51,44 +51,44 @@ def test_a_hash_of_content_is_the_files_wherever_they_lie(tmp_path: Path) -> Non
         (b"[" * 100_000, r"not JSON"),
         (b"[1, 2]", r"a JSON dict is expected, not \[1, 2\]"),
         (None, r"missing"),
+        ("a directory", r"cannot be read \(Is a directory\)"),
+        ("a loop", r"cannot be read \(Too many levels of symbolic links\)"),
     ],
 )
-def test_a_json_file_is_read_or_named_in_one_line(tmp_path: Path, payload: bytes | None, message: str | None) -> None:
+def test_a_json_file_is_read_or_named_in_one_line(
+    tmp_path: Path, payload: bytes | str | None, message: str | None
+) -> None:
     path = tmp_path / "file.json"
-    if payload is not None:
+    if payload == "a directory":
+        path.mkdir()
+    elif payload == "a loop":
+        path.symlink_to(path)
+    elif isinstance(payload, bytes):
         path.write_bytes(payload)
     if message is None:
         assert read_json(path) == {"x": 1}
         return
-    with pytest.raises(UserError, match=f"{path}: {message}.*; make it again"):
+    with pytest.raises(UserError, match=f"{path}: {message}.*; (make it again|mend)"):
         read_json(path, cure="make it again")
-
-
-def test_a_directory_and_a_loop_of_links_are_no_json_files(tmp_path: Path) -> None:
-    (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    for path, message in ((tmp_path, "Is a directory"), (tmp_path / "loop", "Too many levels of symbolic links")):
-        with pytest.raises(UserError, match=rf"{path}: cannot be read \({message}\)"):
-            read_json(path)
 
 
 def test_a_pipe_is_refused_at_once_in_place_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "manifest.json"
     os.mkfifo(path)
-    with pytest.raises(UserError, match=f"{path}: cannot be read .a pipe or device, not a file"):
-        read_json(path)
     assert placeholder(path) == ""
-    with pytest.raises(UserError, match=f"{path}: cannot be read"):
-        open_store(tmp_path)
-    with pytest.raises(OSError, match="a pipe or device"):
-        Labels.read(path, {})
-    with pytest.raises(SourceError, match="a pipe or device"):
-        select(Source(1), path)
-    request = Request("test", (), None, path, None, {})
-    with pytest.raises(UserError, match=f"{path}: not a readable .npy file of numbers .*a pipe or device"):
-        _foreign_actions(request, [], presets.debug())  # type: ignore[arg-type]
-    for read in (read_rows, read_quarantine):
-        with pytest.raises(UserError, match="a pipe or device"):
-            read(path)
+    request: Any = Request("test", (), None, path, None, {})
+    reads: tuple[Callable[[], object], ...] = (
+        lambda: read_json(path),
+        lambda: open_store(tmp_path),
+        lambda: Labels.read(path, {}),
+        lambda: select(Source(1), path),
+        lambda: _foreign_actions(request, [], presets.debug()),  # type: ignore[arg-type]
+        lambda: read_rows(path),
+        lambda: read_quarantine(path),
+    )
+    for read in reads:
+        with pytest.raises((UserError, OSError), match="a pipe or device"):
+            read()
 
 
 def test_a_lock_has_one_holder_and_a_place_without_locks_is_named(
@@ -169,12 +169,14 @@ def test_a_data_set_is_made_by_one_process_at_a_time(tmp_path: Path) -> None:
 )
 def test_what_a_download_left_in_place_of_a_file_is_named(tmp_path: Path, name: str, read: Any) -> None:
     path = tmp_path / name
-    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n")
-    with pytest.raises(UserError, match=f"{name}: a Git-LFS pointer in place of the file: fetch it with git lfs pull"):
-        read(path)
-    path.write_text("<html><body>Not found</body></html>")
-    with pytest.raises(UserError, match=f"{name}: a web page in place of the file"):
-        read(path)
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+    for content, message in (
+        (pointer, "a Git-LFS pointer in place of the file: fetch it with git lfs pull"),
+        ("<html><body>Not found</body></html>", "a web page in place of the file"),
+    ):
+        path.write_text(content)
+        with pytest.raises(UserError, match=f"{name}: {message}"):
+            read(path)
 
 
 @given(st.binary(max_size=600))

@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.data.store import MANIFEST, StoreError, open_store
+from rsjax.data.store import MANIFEST, StoreError, complete_key, open_store
 from tests.data.clips import clip_store, numbers
+
+Damage = Callable[[Path], object]
 
 
 @pytest.fixture
@@ -18,29 +21,33 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "a"
 
 
-def change(path: Path, value: Any, *keys: str | int) -> None:
-    manifest = json.loads((path / MANIFEST).read_text())
-    place = manifest
-    for key in keys[:-1]:
-        place = place[key]
-    place[keys[-1]] = value
-    (path / MANIFEST).write_text(json.dumps(manifest))
+def changed(value: Any, *keys: str | int) -> Damage:
+    """Puts a value into the manifest."""
+
+    def damage(path: Path) -> None:
+        manifest = json.loads((path / MANIFEST).read_text())
+        place = manifest
+        for key in keys[:-1]:
+            place = place[key]
+        place[keys[-1]] = value
+        (path / MANIFEST).write_text(json.dumps(manifest))
+
+    return damage
 
 
-@pytest.mark.parametrize("name", ["../b/train-00000.array_record", "/etc/passwd", "..", "", "a\\b", "x\0y", 3, None])
-def test_a_name_that_leads_elsewhere_is_refused(path: Path, name: Any) -> None:
-    for keys in (("files", 0), ("labels",)):
-        change(path, name, "splits", "train", *keys, "name")
-        with pytest.raises(StoreError, match=r"splits.train.*name is .*not a file beside it"):
-            open_store(path)
+def written(content: bytes | None, name: str = MANIFEST) -> Damage:
+    """Writes a file of the store anew, or deletes it."""
+    return lambda path: (path / name).unlink() if content is None else (path / name).write_bytes(content)
 
 
-@pytest.mark.parametrize("value", [-1, 2**60, "7", 1.5, None])
-def test_impossible_sizes_are_refused(path: Path, value: Any) -> None:
-    for field in ("bytes", "count"):
-        change(path, value, "splits", "train", "files", 0, field)
-        with pytest.raises(StoreError, match=r"splits.train.files.0"):
-            open_store(path)
+def looped(name: str) -> Damage:
+    """Puts a link to itself in place of a file."""
+
+    def damage(path: Path) -> None:
+        (path / name).unlink()
+        (path / name).symlink_to(name)
+
+    return damage
 
 
 @settings(max_examples=30)
@@ -63,17 +70,46 @@ def _opened(path: Path) -> bool:
     return True
 
 
-def test_a_loop_of_links_is_reported(path: Path) -> None:
-    (path / MANIFEST).rename(path / "real")
-    (path / MANIFEST).symlink_to(MANIFEST)
-    with pytest.raises(StoreError, match=r"manifest.json: cannot be read \(Too many levels of symbolic links\)"):
-        open_store(path)
+SHARD = "train-00000.array_record"
+FILE = ("splits", "train", "files", 0)
+DAMAGES: list[tuple[Damage, str]] = [
+    *(
+        (changed(name, "splits", "train", *keys, "name"), r"splits.train.*name is .*not a file beside it")
+        for name in ("../b/train-00000.array_record", "/etc/passwd", "..", "", "a\\b", "x\0y", 3, None)
+        for keys in (("files", 0), ("labels",))
+    ),
+    *(
+        (changed({"files": []}, "splits", split), r"manifest.json: splits has .* cannot be the name of a file")
+        for split in ("../elsewhere", "/tmp/x", "..", "")
+    ),
+    *(
+        (changed(value, *FILE, field), r"splits.train.files.0")
+        for value in (-1, 2**60, "7", 1.5, None)
+        for field in ("bytes", "count")
+    ),
+    (changed(10**13, *FILE, "count"), r"files.0.count is 10000000000000, more than its \d+ bytes"),
+    *(
+        (changed("of another kind", field), rf"manifest.json: {field} is missing or not what it should be")
+        for field in ("episodes", "counts", "filtered", "quarantine", "action_mean", "action_std")
+    ),
+    (changed(99, "format"), "format 99"),
+    (written(b"{"), "manifest.json: not JSON"),
+    (written(b"\xff\xfe\x00"), "not JSON"),
+    (written(b"[" * 100_000), "manifest.json: not JSON"),
+    (looped(MANIFEST), r"manifest.json: cannot be read \(Too many levels of symbolic links\)"),
+    (written(None, SHARD), f"{SHARD}: missing"),
+    (written(b"short", SHARD), f"{SHARD}.*should be.*make it again"),
+    (looped(SHARD), rf"{SHARD}: cannot be read \(Too many levels of symbolic"),
+    (written(None, "train-labels.npy"), "train-labels.npy: missing"),
+]
 
 
-def test_bytes_that_are_no_text_are_reported(path: Path) -> None:
-    (path / MANIFEST).write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(StoreError, match=r"not JSON"):
+@pytest.mark.parametrize(("damage", "message"), DAMAGES)
+def test_damage_is_named_on_opening(path: Path, damage: Damage, message: str) -> None:
+    damage(path)
+    with pytest.raises(StoreError, match=message):
         open_store(path)
+    assert complete_key(path) is None
 
 
 def test_a_missing_permission_is_reported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,37 +123,3 @@ def test_a_missing_permission_is_reported(path: Path, monkeypatch: pytest.Monkey
 
 def test_a_good_store_is_opened(path: Path) -> None:
     assert numbers(open_store(path)) == [0, 1]
-
-
-@pytest.mark.parametrize("split", ["../elsewhere", "/tmp/x", "..", ""])
-def test_a_split_that_leads_elsewhere_is_refused(path: Path, split: str) -> None:
-    change(path, {"files": []}, "splits", split)
-    with pytest.raises(StoreError, match=r"manifest.json: splits has .* cannot be the name of a file"):
-        open_store(path)
-
-
-def test_a_shard_that_is_a_loop_of_links_is_reported(path: Path) -> None:
-    shard = path / "train-00000.array_record"
-    shard.unlink()
-    shard.symlink_to(shard)
-    with pytest.raises(StoreError, match=r"train-00000.array_record: cannot be read \(Too many levels of symbolic"):
-        open_store(path)
-
-
-def test_a_manifest_of_nothing_but_brackets_is_reported(path: Path) -> None:
-    (path / MANIFEST).write_text("[" * 100_000)
-    with pytest.raises(StoreError, match=r"manifest.json: not JSON"):
-        open_store(path)
-
-
-@pytest.mark.parametrize("field", ["episodes", "counts", "filtered", "quarantine", "action_mean", "action_std"])
-def test_what_others_rely_on_has_its_kind(path: Path, field: str) -> None:
-    change(path, "of another kind", field)
-    with pytest.raises(StoreError, match=rf"manifest.json: {field} is missing or not what it should be"):
-        open_store(path)
-
-
-def test_more_records_than_bytes_are_refused(path: Path) -> None:
-    change(path, 10**13, "splits", "train", "files", 0, "count")
-    with pytest.raises(StoreError, match=r"splits.train.files.0.count is 10000000000000, more than its \d+ bytes"):
-        open_store(path)

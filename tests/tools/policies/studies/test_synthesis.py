@@ -119,20 +119,23 @@ def test_noise_leaves_commands_alone_and_stays_in_range(seed: int, noise: float)
 
 
 def test_what_cannot_be_made_is_named(tmp_path: Path, store: Any) -> None:
-    with pytest.raises(UserError, match="--demos 0"):
-        Synthesis(demos=0)
-    other = trained(store)
-    other.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None), tokenizer=None)
-    with pytest.raises(UserError, match="actions of 6 numbers, the model takes 7"):
-        synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
-    other = trained(store)
-    other.config.model.takes_actions = False
-    with pytest.raises(UserError, match=r"the model takes no actions \(family 'toy'\), so its videos do not show"):
-        synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
-    other = trained(store)
-    other.config.clips.image_size = 64
-    with pytest.raises(UserError, match="frames of 16 × 16 pixels, the model takes 64 × 64"):
-        synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
+    for field, wrong, message in (
+        ("demos", 0, "--demos 0"),
+        *(("fps", fps, f"--fps {fps:g}: frames per second, 0.001 to 1000") for fps in (-1, 1e-4, float("nan"))),
+    ):
+        with pytest.raises(UserError, match=message):
+            Synthesis(**{field: wrong})  # type: ignore[arg-type]
+    wide, still, large = (trained(store) for _ in range(3))
+    wide.assets = SimpleNamespace(normalization=Normalization((0.0,) * 7, (1.0,) * 7, None), tokenizer=None)
+    still.config.model.takes_actions = False
+    large.config.clips.image_size = 64
+    for other, message in (
+        (wide, "actions of 6 numbers, the model takes 7"),
+        (still, r"the model takes no actions \(family 'toy'\), so its videos do not show"),
+        (large, "frames of 16 × 16 pixels, the model takes 64 × 64"),
+    ):
+        with pytest.raises(UserError, match=message):
+            synthesize(other, store, tmp_path / "out", Synthesis(2), LIMITS)
 
 
 def test_clips_without_a_frame_rate_need_one_before_anything_is_generated(tmp_path: Path) -> None:
@@ -148,6 +151,3 @@ def test_clips_without_a_frame_rate_need_one_before_anything_is_generated(tmp_pa
     with pytest.raises(UserError, match="both: its clips have several frame rates, such as . Hz; give --fps"):
         choose_clips(both, Synthesis(8))
     assert len(choose_clips(both, Synthesis(8, fps=5))) == 6
-    for fps in (-1, 1e-4, float("nan")):
-        with pytest.raises(UserError, match=f"--fps {fps:g}: frames per second, 0.001 to 1000"):
-            Synthesis(fps=fps)
