@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import rsjax
 from rsjax.data.merge import merge
-from rsjax.data.store import Store, StoreError
+from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.tools.export import lerobot_files
 from rsjax.tools.export.lerobot import LeRobotOptions, export_lerobot
@@ -202,20 +202,18 @@ def test_an_export_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="do not say how many frames a second have; give --fps"):
-        export_lerobot(toy_store(tmp_path / "still", fps=None), tmp_path / "a")
-    with pytest.raises(UserError, match="33 × 33 pixels"):
-        export_lerobot(toy_store(tmp_path / "odd", size=33), tmp_path / "b")
-    for fps in (float("inf"), -1.0, 1e-9):
-        with pytest.raises(UserError, match=r"32 × 32 pixels at .* Hz; videos need even sides and 0.001 to 1000 Hz"):
-            export_lerobot(toy_store(tmp_path / f"{fps}"), tmp_path / "f", LeRobotOptions(fps=fps))
     for fields in ({"crf": 64}, {"crf": 52, "codec": "h264"}, {"crf": -3}):
         with pytest.raises(UserError, match=r"export.crf is .*; it must be 0 … "):
             LeRobotOptions(**fields)  # type: ignore[arg-type]
-    fast = toy_store(tmp_path / "fast")
-    slow = toy_store(tmp_path / "slow", fps=2.0)
-    merge([fast.path, slow.path], tmp_path / "both")
-    with pytest.raises(StoreError, match=r"has clips of 5 and 2 frames a second .* or give --fps"):
-        export_lerobot(rsjax.open_store(tmp_path / "both"), tmp_path / "d")
-    with pytest.raises(StoreError, match="no split 'val'"):
-        export_lerobot(toy_store(tmp_path / "store"), tmp_path / "c", LeRobotOptions(split="val"))  # type: ignore[arg-type]
+    fast, slow = toy_store(tmp_path / "fast"), toy_store(tmp_path / "slow", fps=2.0)
+    both = merge([fast.path, slow.path], tmp_path / "both")
+    at = r"32 × 32 pixels at .* Hz; videos need even sides and 0.001 to 1000 Hz"
+    for store, options, message in (
+        (toy_store(tmp_path / "still", fps=None), {}, "do not say how many frames a second have; give --fps"),
+        (toy_store(tmp_path / "odd", size=33), {}, "33 × 33 pixels"),
+        *((fast, {"fps": fps}, at) for fps in (float("inf"), -1.0, 1e-9)),
+        (both, {}, "has clips of 5 and 2 frames a second .* or give --fps"),
+        (fast, {"split": "val"}, "no split 'val'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            export_lerobot(store, tmp_path / "out", LeRobotOptions(**options))  # type: ignore[arg-type]

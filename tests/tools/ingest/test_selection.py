@@ -14,14 +14,6 @@ def test_episodes_of_one_name_are_all_counted_and_left_out(tmp_path: Path) -> No
     assert write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons()) == (5, 2)
 
 
-def test_a_manifest_made_with_other_options_is_refused(tmp_path: Path) -> None:
-    diagnosis = diagnose(source(), Thresholds())
-    write_selection(tmp_path / "m.json", "toy", diagnosis.refs, diagnosis.reasons())
-    others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
-    with pytest.raises(SourceError, match=r"m.json: the data set was read with other options then"):
-        select(others, tmp_path / "m.json")
-
-
 def test_the_fix_leaves_out_the_bad_ones_with_reasons_and_counts_them(tmp_path: Path) -> None:
     data_set = source(replace(episode(6), task=""), episode(7))
     diagnosis = diagnose(data_set, Thresholds())
@@ -44,20 +36,23 @@ def test_an_episode_that_was_mended_is_read_again(tmp_path: Path) -> None:
     assert [mended.read(ref).task for ref in mended.episodes()][6] == "lift"
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"format": 2}', '{"format": 1, "kept": 3, "left_out": []}'])
-def test_another_file_is_no_manifest(tmp_path: Path, content: str) -> None:
-    for text in (content, "[" * 100_000 + content):
-        (tmp_path / "m.json").write_text(text)
-        with pytest.raises(SourceError, match="m.json: not a list of"):
-            select(source(), tmp_path / "m.json")
-
-
-def test_the_manifest_of_another_data_set_is_refused(tmp_path: Path) -> None:
-    write_selection(tmp_path / "m.json", "toy", (("other", "0" * 16),), {})
-    with pytest.raises(SourceError, match="m.json: names no episode of this data set"):
-        select(source(), tmp_path / "m.json")
-
-
-def test_a_missing_list_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="m.json: not there"):
-        select(source(), tmp_path / "m.json")
+def test_a_list_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    diagnosis = diagnose(source(), Thresholds())
+    write_selection(path, "toy", diagnosis.refs, diagnosis.reasons())
+    whole = path.read_text()
+    write_selection(path, "toy", (("other", "0" * 16),), {})
+    of_another = path.read_text()
+    others = ToySource(tuple(replace(episode(seed), fingerprint="1" * 16) for seed in range(6)))
+    no_lists = ("", "[]", "{}", '{"format": 2}', '{"format": 1, "kept": 3, "left_out": []}', "[" * 100_000)
+    for data_set, content, message in (
+        (source(), None, "not there"),
+        (others, whole, "the data set was read with other options then"),
+        (source(), of_another, "names no episode of this data set"),
+        *((source(), content, "not a list of") for content in no_lists),
+    ):
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_text(content)
+        with pytest.raises(SourceError, match=f"m.json: {message}"):
+            select(data_set, path)

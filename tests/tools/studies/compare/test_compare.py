@@ -236,17 +236,18 @@ def test_groups_are_paths_lists_or_patterns_with_commas_in_names(tmp_path: Path)
 
 
 def test_a_missing_result_names_the_command(make: Make, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"no result of protocol papr; did you mean 'paper'.*experiments.evaluate"):
-        read_groups([make("a", toy.result(0.0))], "papr")
     (tmp_path / "bare").mkdir()
-    with pytest.raises(UserError, match="no protocol has evaluated all of them; python -m experiments.evaluate"):
-        read_groups([str(tmp_path / "bare")], None)
-    toy.run(tmp_path / "a,seed=0", replace(toy.result(0.0), label="horizon48"))
-    with pytest.raises(UserError, match="results of horizon48 and of paper; choose one with --protocol"):
-        read_groups([f"a={tmp_path}/a,seed=0"], None)
+    both = make("both", toy.result(0.0))
+    toy.run(tmp_path / "both,seed=0", replace(toy.result(0.0), label="horizon48"))
     toy.run(tmp_path / "b", replace(toy.result(0.0), label="unseen,unseen_camera"))
-    with pytest.raises(UserError, match="no result unseen, but unseen,unseen_camera; choose one of them with --proto"):
-        read_groups([f"{tmp_path}/b"], "unseen")
+    for group, protocol, message in (
+        (make("a", toy.result(0.0)), "papr", "no result of protocol papr; did you mean 'paper'.*experiments.evaluate"),
+        (f"{tmp_path}/bare", None, "no protocol has evaluated all of them; python -m experiments.evaluate"),
+        (both, None, "results of horizon48 and of paper; choose one with --protocol"),
+        (f"{tmp_path}/b", "unseen", "no result unseen, but unseen,unseen_camera; choose one of them with --proto"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read_groups([group], protocol)
 
 
 @pytest.mark.parametrize(

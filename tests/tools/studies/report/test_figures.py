@@ -87,9 +87,11 @@ def test_keypoints_draw_trails_only_where_visible(make_clip):
 
 
 def test_errors_name_arrays_of_the_wrong_shape(make_clip):
-    with pytest.raises(ValueError, match=r"prediction of clip 'episode <7>' has shape \(1, 32, 32, 3\)"):
-        make_clip(prediction=np.zeros((1, 32, 32, 3), np.uint8))
-    with pytest.raises(ValueError, match="true_depth"):
-        make_clip(true_depth=np.zeros((6, 32, 32, 1), np.float32))
-    with pytest.raises(ValueError, match="visible"):
-        make_clip(visible=None)
+    one_frame = np.zeros((1, 32, 32, 3), np.uint8)
+    for changes, message in (
+        ({"prediction": one_frame}, r"prediction of clip 'episode <7>' has shape \(1, 32, 32, 3\)"),
+        ({"true_depth": np.zeros((6, 32, 32, 1), np.float32)}, "true_depth"),
+        ({"visible": None}, "visible"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_clip(**changes)
