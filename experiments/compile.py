@@ -1,21 +1,19 @@
-"""Compiles a preset's step for accelerators that are not here. ``python -m experiments.compile roboscape_s``"""
+"""Compiles a preset for absent accelerators. ``python -m experiments.compile roboscape_s --target h100x8``"""
 
 import os
 import sys
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 from experiments.cli import main_errors, parse
-from rsjax.files import write_file
+from rsjax.errors import UserError
+from rsjax.files import write_file, write_json
+from rsjax.tools.compile import targets
 
 PROG = "python -m experiments.compile"
-# Without these, libtpu looks for a TPU, and jax for a GPU.
-ABSENT = {
-    "JAX_PLATFORMS": "cpu",
-    "TPU_SKIP_MDS_QUERY": "1",
-    "TPU_ACCELERATOR_TYPE": "v5litepod-4",
-    "TPU_WORKER_HOSTNAMES": "localhost",
-}
+PACKAGES = {"cuda": ("jax_cuda13_plugin", "CUDA packages of jax"), "tpu": ("libtpu", "libtpu")}
 
 
 @dataclass(frozen=True)
@@ -23,44 +21,57 @@ class Options:
     """Options of this command."""
 
     target: str = "h100"
-    """The cluster: h100, h100x8."""
+    """The cluster, such as h100, a100x8, rtx4090, v5e-16, v5p-64 (docs/how-to/compile.md lists all)."""
+    part: Literal["train", "sample", "tokenizer"] = "train"
+    """The training step, a generated frame, or the tokenizer's training step and its encoding."""
+    clips: int = 64
+    """With --part sample: clips that are generated at once, beside one alone."""
+    largest: bool = True
+    """Compile a second batch size, to extrapolate the largest batch that fits."""
+    json: Path | None = None
+    """Write the numbers to this file."""
     dump: Path | None = None
     """Write the optimised program to this file."""
 
 
 @main_errors()
 def main() -> None:
-    """Compiles, and prints the cost."""
-    config, options = parse(sys.argv[1:], PROG, "Compiles for accelerators that are not here.", Options())
-    os.environ |= ABSENT
-    from rsjax.tools.compile import programs, targets
-    from rsjax.tools.compile.roofline import part_of, roofline
-
+    """Compiles, and prints memory, cost and speed."""
+    description = "Compiles for accelerators that are not here, and says what they could do at most."
+    config, options = parse(sys.argv[1:], PROG, description, Options())
     target = targets.find(options.target)
-    compiled = programs.train(config, targets.devices(target)).compile()
-    text = compiled.as_text()
-    if options.dump:
-        write_file(options.dump, text.encode())
-    cost = roofline(text, target.card)
-    from rsjax.models.base import create_model
+    enter_environment(target.card.platform)
+    from rich.console import Console
 
-    clips = config.train.batch_size
-    flops = clips * create_model(config).flops(config.clips.frames).get("train", 0)
-    memory = compiled.memory_analysis()
-    for warning in cost.warnings:
-        print(f"WARNING: {warning}")
-    mfu = flops / (target.card.peak * target.devices * cost.seconds)
-    moved = cost.bytes * target.devices / clips
-    print(f"roofline {cost.seconds:.4f} s a step, model {flops / 1e12:.3f} TFLOP, roofline MFU {mfu:.2%}")
-    print(f"{cost.flops * target.devices / 1e12:.3f} TFLOP executed, {moved / 1e9:.2f} GB a clip")
-    print(f"{cost.launches} kernels, collectives {cost.collectives()}")
-    print(f"temporaries {memory.temp_size_in_bytes / 1e9:.2f} GB, state {memory.argument_size_in_bytes / 1e9:.2f} GB")
-    for kernel in sorted(cost.kernels, key=lambda kernel: -kernel.total)[:10]:
-        work = f"{kernel.bytes / 1e6:9.1f} MB {kernel.flops / 1e9:8.1f} GFLOP"
-        print(f"{kernel.total * 1e3:9.2f} ms {kernel.launches:5d} x {work} {kernel.name}  {kernel.op_name[-100:]}")
-    for name, part in list(cost.by_part(part_of).items())[:20]:
-        share = part.seconds / cost.seconds
-        print(f"{share:7.1%} {part.bytes / 1e9:9.1f} GB {part.launches:6d} kernels  {name}")
+    from rsjax.tools.compile.report import render
+    from rsjax.tools.compile.run import check, run
+
+    texts: list[str] = []
+    console = Console()
+    results = run(config, target, options.part, options.clips, Console(stderr=True), options.largest, keep=texts.append)
+    for numbers in results:
+        console.print(render(numbers, target, config.name), "")
+    if options.dump:
+        write_file(options.dump, "\n".join(texts).encode())
+    if options.json:
+        write_json(options.json, {"preset": config.name, "part": options.part} | results[0] | {"others": results[1:]})
+    check(results, config, options.part, target)
+
+
+def enter_environment(platform: str) -> None:
+    """Continues in the environment with the compilers, where they are not in this one.
+
+    Raises:
+        UserError: there is no such environment, or it lacks the compiler.
+    """
+    os.environ |= targets.ENVIRONMENT
+    package, title = PACKAGES[platform]
+    if find_spec(package):
+        return
+    python = Path(sys.prefix) / "accelerators" / "bin" / "python"
+    if not python.exists() or find_spec("jax_cuda13_plugin") or find_spec("libtpu"):
+        raise UserError(f"the compiler is not installed ({title}); make accelerators installs it, 5 GB in all")
+    os.execve(python, [str(python), *sys.orig_argv[1:]], os.environ)
 
 
 if __name__ == "__main__":

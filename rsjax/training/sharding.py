@@ -4,7 +4,7 @@ A state is an ordinary tree of arrays in all three cases, so checkpoints do not 
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import prod
@@ -77,19 +77,24 @@ class Sharding:
     mesh: Mesh
 
     @classmethod
-    def create(cls, loop: LoopConfig) -> "Sharding":
+    def create(cls, loop: LoopConfig, devices: Sequence[Any] = ()) -> "Sharding":
         """Returns the sharding that ``loop`` requires, on the devices of all processes.
+
+        Args:
+            devices: those to use; for absent ones, programs can be lowered and compiled, but not run.
 
         Raises:
             ConfigError: the batch or the devices cannot be divided as required.
         """
-        kind, devices = choose(loop, jax.local_device_count(), jax.process_count())
+        devices = devices or jax.devices()
+        processes = len({device.process_index for device in devices})
+        kind, count = choose(loop, len(devices) // processes, processes)
         if kind == "mesh":
-            sizes = (devices // loop.fsdp, loop.fsdp)
-            return cls(kind, jax.make_mesh(sizes, (DATA, FSDP), axis_types=(AxisType.Auto,) * 2))
+            sizes = (count // loop.fsdp, loop.fsdp)
+            return cls(kind, jax.make_mesh(sizes, (DATA, FSDP), axis_types=(AxisType.Auto,) * 2, devices=devices))
         # pmap requires the devices of a process to be adjacent.
-        ordered = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
-        return cls(kind, Mesh(np.array(ordered[:devices]), (AXIS,)))
+        ordered = sorted(devices, key=lambda device: (device.process_index, device.id))
+        return cls(kind, Mesh(np.array(ordered[:count]), (AXIS,)))
 
     def init(
         self, model: Trainable[Any], loop: LoopConfig, start: Callable[[Params], Params] | None = None
@@ -154,6 +159,21 @@ class Sharding:
             split = jax.tree.map(lambda x: np.reshape(x, (local.size, -1, *np.shape(x)[1:])), batch)
             return jax.device_put(split, NamedSharding(local, P(AXIS)))
         return jax.tree.map(lambda x: jax.make_array_from_process_local_data(self._rows, np.asarray(x)), batch)
+
+    def batch_template(self, batch: PyTree) -> PyTree:
+        """Returns shapes, dtypes and shardings of :meth:`put_batch`'s batch, from those of the global batch."""
+        if self.kind == "jit":
+            one = SingleDeviceSharding(self.mesh.devices.flat[0])
+            return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=one), batch)
+        if self.kind == "mesh":
+            return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=self._rows), batch)
+        parts = self.mesh.size
+        each = NamedSharding(self.mesh, P(AXIS))
+
+        def split(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((parts, x.shape[0] // parts, *x.shape[1:]), x.dtype, sharding=each)
+
+        return jax.tree.map(split, batch)
 
     @property
     def shares(self) -> bool:

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from math import prod
 from typing import NamedTuple
 
+import numpy as np
+
 from rsjax.layers.kernel_flops import KERNEL_FLOPS
 from rsjax.tools.compile.cards import Card
 from rsjax.tools.compile.hlo import HOST, Array, Computation, Instruction, Module, parse
@@ -31,6 +33,18 @@ FREE_CALLS = {
 # Custom calls that only move data, or whose operations are few beside their bytes.
 PLAIN_CALLS = {"TopK", "__cub$DeviceRadixSort", "xla.gpu.ext.cub_sort_unassigned_scratch_size", "__gpu$TopK"}
 COLLECTIVES = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute", "ragged-all-to-all")
+# Names in an operation's path that are no module of the model.
+_WRAPPERS = {
+    "while",
+    "body",
+    "cond",
+    "closed_call",
+    "checkpoint",
+    "rematted_computation",
+    "train_step",
+    "pallas_call",
+    "",
+}
 # Inside a fusion, these compute each element of the result from one element of their operand.
 UNARY = {"bitcast", "convert", "copy", "reshape", "transpose"}
 
@@ -56,7 +70,8 @@ class Kernel:
         bytes: that it moves between the chip and the memory in one launch.
         flops: operations of one launch.
         seconds: the least time of one launch.
-        sent: bytes of one launch that a collective hands to other devices; 0 for other kernels.
+        sent: bytes that a collective hands to other devices in one launch; 0 for other kernels.
+        exposed: seconds of one launch of a collective, at the links' bandwidth, in which no kernel runs beside it.
     """
 
     name: str
@@ -67,6 +82,7 @@ class Kernel:
     flops: float
     seconds: float
     sent: float = 0
+    exposed: float = 0
 
     @property
     def total(self) -> float:
@@ -85,6 +101,11 @@ class Roofline:
     def seconds(self) -> float:
         """The roofline time."""
         return sum(kernel.total for kernel in self.kernels)
+
+    @property
+    def exposed(self) -> float:
+        """Seconds that collectives add to it, because no kernel runs beside them."""
+        return sum(kernel.launches * kernel.exposed for kernel in self.kernels)
 
     @property
     def bytes(self) -> float:
@@ -119,14 +140,15 @@ class Roofline:
         return dict(sorted(parts.items(), key=lambda item: -item[1].seconds))
 
 
-def roofline(text: str, card: Card) -> Roofline:
-    """Returns the cost of a program.
+def roofline(text: str, card: Card, local: int = 8) -> Roofline:
+    """Returns the cost of a program on one device.
 
     Args:
         text: of the optimised program, ``compiled.as_text()``.
+        local: devices of a host.
     """
     module = parse(text)
-    counter = _Counter(module, card)
+    counter = _Counter(module, card, local)
     kernels = tuple(counter.kernels(module[module.entry]))
     return Roofline(kernels, tuple(dict.fromkeys(counter.warnings)))
 
@@ -144,46 +166,61 @@ def part_of(op_name: str, depth: int = 3) -> str:
         phase = "backward "
     elif "jvp(" in op_name:
         phase = "forward "
-    path = re.sub(r"\b(?:jit|jvp|vmap|transpose|pmap|shard_map|checkpoint|remat)\(", "", op_name).replace(")", "")
-    skipped = {"while", "body", "closed_call", "checkpoint", "rematted_computation", "cond", "branch_1_fun", ""}
-    names = [name.partition(".")[0] for name in path.split("/") if name not in skipped]
-    names = [name for name, before in zip(names, [None, *names], strict=False) if name != before]
-    if names and names[0] in ("train_step", "step"):
-        names = names[1:]
-    if len(names) > 1:
-        names = names[:-1]  # the last one is the primitive
-    return f"{phase}{'/'.join(names[:depth])}".strip() or "other"
+    path = re.sub(r"\b\w+\(|\)", "", op_name)  # jit(step)/jvp(Network)/layer: step/Network/layer
+    modules = [name.partition(".")[0] for name in path.split("/")[1:-1]]
+    modules = [name for name in modules if name not in _WRAPPERS and not re.match(r"[A-Z]|_|branch_\d|.*->", name)]
+    names = [name for name, before in zip(modules, [None, *modules], strict=False) if name != before]
+    part = "/".join(names[:depth])
+    if not part and "while/body" in op_name:
+        part = "the loop over blocks"
+    elif not part and "train_step" in op_name:
+        part = {"": "optimizer"}.get(phase, "loss and masks")
+    return f"{phase}{part or 'other'}"
 
 
 class _Counter:
     """Counts the kernels of one program on one card."""
 
-    def __init__(self, module: Module, card: Card) -> None:
+    def __init__(self, module: Module, card: Card, local: int) -> None:
         self.module = module
         self.card = card
+        self.local = local
         self.warnings: list[str] = []
 
-    def kernels(self, computation: Computation, times: int = 1) -> Iterator[Kernel]:
-        """Yields the kernels of a computation that runs so many times."""
+    def kernels(self, computation: Computation, times: int = 1) -> list[Kernel]:
+        """Returns the kernels of a computation that runs so many times."""
+        kernels: list[Kernel] = []
+        started: dict[str, int] = {}  # the number of kernels before each collective that runs beside others
         for one in computation:
-            if one.opcode in FREE or (one.opcode == "custom-call" and _target(one) in FREE_CALLS):
-                continue
-            if one.opcode == "while":
-                yield from self.kernels(self.module[one.called[0]], times * self._trips(one, computation))
-            elif one.opcode == "conditional":
-                branches = [list(self.kernels(self.module[name], times)) for name in one.called]
-                yield from max(branches, key=lambda branch: sum(kernel.total for kernel in branch))
-            elif one.opcode in ("call", "async-start"):
-                for name in one.called:
-                    yield from self.kernels(self.module[name], times)
-            elif not self._scalar(one):
-                yield replace(self._kernel(one, computation), launches=times)
+            if one.opcode.endswith("-done") and one.operands[0] in started:
+                start = started.pop(one.operands[0])
+                beside = sum(kernel.total for kernel in kernels[start + 1 :]) / times
+                exposed = max(0.0, kernels[start].exposed - beside)
+                kernels[start] = replace(kernels[start], exposed=exposed)
+            new = self._run(one, computation, times)
+            if new and new[0].sent:
+                started[one.name] = len(kernels)
+            kernels += new
+        return kernels
+
+    def _run(self, one: Instruction, computation: Computation, times: int) -> list[Kernel]:
+        """Returns the kernels of an instruction."""
+        if one.opcode in FREE or (one.opcode == "custom-call" and _target(one) in FREE_CALLS) or self._scalar(one):
+            return []
+        if one.opcode == "while":
+            return self.kernels(self.module[one.called[0]], times * self._trips(one))
+        if one.opcode == "conditional":
+            branches = [self.kernels(self.module[name], times) for name in one.called]
+            return max(branches, key=lambda branch: sum(kernel.total for kernel in branch))
+        if one.opcode in ("call", "async-start"):
+            return [kernel for name in one.called for kernel in self.kernels(self.module[name], times)]
+        return [replace(self._kernel(one, computation), launches=times)]
 
     def _scalar(self, one: Instruction) -> bool:
         """Returns whether a TPU's scalar unit computes the instruction."""
         return self.card.platform == "tpu" and one.opcode != "fusion" and all(not x.dims for x in one.arrays)
 
-    def _trips(self, loop: Instruction, computation: Computation) -> int:
+    def _trips(self, loop: Instruction) -> int:
         """Returns the iterations of a loop: those that XLA found, or the constant in its condition."""
         known = re.search(r'known_trip_count"?:\s*\{"?n"?:\s*"?(\d+)', loop.attributes)
         if known:
@@ -207,6 +244,7 @@ class _Counter:
         operands = [computation[name] for name in dict.fromkeys(one.operands)]
         results = sum(map(self._bytes, one.arrays))
         sent = 0.0
+        transfer = 0.0
         work = Work()
         collective = next((kind for kind in COLLECTIVES if opcode.startswith(kind)), None)
         if opcode == "fusion":
@@ -220,7 +258,7 @@ class _Counter:
             if one.opcode.endswith("-start") and collective != "all-reduce":
                 written -= read  # its results include its operands
             moved = read + written
-            sent = float(max(read, written))
+            sent, transfer = self._transfer(collective, one, max(read, written))
         elif opcode in ("copy-start", "slice-start"):
             target = one.arrays[{"copy-start": 0, "slice-start": -2}[opcode]]
             source = operands[0].arrays[0]
@@ -240,7 +278,26 @@ class _Counter:
             moved = results + sum(self._operand_bytes(x) for x in operands)
             work = self._product(one, computation)
         seconds = max(moved / self.card.bandwidth, work.seconds)
-        return Kernel(one.name, opcode, one.op_name, 1, float(moved), work.flops, seconds, sent)
+        exposed = max(0.0, transfer - seconds)
+        return Kernel(one.name, opcode, one.op_name, 1, float(moved), work.flops, seconds, sent, exposed)
+
+    def _transfer(self, kind: str, one: Instruction, payload: float) -> tuple[float, float]:
+        """Returns the bytes that each device sends in a collective, and the least seconds for them.
+
+        Within a host they go over the cards' links. Between hosts, the data that all members on a host have to send go
+        over the network adapters of these members.
+        """
+        group = _group(one)
+        hosts = len({device // self.local for device in group})
+        members = len(group) / hosts
+        if kind == "collective-permute":
+            pairs = zip(*[iter(one.integers("source_target_pairs"))] * 2, strict=True)
+            far = any(source // self.local != target // self.local for source, target in pairs)
+            return payload, payload / {True: self.card.network, False: self.card.link}[far]
+        passes = 1 + (kind == "all-reduce")
+        sent = passes * payload * (1 - 1 / len(group))
+        between = passes * payload * (1 - 1 / hosts) / (members * self.card.network)
+        return sent, max(sent / self.card.link, between)
 
     def _bytes(self, array: Array) -> int:
         """Returns the array's bytes in the device's memory."""
@@ -336,7 +393,9 @@ class _Counter:
     def _work(self, flops: float, dtype: str, precision: str = "") -> Work:
         peak = self.card.peak
         if dtype == "f32":
-            peak = self.card.float32 if "highest" in precision else self.card.tf32
+            peak = self.card.float32
+            if "highest" in precision:
+                peak = self.card.highest
         return Work(flops, flops / peak)
 
     def _call(self, one: Instruction, computation: Computation) -> Work:
@@ -370,6 +429,33 @@ class _Counter:
             "for a kernel of Pallas, register them in rsjax/layers/kernel_flops.py"
         )
         return Work()
+
+
+def _group(one: Instruction) -> list[int]:
+    """Returns the devices of a collective's first group."""
+    text = one.attributes.partition("replica_groups=")[2]
+    if iota := re.match(r"\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?", text):
+        return _iota(iota[2], iota[3]).reshape(_numbers(iota[1]))[0].tolist()
+    if mesh := re.match(r"mesh\[([^\]]*)\](?:, device_ids=\(\[([\d,]+)\]T\(([\d,]+)\)\))? \{([^}]*)\}", text):
+        sizes = {name: int(size) for name, size in re.findall(r"'(\w+)'=(\d+)", mesh[1])}
+        devices = np.arange(prod(sizes.values()))
+        if mesh[2]:
+            devices = _iota(mesh[2], mesh[3])
+        split = re.findall(r"'(\w+)'", mesh[4])
+        axes = [axis for axis, name in enumerate(sizes) if name in split]
+        grid = np.moveaxis(devices.reshape(list(sizes.values())), axes, range(-len(axes), 0))
+        return grid.reshape(-1, prod(sizes[name] for name in split))[0].tolist()
+    return list(one.integers("replica_groups")) or [0]
+
+
+def _iota(dims: str, order: str | None) -> np.ndarray:
+    """Returns the numbers from 0 on in an array of these dims, whose axes are then put in another order."""
+    devices = np.arange(prod(_numbers(dims))).reshape(_numbers(dims))
+    return devices.transpose(_numbers(order or "") or None).ravel()
+
+
+def _numbers(text: str) -> list[int]:
+    return list(map(int, re.findall(r"\d+", text)))
 
 
 def convolution_flops(one: Instruction, image: Array, kernel: Array, result: Array) -> int:
