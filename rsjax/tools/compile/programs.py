@@ -103,7 +103,7 @@ def train_tokenizer(config: Config, devices: Sequence[Any]) -> Program:
     arrays = {name: x[None] for name, x in model.transform()(record, rng).items()}
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), model.batch(arrays))
     flops = 3 * loop.batch_size * frames * sum(model.flops().values())
-    return _training("training step of the tokenizer", "clips", model, loop, devices, one, flops)
+    return _training("tokenizer's training step", "clips", model, loop, devices, one, flops)
 
 
 def _training(
@@ -138,7 +138,7 @@ def _training(
     compiled: Any = sharding.compile(train_step, model, loop)
     each = (np.prod(x.sharding.shard_shape(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(state))
     return Program(
-        title=title,
+        title=f"{title} on {loop.batch_size} {unit}",
         unit=unit,
         count=loop.batch_size,
         devices=used,

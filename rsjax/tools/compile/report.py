@@ -60,7 +60,7 @@ def compile_program(program: Program, target: Target, console: Console) -> Compi
     """
     began = time.monotonic()
     with (
-        _shown(f"compiling: {program.title}, {program.count} {program.unit}, for {target.title}", console),
+        _shown(f"compiling for {target.title}: {program.title}", console),
         answers_for(target.card),
     ):
         try:
@@ -90,12 +90,13 @@ def _refusal(error: Exception, program: Program, target: Target) -> UserError:
     exceeded = re.search(r"Used ([\d.]+\w) of ([\d.]+\w) hbm", text)
     if exceeded:
         return TooLargeError(
-            f"{program.title}: {program.count} {program.unit} need {exceeded[1]}iB of memory on each device, and "
-            f"{target.card.title} has {exceeded[2]}iB"
+            f"{program.title}: needs {exceeded[1]}iB of memory on each device; {target.card.title} has {exceeded[2]}iB"
         )
     path = Path(tempfile.gettempdir()) / "rsjax-compile-error.txt"
     write_file(path, text.encode())
-    return UserError(f"the compiler refuses the {program.title} for {target.name}: {first_line(error)} (all: {path})")
+    return UserError(
+        f"the compiler refuses this: {program.title}, for {target.name}: {first_line(error)} (all: {path})"
+    )
 
 
 def capacity(target: Target) -> float:
@@ -238,7 +239,7 @@ def _rows(numbers: dict[str, Any], target: Target, unit: str) -> Iterator[tuple[
         f"{_bytes(numbers['memory_bytes'])} of {_bytes(capacity(target))}: {fits} "
         f"(state {_bytes(numbers['state_bytes'])}, temporaries {_bytes(numbers['temp_bytes'])}){largest}",
     )
-    bound = f"{_seconds(numbers['roofline_s'])} for {numbers[unit]:,} {unit}"
+    bound = _seconds(numbers["roofline_s"])
     if numbers["exposed_s"]:
         bound += f", and {_seconds(numbers['exposed_s'])} of collectives beside which nothing runs"
     yield "roofline time", bound
@@ -256,7 +257,7 @@ def _rows(numbers: dict[str, Any], target: Target, unit: str) -> Iterator[tuple[
         )
     yield "speed", rate
     each = numbers["bytes"] * numbers["devices"] / numbers[unit]
-    yield "memory traffic", f"{_bytes(numbers['bytes'])} a device, {_bytes(each)} for each of the {unit}"
+    yield "memory traffic", f"{_bytes(numbers['bytes'])} a device, {_bytes(each)} for one of the {unit}"
     shares = numbers["bound_by"]
     named = ", ".join(f"{name} {shares[name]:.0%}" for name in ("bandwidth", "compute", "collectives"))
     yield "bound by", named

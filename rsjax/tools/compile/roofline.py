@@ -40,6 +40,7 @@ _WRAPPERS = {
     "cond",
     "closed_call",
     "checkpoint",
+    "shard_map",
     "rematted_computation",
     "train_step",
     "pallas_call",
@@ -253,12 +254,13 @@ class _Counter:
             work = self._products(inner)
         elif collective:
             opcode = collective
-            read = sum(self._operand_bytes(x) for x in operands)
-            written = results
+            sources = [x for operand in operands for x in operand.arrays]
+            targets = one.arrays
             if one.opcode.endswith("-start") and collective != "all-reduce":
-                written -= read  # its results include its operands
-            moved = read + written
-            sent, transfer = self._transfer(collective, one, max(read, written))
+                targets = targets[len(sources) :]  # its results begin with its operands
+            moved = sum(map(self._bytes, [*sources, *targets]))
+            payload = max(sum(x.bytes for x in sources), sum(x.bytes for x in targets))
+            sent, transfer = self._transfer(collective, one, payload)
         elif opcode in ("copy-start", "slice-start"):
             target = one.arrays[{"copy-start": 0, "slice-start": -2}[opcode]]
             source = operands[0].arrays[0]

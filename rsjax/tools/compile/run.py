@@ -68,7 +68,7 @@ def too_large(numbers: dict[str, Any], config: Config, part: Part, target: Targe
     """Returns one line on a training step that does not fit, with the cure."""
     there = f"{numbers['memory_bytes'] / 1e9:.1f} GB on each device, of which it may use {capacity(target) / 1e9:.1f}"
     batch = numbers.get("largest_batch", 0)
-    line = f"{config.name}: the {numbers['program']} needs {there}"
+    line = f"{config.name}: {numbers['program']} needs {there}"
     if batch:
         return (
             f"{line}; the largest batch that fits is {batch}: --{SECTIONS[part].replace('_', '-')}.batch-size {batch}"
