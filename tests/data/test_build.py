@@ -74,12 +74,6 @@ def test_no_task_is_unknown(tmp_path: Path, task: Any) -> None:
     assert tasks == {"unknown", "push"} and scenes == {"unknown"}
 
 
-def test_what_is_no_clip_is_named(tmp_path: Path) -> None:
-    wrong: list[Any] = [clip(), [clip()]]
-    with pytest.raises(StoreError, match="^clip 1: is a list, should be a dict with rgb and actions$"):
-        rsjax.write_store(tmp_path / "mine", wrong)
-
-
 @settings(max_examples=8)
 @given(names=st.lists(st.sampled_from("abcdef"), min_size=1, max_size=12), share=st.floats(0.01, 0.99))
 def test_all_clips_of_an_episode_are_in_one_split(
@@ -141,12 +135,15 @@ def test_depth_without_a_range_is_refused_by_who_needs_one(tmp_path: Path) -> No
 
 def test_what_is_no_store_is_not_replaced_and_the_callers_errors_stay_its_own(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    with pytest.raises(StoreError, match="mine: exists and is not a store"):
-        rsjax.write_store(tmp_path / "mine", [clip()])
-    with pytest.raises(StoreError, match="there are no clips to write"):
-        rsjax.write_store(tmp_path / "none", [])
-    with pytest.raises(StoreError, match="test_share is 1"):
-        rsjax.write_store(tmp_path / "none", [clip()], test_share=1)
+    wrong: Any = [clip(), [clip()]]
+    for name, clips, share, message in (
+        ("mine", [clip()], 0.1, "mine: exists and is not a store"),
+        ("none", [], 0.1, "there are no clips to write"),
+        ("none", [clip()], 1, "test_share is 1"),
+        ("none", wrong, 0.1, "^clip 1: is a list, should be a dict with rgb and actions$"),
+    ):
+        with pytest.raises(StoreError, match=message):
+            rsjax.write_store(tmp_path / name, clips, test_share=share)
 
     def broken() -> Iterator[dict[str, Any]]:
         yield clip()

@@ -64,23 +64,23 @@ def test_training_starts_from_more_context_or_without_actions(config: Config, tm
     shapes = own.pretrained_shapes(tmp_path)
     assert jax.tree.map(lambda x: x.shape, shapes) == jax.tree.map(lambda x: x.shape, own.shapes())
     wide = replace(own, config=replace(own.config, context_frames=2))
-    with pytest.raises(UserError, match="context_frames is 1 there, 2 here"):
-        wide.pretrained_shapes(tmp_path)
-    with pytest.raises(UserError, match="its tokenizer is for images of 64 pixels, these have 128"):
-        replace(own, image_size=128).pretrained_shapes(tmp_path)
+    wider = IVideoGPT(replace(model.config, width=32, sample=TopKConfig(seed=1)), model.clips)
+    fewer = IVideoGPT(model.config, replace(model.clips, action_dim=5))
+    for other, message in (
+        (wide, "context_frames is 1 there, 2 here"),
+        (replace(own, image_size=128), "its tokenizer is for images of 64 pixels, these have 128"),
+        (wider, "another network .width is 16 there, 32 here"),
+        (fewer, "reads actions of 28 numbers, this one of 5"),
+    ):
+        with pytest.raises(UserError, match=message):
+            other.pretrained_shapes(tmp_path)  # type: ignore[attr-defined]
     saved, fresh = random_params(wide.shapes()), random_params(own.shapes())
     kept = own.start(fresh, saved, tmp_path)["cond_encoder"]["cross_0"]
     np.testing.assert_array_equal(kept["kv_pos_emb"], saved["cond_encoder"]["cross_0"]["kv_pos_emb"][64:])
     np.testing.assert_array_equal(kept["q_pos_emb"], saved["cond_encoder"]["cross_0"]["q_pos_emb"])
     assert model.pretrained_shapes(tmp_path)["action_linear"]["kernel"].shape == (config.clips.action_dim, 16)
-    other = IVideoGPT(replace(model.config, width=32, sample=TopKConfig(seed=1)), model.clips)
-    with pytest.raises(UserError, match="another network .width is 16 there, 32 here"):
-        other.pretrained_shapes(tmp_path)
-    other = IVideoGPT(model.config, replace(model.clips, action_dim=5))
-    with pytest.raises(UserError, match="reads actions of 28 numbers, this one of 5"):
-        other.pretrained_shapes(tmp_path)
     saved_by(tmp_path, replace(model.config, use_actions=False), 64, 0)
-    assert "action_linear" not in other.pretrained_shapes(tmp_path)
+    assert "action_linear" not in fewer.pretrained_shapes(tmp_path)
 
 
 def saved_by(directory: Path, model: IVideoGPTConfig, size: int, actions: int) -> None:

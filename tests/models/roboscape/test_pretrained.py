@@ -82,16 +82,16 @@ def test_a_dual_model_starts_from_a_dual_model_to_the_letter(tmp_path: Path) -> 
     saved = random_params(DUAL)
     save(tmp_path, DUAL, saved)
     jax.tree.map(np.testing.assert_array_equal, begin(DUAL, tmp_path), saved)
-    with pytest.raises(UserError, match="action_encoder/bias has no place in this model"):
-        begin(ALONE, tmp_path)
-    wider = replace(DUAL, action_inputs=6)
-    with pytest.raises(UserError, match=r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"):
-        begin(wider, tmp_path)
-    integrated = depart(DUAL, integrate_actions=True)
-    with pytest.raises(UserError, match="integrate_actions is False there, True here"):
-        begin(integrated, tmp_path)
-    with pytest.raises(UserError, match="action_encoder is linear there, mlp here"):
-        begin(replace(DUAL, action_encoder="mlp"), tmp_path)
+    (tmp_path / "empty").mkdir()
+    for other, place, message in (
+        (ALONE, tmp_path, "action_encoder/bias has no place in this model"),
+        (replace(DUAL, action_inputs=6), tmp_path, r"action_encoder/kernel is \(5, 8\), this model's is \(6, 8\)"),
+        (depart(DUAL, integrate_actions=True), tmp_path, "integrate_actions is False there, True here"),
+        (replace(DUAL, action_encoder="mlp"), tmp_path, "action_encoder is linear there, mlp here"),
+        (DUAL, tmp_path / "empty", "holds no world_model/weights with their settings"),
+    ):
+        with pytest.raises(UserError, match=message):
+            begin(other, place)
 
 
 def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Path) -> None:
@@ -116,8 +116,3 @@ def test_a_run_is_such_a_directory_too(tmp_path: Path) -> None:
     assert pretrained.read_architecture(tmp_path) == genie
     begun = begin(replace(genie, use_depth=True, action_inputs=5, action_encoder="linear"), tmp_path)
     jax.tree.map(np.testing.assert_array_equal, begun["blocks"]["rgb"], random_params(genie)["blocks"]["rgb"])
-
-
-def test_a_directory_without_weights_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no world_model/weights with their settings"):
-        begin(ALONE, tmp_path)
