@@ -14,7 +14,7 @@ import tyro
 from rsjax.command import main_errors as main_errors  # every command imports main_errors and a parser from here
 from rsjax.command import refuse_repeated
 from rsjax.config import Config, ConfigError, CurriculumStageConfig, check_numbers, presets, require
-from rsjax.config.config_fields import config_fields
+from rsjax.config.config_fields import config_fields, with_sections, with_values
 from rsjax.config.curriculum import read_curriculum, write_curriculum
 from rsjax.errors import did_you_mean
 
@@ -119,11 +119,18 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
     preset = presets.get(name)
     preset_options = _parse({"preset": PresetOptions()}, argv, prog, "", rest=True).preset
     preset = preset_options.apply(preset)
-    fields: Any = preset
+    chosen, argv = choose_sections(preset, argv)
+    fields: Any = chosen
     if {"-h", "--help"}.intersection(argv):
-        fields = _first_fields(preset)
+        fields = _first_fields(chosen)
         description = f"{description} Every field: {prog} --help-all"
     elif "--help-all" in argv:
+        sections = [
+            f"--{_flag(name)} {'|'.join(get_args(field.kind))}, now {field.value}"
+            for name, field in config_fields(chosen).items()
+            if field.section
+        ]
+        description = f"{description} Sections: {'; '.join(sections)}."
         argv = ["--help"]
     parsed = _parse({"options": options, "preset": preset_options, "fields": fields}, argv, prog, description)
     config: Config = parsed.fields
@@ -136,6 +143,37 @@ def parse(argv: Sequence[str], prog: str, description: str, options: Options) ->
             f"{flag}.curriculum [] trains on all clips for that many steps",
         )
     return config, parsed.options
+
+
+def choose_sections(preset: Config, argv: Sequence[str]) -> tuple[Config, list[str]]:
+    """Chooses the sections that arguments name, such as ``--model.mask off`` or ``--train.optimizer adamw``.
+
+    An argument within a section that is off switches it on.
+
+    Returns:
+        The preset with these sections, and the other arguments.
+
+    Raises:
+        ConfigError: a section has no such choice, or the sections do not fit together.
+    """
+    sections = {name: field for name, field in config_fields(preset).items() if field.section}
+    words: dict[str, Any] = {}
+    inside: list[str] = []
+    rest: list[str] = []
+    remaining = iter(argv)
+    for argument in remaining:
+        flag, equals, word = argument.partition("=")
+        name = flag.removeprefix("--").replace("-", "_")
+        if not flag.startswith("--") or name not in sections:
+            inside.append(name)
+            rest.append(argument)
+            continue
+        if not equals:
+            word = next(remaining, "")
+        choices = get_args(sections[name].kind)
+        require(word in choices, f"{flag} is {word!r}; choose {' or '.join(choices)}")
+        words[name] = word
+    return with_sections(with_values(preset, words), inside), rest
 
 
 def parse_options(argv: Sequence[str], prog: str, description: str, options: Options) -> Options:

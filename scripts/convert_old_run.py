@@ -32,6 +32,8 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
     model = config["model"]
     if model["family"] in ("roboscape", "genie") and "departures" not in model:
         upgrade_model(model)
+    if "mask" in model:
+        split_model(model)
     return config
 
 
@@ -57,6 +59,22 @@ def upgrade_model(model: dict[str, Any]) -> None:
         departures["masked_keypoints"] = model["loss"].pop("keypoint_masked_only", True)
         departures["visible_keypoints"] = True
     model["departures"] = departures
+
+
+def split_model(model: dict[str, Any]) -> None:
+    """Makes sections of the settings of RoboScape or Genie that can be off, and drops constants."""
+    mask = model.pop("mask")
+    corruption = {"random_token_rate": mask["random_token_rate"], "probability": mask["corruption_probability"]}
+    model["corruption"] = corruption if any(corruption.values()) else None
+    public = {name: model.pop(name) for name in ("qk_norm", "mup", "mlp_ratio")}
+    model["public_code"] = public if public != {"qk_norm": False, "mup": False, "mlp_ratio": 4} else None
+    departures = model["departures"]
+    departures["more_norms"] = departures.pop("temporal_norm")
+    departures["embedding_std"] = model.pop("position_std")
+    for section, name in ((departures, "final_norm"), (departures, "shift_pixels"), (model, "embed_std")):
+        del section[name]
+    if "loss" in model:
+        del model["loss"]["rgb_weight"]
 
 
 def main() -> None:

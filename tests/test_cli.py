@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.cli import FIRST_FIELDS, main_errors, parse, parse_options
-from rsjax.config import Config, ConfigError, LossConfig, presets
+from rsjax.config import Config, ConfigError, LossConfig, PublicCodeConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError, did_you_mean
 
@@ -90,6 +90,14 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         assert config == with_values(genie, {"model.action_encoder": "none", "model.sample.steps": 3})
 
 
+def test_a_section_is_chosen_by_a_word_and_switched_on_by_a_field_of_its_own() -> None:
+    config, _ = read("debug", "--model.corruption", "off", "--model.public-code.qk-norm", "True")
+    assert config == with_values(
+        presets.get("debug"), {"model.corruption": None, "model.public_code": PublicCodeConfig(qk_norm=True)}
+    )
+    assert read("tiny", "--model.corruption=on") == read("tiny", "--model.corruption.probability", "0.5")
+
+
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
@@ -114,6 +122,9 @@ def test_a_family_is_chosen_before_its_fields_are_set() -> None:
         (["tiny", "--sim.frames", "99", "--model.max-frames", "16"], "99 frames but model.max_frames is 16"),
         (["genie_35m", "--model.use-depth", "True"], "unknown argument '--model.use-depth'"),
         (["debug", "--model", "genie", "--model.loss.gamma", "2"], "unknown argument '--model.loss.gamma'"),
+        (["tiny", "--model.corruption", "0.1"], "--model.corruption is '0.1'; choose on or off"),
+        (["tiny", "--model.corruption"], "--model.corruption is ''; choose on or off"),
+        (["tiny", "--model.corruption.rate", "1"], "unknown argument '--model.corruption.rate'"),
         (["debug", "--model", "geni"], "unknown model 'geni'; did you mean 'genie'? (models: cogvideox, genie, irasim"),
     ],
 )

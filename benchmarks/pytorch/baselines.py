@@ -19,7 +19,7 @@ from rsjax.tools.bench.timing import median_seconds
 
 # Options that the plain Genie lacks, of the model and of its departures.
 OPTIONS = ("qk_norm", "mup")
-DEPARTURES = ("temporal_norm", "final_norm", "read_previous", "rotary")
+DEPARTURES = ("more_norms", "read_previous", "rotary")
 
 
 def check_genie(config: Config) -> None:
@@ -27,7 +27,7 @@ def check_genie(config: Config) -> None:
     model = Architecture.create(config)
     plain = "and the PyTorch baseline is the plain Genie"
     cure = "or leave the baseline out"
-    options = {f"model.{name}": getattr(model, name) for name in OPTIONS}
+    options = {f"model.public_code.{name}": getattr(model.public, name) for name in OPTIONS}
     options |= {f"model.departures.{name}": getattr(model.departures, name) for name in DEPARTURES}
     for name, is_on in options.items():
         require(not is_on, f"{name} is on, {plain}, without it; set it to False, {cure}")

@@ -45,7 +45,7 @@ class STBlock(nn.Module):
         self.norm2 = nn.LayerNorm(config.width)
         self.spatial_attn = Attention(config.width, config.heads)
         self.temporal_attn = Attention(config.width, config.heads)
-        hidden = config.mlp_ratio * config.width
+        hidden = config.public.mlp_ratio * config.width
         layers = {"fc1": nn.Linear(config.width, hidden), "gelu": nn.GELU(), "fc2": nn.Linear(hidden, config.width)}
         self.mlp = nn.Sequential(OrderedDict(layers))
 

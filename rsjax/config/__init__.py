@@ -23,10 +23,11 @@ from rsjax.config.model import ModelConfig, families, register_family
 from rsjax.config.run import Config, EvalConfig
 from rsjax.config.sim import SimConfig
 from rsjax.config.token_model import (
+    CorruptionConfig,
     Departures,
     GenieConfig,
     LossConfig,
-    MaskConfig,
+    PublicCodeConfig,
     RoboScapeConfig,
     SampleConfig,
     TokenModelConfig,
@@ -47,6 +48,7 @@ __all__ = [
     "ComponentConfig",
     "Config",
     "ConfigError",
+    "CorruptionConfig",
     "CurriculumStageConfig",
     "DataConfig",
     "Departures",
@@ -54,9 +56,9 @@ __all__ = [
     "GenieConfig",
     "LoopConfig",
     "LossConfig",
-    "MaskConfig",
     "ModelConfig",
     "OptimizerConfig",
+    "PublicCodeConfig",
     "RoboScapeConfig",
     "RuntimeConfig",
     "SampleConfig",

@@ -91,10 +91,26 @@ def check_numbers(settings: Any, prefix: str = "", dash: bool = False) -> None:
                 require(abs(item) < 2**63, f"{name} is {item}; it must fit in 64 bits")
 
 
+def section_choices(hint: Any) -> dict[str, Any]:
+    """Returns what a section of this declared type may be, a class or None, by the word that chooses it.
+
+    ``X | None`` is "on" or "off". Several classes are chosen by their class variable ``kind``, such as "muon". There
+    are no words without a choice, or if a class has fields without a default.
+    """
+    options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
+    kinds = [kind for kind in options if dataclasses.is_dataclass(kind)]
+    if not kinds or any(f.default is dataclasses.MISSING for kind in kinds for f in dataclasses.fields(kind)):
+        return {}
+    words: dict[str, Any] = {getattr(kind, "kind", "on"): kind for kind in kinds}
+    if type(None) in options:
+        words["off"] = None
+    return words
+
+
 def to_dict(config: Any) -> dict[str, Any]:
-    """Returns a config as JSON-ready values; a model's settings include the name of its ``family``."""
+    """Returns a config as JSON-ready values, with the ``family`` or ``kind`` that tells a section's class."""
     values = {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    return ({"family": config.family} if hasattr(config, "family") else {}) | values
+    return {name: getattr(config, name) for name in ("family", "kind") if hasattr(config, name)} | values
 
 
 def _plain(value: Any) -> Any:
@@ -116,6 +132,8 @@ def from_dict(kind: type[T], values: dict[str, Any]) -> T:
         kind, values = typing.cast(Any, kind).chosen(values)
     declared = typing.get_type_hints(kind)
     hints = {f.name: declared[f.name] for f in dataclasses.fields(typing.cast(Any, kind))}
+    if "kind" not in hints and hasattr(kind, "kind"):
+        values = {name: value for name, value in values.items() if name != "kind"}
     unknown = set(values) - set(hints)
     require(not unknown, f"{kind.__name__} has no field {', '.join(sorted(unknown))}; the file is of another version")
     return kind(**{name: _read(f"{kind.__name__}.{name}", hints[name], value) for name, value in values.items()})
@@ -136,8 +154,14 @@ def _read(name: str, hint: Any, value: Any) -> Any:
     if typing.get_origin(hint) is typing.Literal:
         expect(value in kinds, f"one of {', '.join(map(str, kinds))}")
     elif typing.get_origin(hint) in (typing.Union, types.UnionType):
-        if not (value is None and type(None) in kinds):
-            return _read(name, next(kind for kind in kinds if kind is not type(None)), value)
+        if value is None and type(None) in kinds:
+            return None
+        choices = section_choices(hint)
+        if choices and "on" not in choices:
+            word = str(value.get("kind")) if isinstance(value, dict) else ""
+            expect(word in choices, f"fields with a kind, {' or '.join(choices)}")
+            return _read(name, choices[word], value)
+        return _read(name, next(kind for kind in kinds if kind is not type(None)), value)
     elif hint in _JSON_KINDS:
         text, allowed = _JSON_KINDS[hint]
         expect(type(value) in allowed, text)

@@ -1,25 +1,37 @@
 """Settings of the families that predict tokens, RoboScape and Genie: masking, sampling, losses and the network."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rsjax.config.data import ClipShape
 from rsjax.config.fields import loss_weights, require, require_range, runtime, sampling
 from rsjax.config.model import ModelConfig, register_family
 
+SHIFT_PIXELS = 4  # how far the copies of Departures.shifts are moved at most: the side of a token in ``tiny``
+
 
 @dataclass(frozen=True)
-class MaskConfig:
-    """Masking and corruption of training tokens, as in the public Genie (reference: 1xgpt).
-
-    Rates are probabilities; see :mod:`rsjax.models.roboscape.masking` for the recipe's three steps.
-    """
+class CorruptionConfig:
+    """Random codes among the training tokens, as in the public Genie (:mod:`rsjax.models.roboscape.masking`)."""
 
     random_token_rate: float = 0.2  # step 1: u·rate of all sub-tokens are replaced, u ~ U(0, 1)
-    corruption_probability: float = 0.5  # step 2 applies to this share of the batches
-    corruption_keep: float = 0.25  # step 2: r ~ U(keep, 1) of a frame's sub-tokens survive …
-    corruption_decay: float = 0.9  # … and r shrinks by U(decay, 1) with every frame
+    probability: float = 0.5  # step 2 applies to this share of the batches
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.corruption", 0, 1, "random_token_rate", "probability")
+
+
+@dataclass(frozen=True)
+class PublicCodeConfig:
+    """Options of the public Genie that published weights may use; ``experiments.convert`` sets them."""
+
+    qk_norm: bool = False  # one LayerNorm normalises each head's queries and keys, in place of norm1 and norm2
+    mup: bool = False  # attention scale 8/head width instead of 1/√(head width); the heads' input ÷ (width/256)
+    mlp_ratio: int = 4  # width of an MLP's hidden layer, in widths of the model
+
+    def __post_init__(self) -> None:
+        require_range(self, "model.public_code", 1, math.inf, "mlp_ratio")
 
 
 @dataclass(frozen=True)
@@ -47,15 +59,16 @@ class Departures:
     # Temporal queries and keys are rotated, and a rollout can go on beyond the trained frames with a rolling cache;
     # positions within a frame stay learned.
     rotary: bool = False
-    # Norms before temporal attention and before the heads: small models trained for few steps learn faster with both.
-    temporal_norm: bool = False
-    final_norm: bool = False
+    # Norms before temporal attention and before the heads: small models trained for few steps learn faster with them.
+    more_norms: bool = False
+    # Token, position and mask embeddings begin as N(0, this²); 0: tokens as N(0, 1), the others at 0, as in the public
+    # code.
+    embedding_std: float = 0.0
 
     # Training.
-    # Copies of each training clip, moved by up to shift_pixels. A step draws one of them or the clip. Few clips last
-    # longer with copies: a scene that is moved by less than a token has new tokens everywhere.
+    # Copies of each training clip, moved by a few pixels. A step draws one of them or the clip. Few clips last longer
+    # with copies: a scene that is moved by less than a token has new tokens everywhere.
     shifts: int = 0
-    shift_pixels: int = 4
     # The share of the clips in which all frames before a random one stay visible, as past frames are in sampling.
     visible_prefix: float = 0.0
     # With whole_frames: after self_conditioning_after steps, in this share of the steps, every frame is predicted from
@@ -75,7 +88,7 @@ class Departures:
 
     def __post_init__(self) -> None:
         require_range(self, "model.departures", 0, 1, "visible_prefix", "self_conditioning")
-        require_range(self, "model.departures", 0, math.inf, "shifts", "shift_pixels", "self_conditioning_after")
+        require_range(self, "model.departures", 0, math.inf, "shifts", "embedding_std", "self_conditioning_after")
         require(
             0 <= self.action_dropout < 1,
             f"model.departures.action_dropout is {self.action_dropout}; it is a share of the clips, at least 0 and "
@@ -158,10 +171,9 @@ def check_sampling(sample: SampleConfig, positions: int, action_dropout: float) 
 class LossConfig:
     """Eq. 8: L = L_RGB + λ₁·L_Depth + λ₂·L_Keypoint + λ₃·L_Attention.
 
-    A field ``NAME_weight`` weighs the term NAME; 0 switches it off.
+    A field ``NAME_weight`` weighs the term NAME; 0 switches it off. L_RGB has the weight 1.
     """
 
-    rgb_weight: float = 1.0
     depth_weight: float = 1.0  # λ₁
     keypoint_weight: float = 0.01  # λ₂
     attention_weight: float = 1.0  # λ₃
@@ -183,13 +195,6 @@ class TransformerConfig:
     width: int = 256
     blocks: int = 32
     heads: int = 8
-    mlp_ratio: int = 4
-    # Options of the public code that published weights may use. qk_norm: one LayerNorm normalises each head's queries
-    # and keys; the norms before spatial attention and the MLP are then absent.
-    qk_norm: bool = False
-    mup: bool = False  # attention scale 8/head width instead of 1/√(head width); the heads' input ÷ (width/256)
-    embed_std: float = 1.0  # token embeddings ~ N(0, std²); 1 as in the public code (torch's default)
-    position_std: float = 0.0  # position and mask embeddings ~ N(0, std²); 0 as in the public code
     # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
     # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units still
     # multiply linear layers in float32, which is faster there.
@@ -198,10 +203,11 @@ class TransformerConfig:
     # What the backward pass recomputes. none: nothing. blocks: everything but each block's input. products: the same,
     # but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
+    public_code: PublicCodeConfig | None = None
     departures: Departures = Departures()
 
     def __post_init__(self) -> None:
-        for name in ("width", "blocks", "heads", "mlp_ratio", "unroll"):
+        for name in ("width", "blocks", "heads", "unroll"):
             require(getattr(self, name) >= 1, f"model.{name} is {getattr(self, name)}; it must be at least 1")
         require(
             self.width % self.heads == 0,
@@ -224,6 +230,11 @@ class TransformerConfig:
         """Channels of one attention head."""
         return self.width // self.heads
 
+    @property
+    def public(self) -> PublicCodeConfig:
+        """The options of the public code, which are all off without ``public_code``."""
+        return self.public_code or PublicCodeConfig()
+
 
 @dataclass(frozen=True)
 class TokenModelConfig(TransformerConfig, ModelConfig):
@@ -235,7 +246,7 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
 
     uses_tokenizer: ClassVar[bool] = True
     max_frames: int = 0
-    mask: MaskConfig = MaskConfig()
+    corruption: CorruptionConfig | None = CorruptionConfig()  # off: models of few steps lose more than they gain
     sample: SampleConfig = sampling(SampleConfig())
 
     @property
@@ -254,10 +265,9 @@ class TokenModelConfig(TransformerConfig, ModelConfig):
     def token_shifts(self) -> tuple[int, ...]:
         if not self.departures.shifts:
             return ()
-        return self.departures.shifts, self.departures.shift_pixels
+        return self.departures.shifts, SHIFT_PIXELS
 
     def check(self, clips: ClipShape) -> None:
-        require_range(self.mask, "model.mask", 0, 1, *(f.name for f in fields(MaskConfig)))
         require(
             clips.frames <= self.frames(clips),
             f"clips have {clips.frames} frames but model.max_frames is {self.max_frames}; shorten the clips, or set "
@@ -286,7 +296,7 @@ class RoboScapeConfig(TokenModelConfig):
     def loss_weights(self) -> dict[str, float]:
         off = set() if self.use_depth else {"depth"}
         off |= set() if self.loss.use_keypoints else {"keypoint", "attention"}
-        return {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
+        return {"rgb": 1.0} | {name: weight for name, weight in loss_weights(self.loss).items() if name not in off}
 
 
 @register_family("genie")

@@ -76,7 +76,10 @@ def test_the_key_covers_the_family() -> None:
 
 
 def test_the_key_tells_parts_and_their_order_apart() -> None:
-    keys = [c.content_key(*parts) for parts in ((), (1,), ("1",), (1, 2), (2, 1), (c.MaskConfig(),), (c.EvalConfig(),))]
+    keys = [
+        c.content_key(*parts)
+        for parts in ((), (1,), ("1",), (1, 2), (2, 1), (c.CorruptionConfig(),), (c.EvalConfig(),))
+    ]
     assert len(set(keys)) == len(keys)
     assert all(len(key) == 16 and int(key, 16) >= 0 for key in keys)
 
@@ -150,7 +153,7 @@ def test_a_stored_value_of_another_type_is_refused_by_name(path: str, value: Any
         ("train.optimizer", {"learning_rate": -1e-3}, "optimizer.learning_rate is -0.001; it must be at least 0"),
         ("train.optimizer", {"betas": (0.9, 1.5)}, "optimizer.betas are (0.9, 1.5); they are two numbers"),
         ("model.loss", {"depth_weight": math.nan}, "model.loss.depth_weight is nan; it must be a finite"),
-        ("model.mask", {"corruption_decay": -math.inf}, "model.mask.corruption_decay is -inf; it must be a finite"),
+        ("model.corruption", {"probability": -math.inf}, "model.corruption.probability is -inf; it must be 0 … 1"),
         ("train", {"ema": math.nan}, "train.ema is nan; it must be 0 … 1"),
         ("runtime", {"max_damaged": 2.0}, "runtime.max_damaged is 2.0; it must be 0 … 1"),
         ("runtime", {"log_every": 2**63}, "runtime.log_every is 9223372036854775808; it must fit in 64 bits"),

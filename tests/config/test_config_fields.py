@@ -1,12 +1,13 @@
 import dataclasses
-from typing import Any
+import json
+from typing import Any, ClassVar, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsjax.config import Config, ConfigError, from_dict, presets, to_dict
-from rsjax.config.config_fields import config_fields, with_values
+from rsjax.config import Config, ConfigError, content_key, from_dict, presets, to_dict
+from rsjax.config.config_fields import config_fields, with_sections, with_values
 
 DEBUG = presets.debug()
 
@@ -23,7 +24,8 @@ def test_config_fields_are_the_configurations_json_by_dotted_names() -> None:
     known = config_fields(DEBUG)
     saved = flat(to_dict(DEBUG))
     for name, field in known.items():
-        assert saved[name] == (list(field.value) if isinstance(field.value, tuple) else field.value)
+        if not field.section:
+            assert saved[name] == (list(field.value) if isinstance(field.value, tuple) else field.value)
     assert set(saved) - set(known) == {"model.family"}
     assert known["runtime.log_every"].runtime
     assert not known["train.steps"].runtime
@@ -63,6 +65,62 @@ def test_fields_that_only_fit_together_are_set_together() -> None:
     for alone in ({"model.width": 33}, {"tokenizer.code_bits": 9}):
         with pytest.raises(ConfigError):
             with_values(DEBUG, alone)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slow:
+    kind: ClassVar[str] = "slow"
+    rate: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Fast:
+    kind: ClassVar[str] = "fast"
+    rate: float = 2.0
+    drops: tuple[int, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    driver: Slow | Fast = Fast()
+    extra: Slow | None = None
+
+
+def test_a_section_of_which_there_is_a_choice_is_a_field_with_the_word_that_chooses_it() -> None:
+    known = config_fields(Parts())
+    assert {name: field.value for name, field in known.items()} == {
+        "driver": "fast",
+        "driver.rate": 2.0,
+        "driver.drops": (),
+        "extra": "off",
+    }
+    assert [name for name, field in known.items() if field.section] == ["driver", "extra"]
+    assert get_args(known["driver"].kind) == ("slow", "fast")
+    assert get_args(known["extra"].kind) == ("on", "off")
+
+
+def test_a_section_is_changed_by_its_word_by_itself_or_by_a_field_in_it() -> None:
+    parts = Parts(driver=Fast(rate=3.0, drops=(1,)))
+    assert with_values(parts, {"driver": "fast"}) == parts
+    assert with_values(parts, {"driver": "slow"}) == Parts(Slow(rate=3.0)), "shared fields stay"
+    assert with_values(parts, {"driver": "slow", "driver.rate": 4.0}) == Parts(Slow(rate=4.0))
+    assert with_values(parts, {"driver": Slow()}) == Parts(Slow())
+    assert with_values(parts, {"extra": "on"}).extra == with_values(parts, {"extra.rate": 1.0}).extra == Slow()
+    assert with_values(Parts(extra=Slow()), {"extra": "off"}) == with_values(Parts(), {"extra": None}) == Parts()
+    assert with_sections(Parts(), ["extra.rate", "driver.rate"]) == Parts(extra=Slow())
+
+
+@pytest.mark.parametrize("parts", [Parts(), Parts(Slow(rate=3.0), Slow())])
+def test_sections_survive_json(parts: Parts) -> None:
+    assert from_dict(Parts, json.loads(json.dumps(to_dict(parts)))) == parts
+    assert content_key(Parts(Slow())) != content_key(Parts(Fast(rate=1.0)))
+
+
+def test_a_section_of_no_known_kind_is_refused() -> None:
+    for driver in ({"rate": 1.0}, {"kind": "quick"}, 3):
+        with pytest.raises(ConfigError) as caught:
+            from_dict(Parts, {"driver": driver})
+        assert "Parts.driver must be fields with a kind, slow or fast" in str(caught.value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,11 +9,12 @@ import pytest
 from rsjax.config import (
     Config,
     ConfigError,
+    CorruptionConfig,
     Departures,
     GenieConfig,
     LossConfig,
-    MaskConfig,
     ModelConfig,
+    PublicCodeConfig,
     RoboScapeConfig,
     SampleConfig,
     families,
@@ -25,9 +26,8 @@ from rsjax.config import (
 
 DEBUG = presets.debug()
 CHANGED = (
-    RoboScapeConfig(
-        width=32, use_depth=False, loss=LossConfig(gamma=2.0), mask=MaskConfig(corruption_keep=0.5), max_frames=9
-    ),
+    RoboScapeConfig(width=32, use_depth=False, loss=LossConfig(gamma=2.0), corruption=None, max_frames=9),
+    RoboScapeConfig(corruption=CorruptionConfig(probability=0.1), public_code=PublicCodeConfig(qk_norm=True)),
     GenieConfig(action_encoder="none", heads=2, sample=SampleConfig(steps=3, cache_dtype="bfloat16")),
 )
 
@@ -48,10 +48,11 @@ def test_every_family_survives_json(model: ModelConfig) -> None:
 
 
 def test_a_family_keeps_changed_fields_and_its_own_defaults_for_the_others() -> None:
-    mask, sample = MaskConfig(random_token_rate=0.1), SampleConfig(steps=5)
-    config = replace(DEBUG, model=RoboScapeConfig(width=64, heads=4, use_depth=False, mask=mask, sample=sample))
+    corruption, sample = CorruptionConfig(random_token_rate=0.1), SampleConfig(steps=5)
+    shared: dict[str, Any] = {"width": 64, "heads": 4, "corruption": corruption, "sample": sample}
+    config = replace(DEBUG, model=RoboScapeConfig(use_depth=False, **shared))
     genie = config.with_family("genie")
-    assert genie == replace(config, model=GenieConfig(width=64, heads=4, mask=mask, sample=sample))
+    assert genie == replace(config, model=GenieConfig(**shared))
     # The action encoder is at RoboScape's default, so it becomes Genie's; set on purpose, it is kept.
     assert (RoboScapeConfig().action_encoder, GenieConfig().action_encoder) == ("linear", "mlp")
     assert genie.with_family("roboscape") == replace(config, model=replace(config.model, use_depth=True))  # type: ignore[call-arg]
@@ -127,7 +128,7 @@ def test_own_frames_need_whole_frames_and_are_a_share() -> None:
         replace(whole, self_conditioning_after=-1)
 
 
-@pytest.mark.parametrize("name", ["random_token_rate", "corruption_probability", "corruption_decay"])
-def test_rates_of_masks_are_shares_not_percentages(name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"model.mask.{name} is 20; it must be 0 … 1"):
-        replace(DEBUG, model=RoboScapeConfig(mask=MaskConfig(**{name: 20})))  # type: ignore[arg-type]
+@pytest.mark.parametrize("name", ["random_token_rate", "probability"])
+def test_rates_of_corruption_are_shares_not_percentages(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"model.corruption.{name} is 20; it must be 0 … 1"):
+        CorruptionConfig(**{name: 20})

@@ -26,7 +26,7 @@ class Attention(nn.Module):
         bf16 = cfg.compute_dtype == "bfloat16"
         self.qkv = Dense(3 * cfg.width, bf16, use_bias=False)
         self.proj = Dense(cfg.width, bf16)
-        if cfg.qk_norm:
+        if cfg.public.qk_norm:
             self.norm = layer_norm(None)
 
     def spatial(self, x: Float[Array, "B T S C"]) -> Float[Array, "B T S C"]:
@@ -80,9 +80,9 @@ class Attention(nn.Module):
 
     def _project(self, x: Float[Array, "*N C"]) -> tuple[Float[Array, "*N C"], ...]:
         q, k, v = jnp.split(self.qkv(x), 3, axis=-1)
-        if self.config.qk_norm:
+        if self.config.public.qk_norm:
             q, k = (self.norm(self._heads(y)).reshape(y.shape) for y in (q, k))
-        if self.config.mup:
+        if self.config.public.mup:
             # Together with attend's 1/√e this scales by 8/e, after the norm as in the public code.
             q = q * (8 * self.config.head_width**-0.5)
         return q, k, v

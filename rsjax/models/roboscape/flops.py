@@ -17,7 +17,7 @@ def forward_flops(config: Architecture, frames: int) -> int:
     cells = config.grid**2
     width = config.width
     branches = 2 if config.use_depth else 1
-    linear = 8 * width**2 + 2 * config.mlp_ratio * width**2  # qkv and proj of both attentions, fc1 and fc2
+    linear = 8 * width**2 + 2 * config.public.mlp_ratio * width**2  # qkv and proj of both attentions, fc1 and fc2
     attention = 2 * (cells + frames) * width  # scores and weighted sums, over space and over time
     head = width * config.vocabularies * config.vocabulary_size
     joint = width**2 * config.blocks if config.use_depth else 0  # depth → RGB

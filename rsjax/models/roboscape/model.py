@@ -78,7 +78,7 @@ class RoboScape(WorldModel[Batch]):
         departures = self.config.departures
         targets = {branch: getattr(batch, branch) for branch in arch.branches}
         corrupted = masking.corrupt(
-            self.config.mask,
+            self.config.corruption,
             departures.visible_prefix,
             self.prompt_frames,
             arch.code_bits,

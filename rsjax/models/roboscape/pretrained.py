@@ -21,12 +21,10 @@ from rsjax.models.saved import check_family
 from rsjax.trainable import Params
 
 # Departures in which the saved network and the one to train must agree; other departures may differ.
-ALIKE = {"read_previous", "whole_frames", "rotary", "temporal_norm", "final_norm"}
+ALIKE = {"read_previous", "whole_frames", "rotary", "more_norms"}
 # Fields that may differ.
 FREE = {"use_depth", "action_encoder", "action_inputs", "departures"} | {
     "compute_dtype",
-    "embed_std",
-    "position_std",
     *(field.name for field in fields(TransformerConfig) if field.metadata.get("runtime")),
 }
 

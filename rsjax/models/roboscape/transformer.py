@@ -45,7 +45,7 @@ class TokenEmbed(nn.Module):
     @nn.compact
     def __call__(self, cells: Cells, mask: Bool[Array, "B T S"]) -> Float[Array, "B T S C"]:
         cfg = self.config
-        init = nn.initializers.normal(cfg.embed_std)
+        init = nn.initializers.normal(cfg.departures.embedding_std or 1.0)
         tables = [
             nn.Embed(cfg.vocabulary_size, cfg.width, embedding_init=init, name=f"factored_embed_{k}")
             for k in range(cfg.vocabularies)
@@ -58,14 +58,14 @@ class TokenEmbed(nn.Module):
             codes = jnp.arange(cfg.vocabulary_size)
             mean = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)  # a token's code embeds as the token does
             embedded = sum(mean(shares[..., k, :], table(codes)) for k, table in enumerate(tables))
-        mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.position_std), (cfg.width,))
+        mask_embed = self.param("mask_token_embed", nn.initializers.normal(cfg.departures.embedding_std), (cfg.width,))
         return jnp.where(mask[..., None], mask_embed, embedded)
 
 
 class STBlock(nn.Module):
     """x += Spatial(norm1 x); x += Temporal(x); x += MLP(norm2 x), as in the public Genie.
 
-    The departure ``temporal_norm`` adds a norm before temporal attention; ``config.qk_norm`` removes norm1 and norm2.
+    The departure ``more_norms`` adds a norm before temporal attention; ``public_code.qk_norm`` removes norm1 and norm2.
     GELU is exact.
     """
 
@@ -75,13 +75,13 @@ class STBlock(nn.Module):
     def __call__(self, x: Features, start: Any, cache: KeyValues | None) -> tuple[Features, KeyValues | None]:
         cfg = self.config
         bf16 = cfg.compute_dtype == "bfloat16"
-        normed = optional_norm(not cfg.qk_norm, "norm1", x)
+        normed = optional_norm(not cfg.public.qk_norm, "norm1", x)
         x = x + Attention(cfg, name="spatial_attn").spatial(normed)
-        normed = optional_norm(cfg.departures.temporal_norm, "norm_temporal", x)
+        normed = optional_norm(cfg.departures.more_norms, "norm_temporal", x)
         out, cache = Attention(cfg, name="temporal_attn").temporal(normed, start, cache)
         x = x + out
-        normed = optional_norm(not cfg.qk_norm, "norm2", x)
-        inner = gelu(Dense(cfg.mlp_ratio * cfg.width, bf16, name="fc1")(normed))
+        normed = optional_norm(not cfg.public.qk_norm, "norm2", x)
+        inner = gelu(Dense(cfg.public.mlp_ratio * cfg.width, bf16, name="fc1")(normed))
         return x + Dense(cfg.width, bf16, name="fc2")(inner), cache
 
 
@@ -196,7 +196,7 @@ class Transformer(nn.Module):
         if not cfg.departures.rotary and frames + (start if isinstance(start, int) else 0) > cfg.frames:
             raise ValueError(f"{frames} frames from {start} on; the model has learned positions for {cfg.frames}")
         learned = 1 if cfg.departures.rotary else cfg.frames
-        init = nn.initializers.normal(cfg.position_std)
+        init = nn.initializers.normal(cfg.departures.embedding_std)
         position = self.param("pos_embed", init, (learned, cfg.grid**2, cfg.width))
         if cfg.departures.rotary:
             return position
@@ -219,8 +219,8 @@ class Transformer(nn.Module):
 
     def _head(self, branch: str, x: Float[Array, "B T S C"]) -> Float[Array, "B T S n V"]:
         cfg = self.config
-        x = optional_norm(cfg.departures.final_norm, f"{branch}_norm_out", x)
-        if cfg.mup:
+        x = optional_norm(cfg.departures.more_norms, f"{branch}_norm_out", x)
+        if cfg.public.mup:
             x = x / (cfg.width / MUP_WIDTH)
         bf16 = cfg.compute_dtype == "bfloat16"
         logits = Dense(cfg.vocabularies * cfg.vocabulary_size, bf16, name=f"{branch}_head")(x)

@@ -108,16 +108,16 @@ def bandwidth(budget: float) -> float:
 def operations(arch: Architecture, config: Config, batch: int) -> tuple[Operation, ...]:
     """Returns the operations of a training step's forward pass, without rematerialisation and without embeddings."""
     width = arch.width
-    hidden = arch.mlp_ratio * arch.width
+    hidden = arch.public.mlp_ratio * arch.width
     heads = arch.heads
     frames = config.clips.frames
     cells = arch.grid**2
     blocks = arch.blocks * len(arch.branches)
     rows = batch * frames * cells
     bf16 = arch.compute_dtype == "bfloat16"
-    norms = blocks * ((4 if arch.qk_norm else 2) + arch.departures.temporal_norm) + arch.departures.final_norm * len(
-        arch.branches
-    )
+    norms = blocks * (4 if arch.public.qk_norm else 2)
+    if arch.departures.more_norms:
+        norms += blocks + len(arch.branches)
     joint = arch.blocks if arch.use_depth else 0  # depth → RGB
 
     def product(name: str, times: int, inputs: int, outputs: int) -> Operation:

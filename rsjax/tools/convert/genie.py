@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 
-from rsjax.config import ConfigError
+from rsjax.config import ConfigError, PublicCodeConfig
 from rsjax.files import read_json
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -63,13 +63,13 @@ def table(config: Architecture) -> Table:
     for i in range(config.blocks):
         layer = f"decoder.layers.{i}"
         path = "blocks/rgb"
-        if not config.qk_norm:
+        if not config.public.qk_norm:
             entries += norm(f"{layer}.norm1", f"{path}/norm1", i) + norm(f"{layer}.norm2", f"{path}/norm2", i)
         for name in ("spatial_attn", "temporal_attn"):
             # Both sides order the rows (3, heads, head width), so a transpose is enough.
             entries.append(Entry(f"{layer}.{name}.qkv.weight", f"{path}/{name}/qkv/kernel", "linear", i))
             entries += weight_and_bias(f"{layer}.{name}.proj", f"{path}/{name}/proj", "linear", i)
-            if config.qk_norm:
+            if config.public.qk_norm:
                 entries += norm(f"{layer}.{name}.norm", f"{path}/{name}/norm", i)
         for name in ("fc1", "fc2"):
             entries += weight_and_bias(f"{layer}.mlp.{name}", f"{path}/{name}", "linear", i)
@@ -134,6 +134,11 @@ def infer_config(
             f"put the published {SETTINGS} beside the file, or set --heads (8 in the public models)"
         )
     try:
+        public = PublicCodeConfig(
+            qk_norm=shared in tensors,
+            mup=settings.get("use_mup") or False,
+            mlp_ratio=max(1, shape(hidden, 2)[0] // width),
+        )
         config = Architecture(
             frames=frames,
             grid=math.isqrt(cells),
@@ -144,10 +149,8 @@ def infer_config(
             width=width,
             blocks=blocks,
             heads=heads,
-            mlp_ratio=max(1, shape(hidden, 2)[0] // width),
             use_depth=False,
-            qk_norm=shared in tensors,
-            mup=settings.get("use_mup") or False,
+            public_code=None if public == PublicCodeConfig() else public,
         )
     except ConfigError as error:
         raise ConvertError(f"{source}: the network inferred from its tensors cannot be built: {error}") from error
@@ -178,13 +181,13 @@ def settings_of(config: Architecture) -> dict[str, Any]:
         "T": config.frames,
         "S": config.grid**2,
         "image_vocab_size": 2**config.code_bits,
-        "use_mup": config.mup,
+        "use_mup": config.public.mup,
         "num_factored_vocabs": config.vocabularies,
         "factored_vocab_size": config.vocabulary_size,
         **FIXED,
         "attn_drop": 0.0,
-        "qk_norm": config.qk_norm,
-        "mlp_ratio": float(config.mlp_ratio),
+        "qk_norm": config.public.qk_norm,
+        "mlp_ratio": float(config.public.mlp_ratio),
         "mlp_drop": 0.0,
     }
 

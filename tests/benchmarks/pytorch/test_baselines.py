@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from benchmarks.pytorch.baselines import check_torch, torch_baseline
-from rsjax.config import Config, ConfigError, Departures, presets
+from rsjax.config import Config, ConfigError, Departures, PublicCodeConfig, presets
 from rsjax.config.config_fields import with_values
 from rsjax.errors import UserError
 from rsjax.tools.bench.run import bench
@@ -21,13 +21,13 @@ def toy(**model: Any) -> Config:
 @pytest.mark.parametrize(
     ("config", "line"),
     [
-        (presets.get("tiny"), "model.departures.temporal_norm is on"),
-        (toy(departures=Departures(final_norm=True)), "model.departures.final_norm is on"),
-        (toy(qk_norm=True), "model.qk_norm is on"),
-        (toy(mup=True), "model.mup is on"),
+        (presets.get("tiny"), "model.departures.more_norms is on"),
+        (toy(departures=Departures(more_norms=True)), "model.departures.more_norms is on"),
+        (toy(public_code=PublicCodeConfig(qk_norm=True)), "model.public_code.qk_norm is on"),
+        (toy(public_code=PublicCodeConfig(mup=True)), "model.public_code.mup is on"),
         (toy(departures=Departures(rotary=True)), "model.departures.rotary is on"),
     ],
-    ids=["tiny", "final_norm", "qk_norm", "mup", "rotary"],
+    ids=["tiny", "more_norms", "qk_norm", "mup", "rotary"],
 )
 def test_a_model_that_torch_lacks_is_refused(config: Config, line: str) -> None:
     with pytest.raises(ConfigError, match=line):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import OptimizerConfig, TokenizerConfig
+from rsjax.config import Departures, OptimizerConfig, TokenizerConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import magvit2
@@ -17,7 +17,15 @@ from rsjax.tools.convert.tokenizer import table
 torch = pytest.importorskip("torch")
 
 TOY = Architecture(
-    frames=3, grid=4, code_bits=8, action_inputs=0, width=24, blocks=2, heads=3, use_depth=False, position_std=0.5
+    frames=3,
+    grid=4,
+    code_bits=8,
+    action_inputs=0,
+    width=24,
+    blocks=2,
+    heads=3,
+    use_depth=False,
+    departures=Departures(embedding_std=0.5),
 )
 
 

@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from rsjax.config import PublicCodeConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.flops import forward_flops
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers.flops import products
 
+NARROW = PublicCodeConfig(mlp_ratio=2)
 DUAL = Architecture(frames=5, grid=3, code_bits=8, action_inputs=3, width=32, blocks=3, heads=2)
 
 
@@ -34,7 +36,11 @@ def xla_flops(function: Any, *inputs: Any) -> float:
 
 @pytest.mark.parametrize(
     "config",
-    [DUAL, replace(DUAL, use_depth=False, action_inputs=0), replace(DUAL, mlp_ratio=2, vocabularies=1)],
+    [
+        DUAL,
+        replace(DUAL, use_depth=False, action_inputs=0),
+        replace(DUAL, public_code=NARROW, vocabularies=1),
+    ],
     ids=["dual", "genie", "other shapes"],
 )
 def test_a_pass_of_the_world_model_is_the_formula_to_the_letter(config: Architecture) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Config, GenieConfig, LossConfig, MaskConfig, RoboScapeConfig, presets
+from rsjax.config import Config, CorruptionConfig, GenieConfig, LossConfig, RoboScapeConfig, presets
 from rsjax.models.base import create_model
 from rsjax.models.genie.model import Genie
 from rsjax.models.roboscape.architecture import Architecture
@@ -78,8 +78,8 @@ def test_training_can_move_the_last_layer_away_from_zero(fresh: Params) -> None:
 
 @pytest.mark.parametrize("encoder", ["none", "mlp"])
 def test_its_parameters_and_loss_are_those_of_the_rgb_branch(encoder: Any) -> None:
-    mask = MaskConfig(corruption_probability=1.0)
-    small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "mask": mask, "action_encoder": encoder}
+    corruption = CorruptionConfig(probability=1.0)
+    small: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 2, "corruption": corruption, "action_encoder": encoder}
     genie = create_model(debug(GenieConfig(**small)))
     loss = LossConfig(use_keypoints=False)
     alone = create_model(debug(RoboScapeConfig(use_depth=False, loss=loss, **small)))

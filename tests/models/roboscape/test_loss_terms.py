@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Departures, LossConfig, MaskConfig, RoboScapeConfig
+from rsjax.config import CorruptionConfig, Departures, LossConfig, RoboScapeConfig
 from rsjax.models.roboscape import keypoints as kp
 from rsjax.models.roboscape import masking
 from rsjax.models.roboscape.architecture import Architecture
@@ -20,13 +20,13 @@ from rsjax.trainable import StepContext, Term, combine
 from tests.models.roboscape.toy import depart, roboscape
 
 MODEL = Architecture(frames=4, grid=2, code_bits=4, action_inputs=3, width=8, blocks=1, heads=2)
-MASK, LOSS = MaskConfig(), LossConfig(num_keypoints=3)
+CORRUPTION, LOSS = CorruptionConfig(), LossConfig(num_keypoints=3)
 KEY, CONTEXT = jax.random.key(3), StepContext(jnp.int32(0), None, None)
 
 
 def model_of(architecture: Architecture, loss: LossConfig) -> RoboScape:
     departures = architecture.departures
-    config = RoboScapeConfig(use_depth=architecture.use_depth, departures=departures, loss=loss, mask=MASK)
+    config = RoboScapeConfig(use_depth=architecture.use_depth, departures=departures, loss=loss, corruption=CORRUPTION)
     return roboscape(architecture, config)
 
 
@@ -73,7 +73,7 @@ def test_each_branch_is_scored_on_its_own_clean_tokens_where_masked(has_depth: t
     has = np.ones(3, np.float32) if has_depth is None else np.array(has_depth, np.float32)
     batch = batch.replace(has_depth=None if has_depth is None else has)  # type: ignore[attr-defined]
     clean = {name: jnp.asarray(getattr(batch, name)) for name in MODEL.branches}
-    corrupt = jax.jit(partial(masking.corrupt, MASK, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
+    corrupt = jax.jit(partial(masking.corrupt, CORRUPTION, 0.0, 1, MODEL.code_bits, MODEL.vocabularies))
     given = corrupt(KEY, clean, batch.index)
     inputs = (given.tokens, given.mask, batch.actions)
     logits, _ = jax.jit(Transformer(MODEL).apply)({"params": params}, *inputs, no_depth=has == 0)

@@ -8,19 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsjax.config import MaskConfig
+from rsjax.config import CorruptionConfig
 from rsjax.models.roboscape.departures.action_dropout import dropped_actions
 from rsjax.models.roboscape.masking import Masked, corrupt
 
 T, GRID, BITS, VOCABULARIES = 10, 8, 18, 2
 BATCHES, CLIPS = 64, 16
-STEP_1 = MaskConfig(corruption_probability=0.0)
-STEP_2 = MaskConfig(random_token_rate=0.0)
+STEP_1 = CorruptionConfig(probability=0.0)
+STEP_2 = CorruptionConfig(random_token_rate=0.0)
 PROMPT = {STEP_1: 1, STEP_2: 4}  # frames given at generation
 
 
 @partial(jax.jit, static_argnums=(0, 4))
-def corrupt_one(config: MaskConfig, key: jax.Array, tokens: Any, index: Any, prefix: float = 0.0) -> Masked:
+def corrupt_one(config: CorruptionConfig, key: jax.Array, tokens: Any, index: Any, prefix: float = 0.0) -> Masked:
     return corrupt(config, prefix, PROMPT[config], BITS, VOCABULARIES, key, tokens, index)
 
 
@@ -33,7 +33,7 @@ def clean(clips: int, branches: tuple[str, ...] = ("rgb", "depth")) -> dict[str,
 
 
 @cache
-def run(config: MaskConfig, prefix: float = 0.0) -> tuple[Masked, dict[str, np.ndarray], np.ndarray]:
+def run(config: CorruptionConfig, prefix: float = 0.0) -> tuple[Masked, dict[str, np.ndarray], np.ndarray]:
     """Many batches: corrupted tokens and masks, the clean tokens, and which sub-tokens of RGB have changed."""
     tokens = clean(CLIPS)
     keys = jax.random.split(jax.random.key(1), BATCHES)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import GenieConfig, presets, to_dict
+from rsjax.config import GenieConfig, PublicCodeConfig, presets, to_dict
 from rsjax.errors import UserError
 from rsjax.models.roboscape import pretrained
 from rsjax.models.roboscape.architecture import Architecture
@@ -20,6 +20,8 @@ from tests.models.roboscape.toy import depart
 from tests.tools.convert.public import genie_shapes, random_tensors
 
 ALONE = Architecture(frames=3, grid=2, code_bits=4, action_inputs=0, width=8, blocks=2, heads=2, use_depth=False)
+BOTH = PublicCodeConfig(qk_norm=True, mup=True)
+MUP = PublicCodeConfig(mup=True)
 DUAL = depart(replace(ALONE, use_depth=True, action_inputs=5), action_dropout=0.1)
 
 
@@ -56,14 +58,19 @@ def public(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"qk_norm": True, "mup": True}, {"compute_dtype": "bfloat16"}, {"action_encoder": "mlp"}],
+    [
+        {},
+        {"public_code": BOTH},
+        {"compute_dtype": "bfloat16"},
+        {"action_encoder": "mlp"},
+    ],
     ids=["plain", "qk-norm and muP", "bfloat16", "MLP of actions"],
 )
 def test_a_dual_model_begins_with_the_very_logits_of_the_genie_it_starts_from(
     options: dict[str, Any], tmp_path: Path
 ) -> None:
-    settings = {"num_heads": ALONE.heads, "use_mup": options.get("mup", False)}
-    tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, options.get("qk_norm", False)))
+    settings = {"num_heads": ALONE.heads, "use_mup": "public_code" in options}
+    tensors = random_tensors(genie_shapes(2, 8, 2, 3, 4, 4, "public_code" in options))
     config, params = from_public(Path("file"), tensors, settings)
     save(tmp_path, config, params)
     alone, dual = replace(config, **options), replace(DUAL, **options)
@@ -99,11 +106,12 @@ def test_a_model_without_actions_leaves_open_what_its_successor_sees(public: Pat
     assert not np.any(begin(integrated, public)["action_encoder"]["kernel"])
 
 
-@pytest.mark.parametrize(("field", "value"), [("heads", 4), ("mup", True), ("blocks", 3), ("frames", 5)])
+@pytest.mark.parametrize(("field", "value"), [("heads", 4), ("public_code", MUP), ("blocks", 3), ("frames", 5)])
 def test_another_network_is_refused_even_where_the_shapes_agree(public: Path, field: str, value: Any) -> None:
     other = replace(DUAL, **{field: value})
-    with pytest.raises(UserError, match=f"{field} is {getattr(DUAL, field)} there, {value} here"):
+    with pytest.raises(UserError) as caught:
         begin(other, public)
+    assert f"{field} is {getattr(DUAL, field)} there, {value} here" in str(caught.value)
 
 
 def test_a_run_is_such_a_directory_too(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, Departures
+from rsjax.config import ConfigError, Departures, PublicCodeConfig
 from rsjax.layers.attention import frames_held, rotate
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer, empty_cache
@@ -22,7 +22,7 @@ ROTARY = Architecture(
     blocks=2,
     heads=2,
     departures=Departures(rotary=True),
-    qk_norm=True,
+    public_code=PublicCodeConfig(qk_norm=True),
 )
 LENGTH = 11  # frames, more than twice the window
 

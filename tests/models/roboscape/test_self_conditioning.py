@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import MaskConfig, RoboScapeConfig
+from rsjax.config import RoboScapeConfig
 from rsjax.models.roboscape.departures.self_conditioning import conditions_itself, previous_frames
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
@@ -20,12 +20,11 @@ from tests.models.roboscape.test_loss_terms import MODEL as VISIBLE
 from tests.models.roboscape.toy import depart, roboscape
 
 MODEL = depart(VISIBLE, read_previous=True, whole_frames=True)
-QUIET = MaskConfig(random_token_rate=0.0, corruption_probability=0.0)
 
 
 def model_of(own: float, after: int = 0) -> RoboScape:
     departures = replace(MODEL.departures, self_conditioning=own, self_conditioning_after=after)
-    return roboscape(MODEL, RoboScapeConfig(departures=departures, loss=LOSS, mask=QUIET))
+    return roboscape(MODEL, RoboScapeConfig(departures=departures, loss=LOSS, corruption=None))
 
 
 @partial(jax.jit, static_argnums=0)

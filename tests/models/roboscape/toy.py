@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import ClipShape, RoboScapeConfig, TokenizerConfig, TokenModelConfig
+from rsjax.config import ClipShape, PublicCodeConfig, RoboScapeConfig, TokenizerConfig, TokenModelConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.models.roboscape.transformer import Transformer
@@ -20,8 +20,8 @@ def depart(architecture: Architecture, **departures: Any) -> Architecture:
 
 DUAL = Architecture(frames=5, grid=2, code_bits=4, action_inputs=3, width=8, blocks=2, heads=2)
 RGB = replace(DUAL, use_depth=False)
-NORMED = depart(DUAL, temporal_norm=True, final_norm=True)
-QK_NORM = replace(DUAL, qk_norm=True, mup=True)
+NORMED = depart(DUAL, more_norms=True)
+QK_NORM = replace(DUAL, public_code=PublicCodeConfig(qk_norm=True, mup=True))
 READS_PREVIOUS = depart(DUAL, read_previous=True)
 WHOLE = depart(READS_PREVIOUS, whole_frames=True)
 GENIE = replace(RGB, action_encoder="none", action_inputs=0)
@@ -107,9 +107,9 @@ def sequence_attention(x: np.ndarray, p: dict, config: Architecture, causal: boo
     length, width = x.shape
     heads = config.heads
     qkv = (x @ p["qkv"]["kernel"]).reshape(length, 3, heads, width // heads)
-    if config.qk_norm:
+    if config.public.qk_norm:
         qkv[:, :2] = layer_norm(qkv[:, :2], p["norm"])
-    scale = 8 / (width // heads) if config.mup else 1 / math.sqrt(width // heads)
+    scale = 8 / (width // heads) if config.public.mup else 1 / math.sqrt(width // heads)
     out = np.zeros((length, heads, width // heads))
     for head in range(heads):
         for i in range(length):
@@ -122,13 +122,13 @@ def sequence_attention(x: np.ndarray, p: dict, config: Architecture, causal: boo
 def st_block(x: np.ndarray, p: dict, config: Architecture) -> np.ndarray:
     x = x.copy()
     b, t, s, _ = x.shape
-    normed = x.copy() if config.qk_norm else layer_norm(x, p["norm1"])
+    normed = x.copy() if config.public.qk_norm else layer_norm(x, p["norm1"])
     x += [[sequence_attention(normed[i, j], p["spatial_attn"], config, False) for j in range(t)] for i in range(b)]
-    before = layer_norm(x, p["norm_temporal"]) if config.departures.temporal_norm else x.copy()
+    before = layer_norm(x, p["norm_temporal"]) if config.departures.more_norms else x.copy()
     for i in range(b):
         for cell in range(s):
             x[i, :, cell] += sequence_attention(before[i, :, cell], p["temporal_attn"], config, True)
-    normed = x if config.qk_norm else layer_norm(x, p["norm2"])
+    normed = x if config.public.qk_norm else layer_norm(x, p["norm2"])
     hidden = gelu(normed @ p["fc1"]["kernel"] + p["fc1"]["bias"])
     return x + hidden @ p["fc2"]["kernel"] + p["fc2"]["bias"]
 
@@ -164,9 +164,9 @@ def plain_forward(config: Architecture, params: Any, inputs: tuple) -> dict[str,
         h = {name: st_block(x, own[name], config) for name, x in h.items()}
         if config.use_depth:
             h["rgb"] = h["rgb"] + h["depth"] @ own["depth_to_rgb"]["kernel"] + own["depth_to_rgb"]["bias"]
-    if config.departures.final_norm:
+    if config.departures.more_norms:
         h = {name: layer_norm(x, p[f"{name}_norm_out"]) for name, x in h.items()}
-    if config.mup:
+    if config.public.mup:
         h = {name: x * 256 / config.width for name, x in h.items()}
     logits = {name: x @ p[f"{name}_head"]["kernel"] + p[f"{name}_head"]["bias"] for name, x in h.items()}
     return {name: x.reshape(*x.shape[:3], config.vocabularies, config.vocabulary_size) for name, x in logits.items()}

@@ -8,7 +8,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from rsjax.config import Departures
+from rsjax.config import Departures, PublicCodeConfig
 from rsjax.errors import UserError
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
@@ -37,7 +37,7 @@ def source(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(("width", "published"), [(256, 35_218_688), (512, 137_545_216)])
 @pytest.mark.parametrize("qk_norm", [False, True])
 def test_the_published_sizes_have_the_published_names_and_shapes(width: int, published: int, qk_norm: bool) -> None:
-    config = Architecture(width=width, use_depth=False, action_inputs=0, qk_norm=qk_norm)
+    config = Architecture(width=width, use_depth=False, action_inputs=0, public_code=PublicCodeConfig(qk_norm))
     shapes = public_shapes(table(config), jax.eval_shape(Transformer(config).init_params, jax.random.key(0)))
     assert shapes == genie_shapes(32, width, 8, 16, 256, 512, qk_norm)
     if not qk_norm:
@@ -49,7 +49,8 @@ def test_the_converted_model_computes_what_the_published_one_does(qk_norm: bool,
     public = tensors(qk_norm)
     rng = np.random.default_rng(0)
     config, params = from_public(Path("file"), public, SETTINGS | {"use_mup": mup, "qk_norm": qk_norm})
-    assert (config.mup, config.qk_norm, config.action_inputs, config.use_depth) == (mup, qk_norm, 0, False)
+    assert (config.public.mup, config.public.qk_norm) == (mup, qk_norm)
+    assert (config.action_inputs, config.use_depth) == (0, False)
     tokens = rng.integers(0, CODES**2, (2, FRAMES, 2, 2), np.int32)
     mask = rng.random(tokens.shape) < 0.4
     logits, _ = jax.jit(lambda *x: Transformer(config).apply({"params": params}, *x))({"rgb": tokens}, mask, None)
@@ -159,7 +160,7 @@ def test_all_misfits_are_named_in_one_error() -> None:
     "fields",
     [
         {"use_depth": True},
-        {"departures": Departures(final_norm=True)},
+        {"departures": Departures(more_norms=True)},
         {"action_inputs": 7},
         {"departures": Departures(rotary=True)},
     ],

@@ -55,7 +55,7 @@ def make(run: Run, *stages: str) -> None:
         ("tokenizer.channels", 32, "tokenizer"),
         ("tokenizer_train.entropy_weight", 0.2, "tokenizer"),
         ("model.width", 64, "world_model"),
-        ("model.mask.corruption_keep", 0.5, "world_model"),
+        ("model.corruption.probability", 0.4, "world_model"),
         ("model.loss.gamma", 4.0, "world_model"),
         ("train.ema", 0.5, "world_model"),
         ("train.curriculum", (CurriculumStageConfig(epochs=2.0),), "world_model"),

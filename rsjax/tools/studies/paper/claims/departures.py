@@ -54,19 +54,14 @@ _departure(
     "clean-contexts",
     "Contexts without corruption",
     "In few steps the corrupted contexts of the public Genie's recipe cost more than they gain.",
-    {"model.mask.random_token_rate": 0.2, "model.mask.corruption_probability": 0.5},
+    {"model.corruption": "on"},
     _METRICS,
 )
 _departure(
     "norms",
     "Norms before temporal attention and the heads, smaller embeddings",
     "Small models trained for few steps learn faster with norms that the public Genie lacks.",
-    {
-        "model.departures.temporal_norm": False,
-        "model.departures.final_norm": False,
-        "model.embed_std": 1.0,
-        "model.position_std": 0.0,
-    },
+    {"model.departures.more_norms": False, "model.departures.embedding_std": 0.0},
     _METRICS,
 )
 _departure(

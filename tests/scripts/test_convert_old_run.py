@@ -1,0 +1,31 @@
+"""The script that upgrades the settings of old runs."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rsjax.config import Config, from_dict, presets
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "convert_old_run.py"
+OLD_RUNS = Path(__file__).with_name("old_runs")
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [
+        ("before_departures", "tiny"),
+        ("before_sections", "tiny"),
+        ("before_sections_full_size", "roboscape_s"),
+    ],
+)
+def test_an_old_run_is_upgraded_once_and_its_old_settings_are_kept(name: str, preset: str, tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    before = (OLD_RUNS / f"{name}.json").read_text()
+    path.write_text(before)
+    for _ in range(2):
+        subprocess.run([sys.executable, str(SCRIPT), str(tmp_path)], check=True)
+        assert from_dict(Config, json.loads(path.read_text())) == presets.get(preset)
+        assert (tmp_path / "config.old.json").read_text() == before
