@@ -34,6 +34,9 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
         upgrade_model(model)
     if "mask" in model:
         split_model(model)
+        split_tokenizer_train(config["tokenizer_train"])
+        for section in ("tokenizer_train", "train"):
+            split_optimizer(config[section]["optimizer"])
     return config
 
 
@@ -75,6 +78,23 @@ def split_model(model: dict[str, Any]) -> None:
         del section[name]
     if "loss" in model:
         del model["loss"]["rgb_weight"]
+
+
+def split_tokenizer_train(train: dict[str, Any]) -> None:
+    """Makes a section of the adversarial terms, which can be off, and drops constants."""
+    names = {"adversarial_weight": "weight", "disc_start": "start"}
+    names |= {"lecam_weight": "lecam_weight", "lecam_decay": "lecam_decay"}
+    adversarial = {new: train.pop(name) for name, new in names.items()}
+    train["adversarial"] = adversarial if adversarial["weight"] else None
+    for name in ("hinge_weight", "entropy_temperature"):
+        del train[name]
+
+
+def split_optimizer(optimizer: dict[str, Any]) -> None:
+    """Leaves Muon the settings that it has."""
+    if optimizer["kind"] == "muon":
+        for name in ("drop_at", "betas", "weight_decay", "grad_clip"):
+            del optimizer[name]
 
 
 def main() -> None:

@@ -33,17 +33,21 @@ from rsjax.config.token_model import (
     TokenModelConfig,
     TransformerConfig,
 )
-from rsjax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
+from rsjax.config.tokenizer import AdversarialConfig, TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import (
+    AdamW,
     ComponentConfig,
     CurriculumStageConfig,
     LoopConfig,
+    Muon,
     OptimizerConfig,
     RuntimeConfig,
     TrainConfig,
 )
 
 __all__ = [
+    "AdamW",
+    "AdversarialConfig",
     "ClipShape",
     "ComponentConfig",
     "Config",
@@ -57,6 +61,7 @@ __all__ = [
     "LoopConfig",
     "LossConfig",
     "ModelConfig",
+    "Muon",
     "OptimizerConfig",
     "PublicCodeConfig",
     "RoboScapeConfig",

@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 from rsjax.config import (
+    AdamW,
+    AdversarialConfig,
     ComponentConfig,
     Config,
     ConfigError,
@@ -11,7 +13,7 @@ from rsjax.config import (
     EvalConfig,
     GenieConfig,
     LossConfig,
-    OptimizerConfig,
+    Muon,
     RoboScapeConfig,
     RuntimeConfig,
     SampleConfig,
@@ -80,7 +82,7 @@ def tiny() -> Config:
             batch_size=8,
             frames_per_clip=2,
             depth_share=0.2,
-            optimizer=OptimizerConfig(kind="muon", learning_rate=5e-3, final_share=0.02),
+            optimizer=Muon(learning_rate=5e-3, final_share=0.02),
             ema=0.998,
             l1_weight=0.2,
             l2_weight=4.0,
@@ -114,7 +116,7 @@ def tiny() -> Config:
             steps=1700,
             batch_size=4,
             accumulate=2,  # half the memory, and faster on a CPU
-            optimizer=OptimizerConfig(kind="muon", learning_rate=5e-3, final_share=0.02),
+            optimizer=Muon(learning_rate=5e-3, final_share=0.02),
             ema=0.995,
         ),
         runtime=RuntimeConfig(checkpoint_every=500, eval_every=1000),
@@ -197,21 +199,21 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             steps=1_350_000,
             batch_size=64,
             frames_per_clip=4,
-            optimizer=OptimizerConfig(
+            optimizer=AdamW(
                 warmup_steps=0, schedule="steps", drop_at=(200 / 270, 250 / 270), betas=(0.5, 0.9), grad_clip=0.0
             ),
             ema=0.999,
             flip=True,
             perceptual_weight=1.0,
             entropy_group=8,
-            adversarial_weight=0.1,
+            adversarial=AdversarialConfig(),
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),
         train=TrainConfig(
             steps=127_000,
             curriculum=simple_then_difficult if isinstance(model, RoboScapeConfig) else (),
             batch_size=256,
-            optimizer=OptimizerConfig(betas=(0.9, 0.999), schedule="linear", final_share=0.0),
+            optimizer=AdamW(betas=(0.9, 0.999), schedule="linear", final_share=0.0),
         ),
         runtime=RuntimeConfig(log_every=100, checkpoint_every=1000, eval_every=5000),
         eval=FULL_SIZE_EVAL,

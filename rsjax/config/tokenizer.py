@@ -7,6 +7,8 @@ from typing import ClassVar, Literal
 from rsjax.config.fields import fitting_sizes, require, require_range
 from rsjax.config.train import TrainConfig
 
+HINGE = 0.5  # weight of the discriminator's hinge loss, as in the reference
+
 
 @dataclass(frozen=True)
 class TokenizerConfig:
@@ -85,6 +87,20 @@ class TokenizerConfig:
 
 
 @dataclass(frozen=True)
+class AdversarialConfig:
+    """A discriminator beside the tokenizer, as in the reference. It needs images of a certain size."""
+
+    weight: float = 0.1  # of the generator's term
+    lecam_weight: float = 0.005  # of the discriminator's regulariser; 0.05 in the newer generation
+    lecam_decay: float = 0.999  # of the regulariser's averages of the logits
+    start: int = 0  # the first step with adversarial terms; later where reconstruction should settle first
+
+    def __post_init__(self) -> None:
+        require_range(self, "tokenizer_train.adversarial", 0, math.inf, "weight", "lecam_weight", "start")
+        require_range(self, "tokenizer_train.adversarial", 0, 1, "lecam_decay")
+
+
+@dataclass(frozen=True)
 class TokenizerTrainConfig(TrainConfig):
     """Settings of the tokenizer's training. The defaults are the reference's, without LPIPS and discriminator.
 
@@ -104,27 +120,18 @@ class TokenizerTrainConfig(TrainConfig):
     perceptual_weight: float = 0.0  # LPIPS, 1.0 in the reference; needs lpips_weights
     lpips_weights: str = ""  # a safetensors file for rsjax.tokenizers.lpips.load_lpips
     entropy_weight: float = 0.1
-    entropy_temperature: float = 0.01
     # Added to the average code's probabilities p in log p, as in the reference; 0: the true entropy.
     entropy_offset: float = 1e-5
     # Images that share an average code; 0: all of the batch, on all devices. 8 in the reference: those of one device.
     entropy_group: int = 0
     commitment_weight: float = 0.25
-    adversarial_weight: float = 0.0  # the generator's term, 0.1 in the reference; 0: no discriminator
-    hinge_weight: float = 0.5  # the discriminator's loss
-    lecam_weight: float = 0.005  # the discriminator's regulariser; 0.05 in the newer generation
-    lecam_decay: float = 0.999  # decay of LeCAM's averages of the logits
-    disc_start: int = 0  # the first step with adversarial terms
+    adversarial: AdversarialConfig | None = None  # on in the reference
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range(self, "tokenizer_train", 0, math.inf, "adversarial_weight", "disc_start", "entropy_group")
+        require_range(self, "tokenizer_train", 0, math.inf, "entropy_group")
         require_range(self, "tokenizer_train", 1, math.inf, "frames_per_clip")
-        require_range(self, "tokenizer_train", 0, 1, "depth_share", "lecam_decay")
-        require(
-            self.entropy_temperature > 0,
-            f"tokenizer_train.entropy_temperature is {self.entropy_temperature}; it must be above 0",
-        )
+        require_range(self, "tokenizer_train", 0, 1, "depth_share")
         images = self.batch_size // self.accumulate * self.frames_per_clip
         require(
             self.entropy_group == 0 or images % self.entropy_group == 0,
@@ -143,7 +150,8 @@ class TokenizerTrainConfig(TrainConfig):
         names = ["l1", "l2", "entropy", "commitment"]
         if self.perceptual_weight > 0 and self.lpips_weights:
             names.append("perceptual")
-        if self.adversarial_weight:
-            names += ["adversarial", "hinge", "lecam"]
-        logged = {"real_logit": 0.0, "fake_logit": 0.0} if self.adversarial_weight else {}
-        return {name: getattr(self, f"{name}_weight") for name in names} | logged
+        weights = {name: getattr(self, f"{name}_weight") for name in names}
+        if self.adversarial is not None:
+            weights |= {"adversarial": self.adversarial.weight, "hinge": HINGE, "lecam": self.adversarial.lecam_weight}
+            weights |= {"real_logit": 0.0, "fake_logit": 0.0}
+        return weights

@@ -8,37 +8,64 @@ from rsjax.config.fields import require, require_range, runtime
 
 
 @dataclass(frozen=True)
-class OptimizerConfig:
-    """The optimizer: linear warm-up, then a learning rate schedule; clipping by the global norm.
+class ScheduleConfig:
+    """The learning rate: linear warm-up to the peak, then a schedule down to a share of it."""
 
-    ``muon`` orthogonalises the updates of the blocks' matrices and of convolutions (at AdamW's scale) and leaves the
-    rest to AdamW with Nesterov momentum. The paper does not name its optimizer; the public Genie uses AdamW.
-    """
-
-    kind: Literal["adamw", "muon"] = "adamw"
-    learning_rate: float = 1e-4
+    learning_rate: float = 1e-4  # the peak
     warmup_steps: int = 50
     # cosine and linear decay from the peak to final_share of it; wsd (warm-up, stable, decay) decays only in the last
-    # fifth of the run; steps divides by 10 at each share in drop_at. The public Genie uses linear.
-    schedule: Literal["cosine", "linear", "wsd", "steps"] = "cosine"
-    final_share: float = 0.05  # the end of cosine, linear and wsd, as a share of the peak
-    drop_at: tuple[float, ...] = ()  # steps: shares of the run at which the rate is divided by 10
+    # fifth of the run.
+    schedule: Literal["cosine", "linear", "wsd"] = "cosine"
+    final_share: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_range(self, "optimizer", 0, math.inf, "learning_rate", "warmup_steps")
+        require_range(self, "optimizer", 0, 1, "final_share")
+
+
+@dataclass(frozen=True)
+class AdamW(ScheduleConfig):
+    """AdamW, as in the public Genie; the paper names no optimizer. Gradients are clipped by the global norm."""
+
+    kind: ClassVar[str] = "adamw"
+
+    # The public Genie uses linear. steps divides the peak by 10 at each share of the run in drop_at; without any it
+    # stays constant.
+    schedule: Literal["cosine", "linear", "wsd", "steps"] = "cosine"  # type: ignore[assignment]
+    drop_at: tuple[float, ...] = ()
     betas: tuple[float, float] = (0.9, 0.95)  # decay of the averages of gradients and of their squares
     weight_decay: float = 0.0
     grad_clip: float = 1.0  # 0: none
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range(self, "optimizer", 0, math.inf, "weight_decay", "grad_clip")
         require(
             all(0 < share < 1 for share in self.drop_at),
             f"optimizer.drop_at is {self.drop_at}; its entries are shares of the run, between 0 and 1",
         )
-        amounts = ("learning_rate", "warmup_steps", "weight_decay", "grad_clip")
-        require_range(self, "optimizer", 0, math.inf, *amounts)
-        require_range(self, "optimizer", 0, 1, "final_share")
         require(
             len(self.betas) == 2 and all(0 <= beta <= 1 for beta in self.betas),
             f"optimizer.betas are {self.betas}; they are two numbers, each 0 … 1",
         )
+
+
+@dataclass(frozen=True)
+class Muon(ScheduleConfig):
+    """Muon for the blocks' matrices and for convolutions, which learn more in few steps than with AdamW.
+
+    It orthogonalises their updates, at AdamW's scale. AdamW with Nesterov momentum updates the rest.
+    """
+
+    kind: ClassVar[str] = "muon"
+    # As AdamW's defaults.
+    drop_at: ClassVar[tuple[float, ...]] = ()
+    betas: ClassVar[tuple[float, float]] = (0.9, 0.95)
+    weight_decay: ClassVar[float] = 0.0
+    grad_clip: ClassVar[float] = 1.0
+
+
+OptimizerConfig = AdamW | Muon
 
 
 @dataclass(frozen=True)
@@ -90,7 +117,7 @@ class TrainConfig:
 
     steps: int = 1000
     batch_size: int = 8  # over all devices
-    optimizer: OptimizerConfig = OptimizerConfig()
+    optimizer: AdamW | Muon = AdamW()
     ema: float = 0.0  # decay of the averaged weights that later stages use; 0: no averaging
     seed: int = 0
     # A run directory, or one made by python -m experiments.convert, whose weights training starts from. With it, steps

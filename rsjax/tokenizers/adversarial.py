@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rsjax.config import TokenizerTrainConfig
+from rsjax.config import AdversarialConfig
 from rsjax.tokenizers.discriminator import Discriminator
 from rsjax.trainable import Params, Scalar, Term
 
@@ -31,7 +31,7 @@ def updated_averages(averages: Averages, real: Scalar, fake: Scalar, decay: floa
 
 
 def adversarial_terms(
-    train: TokenizerTrainConfig,
+    config: AdversarialConfig,
     params: Params,
     target: Float[Array, "B H W 3"],
     output: Float[Array, "B H W 3"],
@@ -39,13 +39,13 @@ def adversarial_terms(
     averages: Averages,
     axis_name: str | None,
 ) -> dict[str, Term]:
-    """Returns the terms of one batch, named as their weights in :class:`TokenizerTrainConfig`.
+    """Returns the terms of one batch, named as their weights in :class:`rsjax.config.TokenizerTrainConfig`.
 
     Args:
         params: the discriminator's.
         target: real images in [-1, 1].
         output: their reconstructions.
-        active: 1, or 0 before ``disc_start``.
+        active: 1, or 0 before ``config.start``.
         averages: LeCAM's, from the previous step.
         axis_name: pmap's axis; None if XLA sees the whole batch.
 
@@ -67,7 +67,7 @@ def adversarial_terms(
     fake_sum = jax.lax.stop_gradient(jnp.mean(fake)) * count
     real_mean = _total(real_sum, axis_name) / _total(count, axis_name)
     fake_mean = _total(fake_sum, axis_name) / _total(count, axis_name)
-    anchors = updated_averages(averages, real_mean, fake_mean, train.lecam_decay)
+    anchors = updated_averages(averages, real_mean, fake_mean, config.lecam_decay)
     means = {
         "adversarial": jnp.mean(jax.nn.softplus(-jnp.mean(fooled, axis=(1, 2)))),
         "hinge": jnp.mean(jax.nn.relu(1 - real)) + jnp.mean(jax.nn.relu(1 + fake)),

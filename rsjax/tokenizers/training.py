@@ -33,6 +33,8 @@ from rsjax.trainable import Extra, Params, Scalar, StepContext, Term
 Images: TypeAlias = Float[Array, "B H W 3"]
 Latents: TypeAlias = Float[Array, "B h w D"]
 
+ENTROPY_TEMPERATURE = 0.01  # of the codes' probabilities in the entropy loss, as in the reference
+
 # Fields that may differ between the saved tokenizer and the one to train.
 FREE = {"vocabularies", "depth_scale", "compute_dtype"}
 
@@ -50,9 +52,9 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def __post_init__(self) -> None:
         require(
-            not self.train.adversarial_weight or self.image_size >= MIN_SIZE,
+            self.train.adversarial is None or self.image_size >= MIN_SIZE,
             f"clips have images of {self.image_size} pixels; the discriminator needs at least {MIN_SIZE}, "
-            f"or tokenizer_train.adversarial_weight 0",
+            f"or tokenizer_train.adversarial off",
         )
 
     @classmethod
@@ -66,7 +68,7 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def init(self, key: Key[Array, ""]) -> Params:
         generator = Tokenizer(self.tokenizer).init_params(key)
-        if not self.train.adversarial_weight:
+        if self.train.adversarial is None:
             return generator
         return {"generator": generator, "discriminator": Discriminator().init_params(jax.random.fold_in(key, 1))}
 
@@ -106,11 +108,13 @@ class TokenizerTraining(Autoencoder[Images]):
         if "perceptual" in train.loss_weights:
             means["perceptual"] = jnp.mean(lpips(extra["lpips"], target, output))
         terms = {name: (mean * count, count) for name, mean in means.items()}
-        if "adversarial" in train.loss_weights:
-            active = (context.step >= train.disc_start).astype(jnp.float32)
+        if train.adversarial is not None:
+            active = (context.step >= train.adversarial.start).astype(jnp.float32)
             discriminator = params["discriminator"]
             averages = extra["lecam"]
-            terms |= adversarial_terms(train, discriminator, target, output, active, averages, context.axis_name)
+            terms |= adversarial_terms(
+                train.adversarial, discriminator, target, output, active, averages, context.axis_name
+            )
         return terms
 
     def entropy(self, latents: Latents, axis_name: str | None) -> Scalar:
@@ -122,7 +126,6 @@ class TokenizerTraining(Autoencoder[Images]):
         Raises:
             ConfigError: this device's images do not divide into groups.
         """
-        temperature = self.train.entropy_temperature
         offset = self.train.entropy_offset
         group = self.train.entropy_group
 
@@ -132,7 +135,7 @@ class TokenizerTraining(Autoencoder[Images]):
             return jax.lax.psum(x, axis_name)
 
         if not group:
-            return lfq.entropy_loss(latents, temperature, offset, total)
+            return lfq.entropy_loss(latents, ENTROPY_TEMPERATURE, offset, total)
         images = latents.shape[0]
         require(
             images % group == 0,
@@ -140,12 +143,13 @@ class TokenizerTraining(Autoencoder[Images]):
             f"choose a divisor, or 0 for one average over the whole batch",
         )
         groups = latents.reshape(-1, group, *latents.shape[1:])
-        return jnp.mean(jax.vmap(lambda part: lfq.entropy_loss(part, temperature, offset))(groups))
+        return jnp.mean(jax.vmap(lambda part: lfq.entropy_loss(part, ENTROPY_TEMPERATURE, offset))(groups))
 
     def next_extra(self, extra: Extra, means: dict[str, Scalar]) -> Extra:
-        if extra is None or "lecam" not in self.loss_weights:
+        adversarial = self.train.adversarial
+        if extra is None or adversarial is None:
             return extra
-        averages = updated_averages(extra["lecam"], means["real_logit"], means["fake_logit"], self.train.lecam_decay)
+        averages = updated_averages(extra["lecam"], means["real_logit"], means["fake_logit"], adversarial.lecam_decay)
         return extra | {"lecam": averages}
 
     def transform(self) -> Transform:
@@ -157,7 +161,7 @@ class TokenizerTraining(Autoencoder[Images]):
 
     def tokenizer_params(self, params: Params) -> Params:
         """Returns the tokenizer's parameters without the discriminator's."""
-        if self.train.adversarial_weight:
+        if self.train.adversarial is not None:
             return params["generator"]
         return params
 
@@ -190,8 +194,8 @@ class TokenizerTraining(Autoencoder[Images]):
 def require_no_adversarial(train: TokenizerTrainConfig, network: str) -> None:
     """Raises :class:`rsjax.config.ConfigError` if a family's autoencoder is to have a discriminator."""
     require(
-        not train.adversarial_weight,
-        f"tokenizer_train.adversarial_weight is above 0, but {network} has no discriminator here; set it to 0",
+        train.adversarial is None,
+        f"tokenizer_train.adversarial is on, but {network} has no discriminator here; switch it off",
     )
 
 

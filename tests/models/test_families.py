@@ -201,9 +201,9 @@ def test_rows_of_an_autoencoders_batch_keep_their_place_over_all_hosts(family: s
 
 
 @own_autoencoder
-def test_an_autoencoder_without_discriminator_takes_no_adversarial_weight(family: str) -> None:
-    config = with_values(families.FAMILIES[family](), {"tokenizer_train.adversarial_weight": 0.1})
-    with pytest.raises(ConfigError, match="adversarial_weight is above 0, but .* has no discriminator here; set it"):
+def test_an_autoencoder_without_discriminator_takes_no_adversarial_terms(family: str) -> None:
+    config = with_values(families.FAMILIES[family](), {"tokenizer_train.adversarial": "on"})
+    with pytest.raises(ConfigError, match="adversarial is on, but .* has no discriminator here; switch it off"):
         create_autoencoder(config)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rsjax
-from rsjax.config import Config, OptimizerConfig, RuntimeConfig, TrainConfig
+from rsjax.config import AdamW, Config, RuntimeConfig, TrainConfig
 from rsjax.errors import UserError
 from rsjax.evaluation import registry
 from rsjax.evaluation.registry import Scene, metric
@@ -48,7 +48,7 @@ def config(tmp_path: Path) -> Config:
         train=TrainConfig(steps=8, batch_size=3),
         runtime=RuntimeConfig(log_every=2, eval_every=4),
     )
-    base = replace(base, train=replace(base.train, optimizer=OptimizerConfig(learning_rate=0.1, warmup_steps=1)))
+    base = replace(base, train=replace(base.train, optimizer=AdamW(learning_rate=0.1, warmup_steps=1)))
     return on_store(base, store.path)
 
 

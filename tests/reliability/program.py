@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.cli import main_errors
-from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.config import AdamW, LoopConfig
 from rsjax.data.loader import batches
 from rsjax.data.quarantine import NAME as QUARANTINE
 from rsjax.data.store import open_store, write_store
@@ -69,7 +69,7 @@ def main() -> None:
     loop = LoopConfig(
         steps=options.steps,
         batch_size=2,
-        optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=2),
+        optimizer=AdamW(learning_rate=1e-2, warmup_steps=2),
         ema=0.9,
         log_every=1,
         checkpoint_every=options.every,

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import TokenizerTrainConfig
+from rsjax.config import AdversarialConfig
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages, updated_averages
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 
-TRAIN = TokenizerTrainConfig(adversarial_weight=0.1, lecam_decay=0.9)
+CONFIG = AdversarialConfig(lecam_decay=0.9)
 AVERAGES = {"real": jnp.float32(0.7), "fake": jnp.float32(-0.4)}
 
 
@@ -24,7 +24,7 @@ def inputs() -> tuple[Any, np.ndarray, np.ndarray]:
 
 @jax.jit
 def means(params: Any, target: Any, output: Any, active: Any) -> dict[str, Any]:
-    terms = adversarial_terms(TRAIN, params, target, output, active, AVERAGES, None)
+    terms = adversarial_terms(CONFIG, params, target, output, active, AVERAGES, None)
     return {name: total / weight for name, (total, weight) in terms.items()}
 
 

@@ -11,7 +11,7 @@ import optax
 import pytest
 from safetensors.numpy import save_file
 
-from rsjax.config import ConfigError, LoopConfig, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config import AdversarialConfig, ConfigError, LoopConfig, TokenizerConfig, TokenizerTrainConfig
 from rsjax.tokenizers import training as module
 from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
 from rsjax.tokenizers.magvit2 import Tokenizer
@@ -24,7 +24,7 @@ from tests.training.toy import QUICK
 
 CONFIG = TokenizerConfig(patch_size=4, channels=8, channel_multipliers=(1,), res_blocks=1, norm_groups=4, code_bits=4)
 PLAIN = TokenizerTrainConfig(steps=4, ema=0.9)
-WHOLE = replace(PLAIN, adversarial_weight=0.1, perceptual_weight=1.0, lecam_decay=0.5)
+WHOLE = replace(PLAIN, adversarial=AdversarialConfig(lecam_decay=0.5), perceptual_weight=1.0)
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3), np.uint8)
 
 

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config import AdversarialConfig, ConfigError, TokenizerConfig, TokenizerTrainConfig
 from rsjax.errors import UserError
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages
 from rsjax.tokenizers.discriminator import MIN_SIZE, Discriminator
 from rsjax.tokenizers.lpips import lpips
 from rsjax.tokenizers.magvit2 import Tokenizer
-from rsjax.tokenizers.training import TokenizerTraining
+from rsjax.tokenizers.training import ENTROPY_TEMPERATURE, TokenizerTraining
 from rsjax.tools.convert.directory import save
 from rsjax.trainable import StepContext
 from rsjax.training.checkpoint import load_weights
@@ -36,7 +36,7 @@ def test_terms_are_those_of_the_plain_computation_and_reach_both_halves() -> Non
     expected = {
         "l1": np.mean(np.abs(error)),
         "l2": np.mean(error**2),
-        "entropy": lfq.entropy_loss(latents, train.entropy_temperature),
+        "entropy": lfq.entropy_loss(latents, ENTROPY_TEMPERATURE),
         "commitment": np.mean((latents - np.where(latents > 0, 1, -1)) ** 2),
     }
 
@@ -71,9 +71,8 @@ def test_the_entropy_is_the_mean_over_groups_of_images() -> None:
 def test_the_whole_loss_is_the_sum_of_its_parts() -> None:
     """The judging networks see the tokenizer's images as they are, and the names are those of the weights."""
     config = replace(CONFIG, patch_size=4)
-    train = TokenizerTrainConfig(
-        perceptual_weight=1.0, lpips_weights="not read here", adversarial_weight=0.1, disc_start=3
-    )
+    adversarial = AdversarialConfig(start=3)
+    train = TokenizerTrainConfig(perceptual_weight=1.0, lpips_weights="not read here", adversarial=adversarial)
     rng = np.random.default_rng(0)
     inits = {"generator": Tokenizer(config).init_params, "discriminator": Discriminator().init_params}
     shapes = {name: jax.eval_shape(init, jax.random.key(0)) for name, init in inits.items()}
@@ -86,7 +85,7 @@ def test_the_whole_loss_is_the_sum_of_its_parts() -> None:
         target = images / jnp.float32(127.5) - 1
         output, _ = Tokenizer(config).apply({"params": params["generator"]}, target)
         expected = {"perceptual": (2 * jnp.mean(lpips(extra["lpips"], target, output)), jnp.float32(2))}
-        judged = (train, params["discriminator"], target, output, jnp.float32(1), extra["lecam"], None)
+        judged = (adversarial, params["discriminator"], target, output, jnp.float32(1), extra["lecam"], None)
 
         def terms_of(train: TokenizerTrainConfig, params: Any, step: int, extra: Any) -> Any:
             context = StepContext(jnp.int32(step), extra, None)
@@ -114,16 +113,16 @@ def test_lpips_without_weights_is_off_and_says_so() -> None:
 
 
 def test_images_too_small_for_the_discriminator_are_refused() -> None:
-    train = TokenizerTrainConfig(adversarial_weight=0.1)
+    train = TokenizerTrainConfig(adversarial=AdversarialConfig())
     with pytest.raises(ConfigError, match=f"images of 8 pixels; the discriminator needs at least {MIN_SIZE}"):
         TokenizerTraining(CONFIG, train, 8)
     TokenizerTraining(CONFIG, train, MIN_SIZE)
     TokenizerTraining(CONFIG, TokenizerTrainConfig(), 8)
 
 
-def test_a_weight_of_0_switches_the_judging_networks_off() -> None:
+def test_without_weights_the_judging_networks_are_off() -> None:
     """Then training has neither their parameters nor their terms."""
-    off = TokenizerTrainConfig(perceptual_weight=0.0, lpips_weights="not read here", adversarial_weight=0.0)
+    off = TokenizerTrainConfig(perceptual_weight=0.0, lpips_weights="not read here")
     training = TokenizerTraining(CONFIG, off, 8)
     assert training.loss_weights.keys() == {"l1", "l2", "entropy", "commitment"}
     assert training.init_extra() is None

@@ -29,11 +29,13 @@ import optax
 from jaxtyping import Array
 
 from rsjax.config import (
+    AdamW,
+    AdversarialConfig,
     Config,
     DataConfig,
     LoopConfig,
     LossConfig,
-    OptimizerConfig,
+    Muon,
     RoboScapeConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
@@ -47,7 +49,7 @@ from rsjax.training.sharding import Sharding
 from rsjax.training.state import TrainState, create_state
 from rsjax.training.step import train_step
 
-LOOP = LoopConfig(batch_size=8, steps=3, ema=0.9, optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=1))
+LOOP = LoopConfig(batch_size=8, steps=3, ema=0.9, optimizer=AdamW(learning_rate=1e-2, warmup_steps=1))
 # Wide enough that the world model's matrices are cut rather than left whole.
 CONFIG = Config(
     name="devices",
@@ -56,14 +58,17 @@ CONFIG = Config(
         patch_size=8, channels=4, channel_multipliers=(1,), res_blocks=1, norm_groups=2, code_bits=4
     ),
     tokenizer_train=TokenizerTrainConfig(
-        batch_size=8, steps=2, adversarial_weight=0.1, lecam_decay=0.9, optimizer=OptimizerConfig(warmup_steps=1)
+        batch_size=8,
+        steps=2,
+        adversarial=AdversarialConfig(lecam_decay=0.9),
+        optimizer=AdamW(warmup_steps=1),
     ),
     model=RoboScapeConfig(width=64, blocks=2, heads=2, loss=LossConfig(num_keypoints=3)),
     train=LOOP,
 )
 MODEL = RoboScape.create(CONFIG)
 TOKENIZER = TokenizerTraining.create(CONFIG)
-MUON = replace(LOOP, optimizer=replace(LOOP.optimizer, kind="muon"))
+MUON = replace(LOOP, optimizer=Muon(learning_rate=1e-2, warmup_steps=1))
 SHARDINGS: dict[str, dict[str, Any]] = {
     "jit": {"sharding": "jit"},
     "pmap": {"sharding": "pmap"},

@@ -15,13 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.config import AdamW, LoopConfig
 from rsjax.training import sharding as sharding_rules
 from rsjax.training.state import create_state
 from tests.models import families
 from tests.training.devices import Training, moments, share
 
-LOOP = LoopConfig(batch_size=8, steps=1, optimizer=OptimizerConfig(warmup_steps=1))
+LOOP = LoopConfig(batch_size=8, steps=1, optimizer=AdamW(warmup_steps=1))
 WEIGHTS = np.array([1, 1, 1, 0, 0, 0, 1, 1], np.float32)
 
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import LoopConfig, OptimizerConfig
+from rsjax.config import AdamW, LoopConfig
 from rsjax.errors import Preempted
 from rsjax.runtime import patient, stop_signals
 from rsjax.training.checkpoint import Checkpoints, write_checksums
@@ -25,7 +25,7 @@ from tests.training.toy import Regression, loader, records, train
 LOOP = LoopConfig(
     steps=9,
     batch_size=2,
-    optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=2),
+    optimizer=AdamW(learning_rate=1e-2, warmup_steps=2),
     ema=0.9,
     log_every=1,
     checkpoint_every=4,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.sharding import PartitionSpec as P
 
-from rsjax.config import ConfigError, LoopConfig, OptimizerConfig, presets
+from rsjax.config import AdamW, ConfigError, LoopConfig, Muon, presets
 from rsjax.models.roboscape.model import RoboScape
 from rsjax.tokenizers.training import TokenizerTraining
 from rsjax.trainable import Trainable
@@ -27,7 +27,7 @@ def rows(model: Trainable[Any], loop: LoopConfig, parts: int) -> dict[str, Row]:
 
 def world_model(preset: str, kind: Any = "adamw", parts: int = 8) -> dict[str, Row]:
     config = presets.get(preset)
-    loop = replace(config.loop("world_model"), ema=0.99, optimizer=OptimizerConfig(kind=kind))
+    loop = replace(config.loop("world_model"), ema=0.99, optimizer={"muon": Muon, "adamw": AdamW}[kind]())
     return rows(RoboScape.create(config), loop, parts)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
+from rsjax.config.train import AdamW, RuntimeConfig, TrainConfig
 from rsjax.models.cogvideox.config import CausalVAEConfig, CogVideoXConfig, GuidedDenoiseConfig, TextConfig
 
 
@@ -37,7 +37,7 @@ def _cogvideox(name: str, model: CogVideoXConfig) -> Config:
             steps=10_000,
             batch_size=16,
             start_from="cogvideox",
-            optimizer=OptimizerConfig(learning_rate=2e-5, warmup_steps=100, schedule="steps", weight_decay=1e-4),
+            optimizer=AdamW(learning_rate=2e-5, warmup_steps=100, schedule="steps", weight_decay=1e-4),
         ),
         runtime=RuntimeConfig(log_every=10, checkpoint_every=500, eval_every=1000),
         eval=FULL_SIZE_EVAL,
@@ -55,7 +55,7 @@ def cogvideox_tiny(base: Config) -> Config:
             batch_size=2,
             frames_per_clip=16,
             depth_share=0.0,
-            optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
+            optimizer=AdamW(learning_rate=3e-3, final_share=0.02),
         ),
         model=CogVideoXConfig(
             autoencoder=CausalVAEConfig(
@@ -77,7 +77,7 @@ def cogvideox_tiny(base: Config) -> Config:
             steps=1200,
             batch_size=8,
             accumulate=1,
-            optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
+            optimizer=AdamW(learning_rate=1e-3, final_share=0.02),
         ),
         runtime=replace(base.runtime, checkpoint_every=300, eval_every=600),
     )

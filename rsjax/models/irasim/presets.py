@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
+from rsjax.config.train import AdamW, RuntimeConfig, TrainConfig
 from rsjax.models.diffusion.config import DenoiseConfig
 from rsjax.models.irasim.config import IRASimConfig, KLConfig
 
@@ -35,7 +35,7 @@ def _irasim(name: str, width: int, blocks: int, heads: int) -> Config:
 
     The public batch is 1 clip a GPU, accumulated twice, on an unknown number of GPUs; 16 is our choice.
     """
-    public = OptimizerConfig(warmup_steps=0, schedule="steps", betas=(0.9, 0.999), grad_clip=0.1)
+    public = AdamW(warmup_steps=0, schedule="steps", betas=(0.9, 0.999), grad_clip=0.1)
     return Config(
         name=name,
         sim=SimConfig(image_size=256),
@@ -61,7 +61,7 @@ def irasim_tiny(base: Config) -> Config:
             base.tokenizer_train,
             steps=2000,
             depth_share=0.0,
-            optimizer=OptimizerConfig(learning_rate=3e-3, final_share=0.02),
+            optimizer=AdamW(learning_rate=3e-3, final_share=0.02),
         ),
         model=IRASimConfig(
             # The convolutions of tiny's tokenizer.
@@ -89,7 +89,7 @@ def irasim_tiny(base: Config) -> Config:
             base.train,
             steps=2400,
             accumulate=1,
-            optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
+            optimizer=AdamW(learning_rate=1e-3, final_share=0.02),
             ema=0.998,
         ),
         runtime=replace(base.runtime, eval_every=1200),

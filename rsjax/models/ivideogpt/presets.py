@@ -5,7 +5,7 @@ from dataclasses import replace
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
 from rsjax.config.tokenizer import TokenizerTrainConfig
-from rsjax.config.train import OptimizerConfig, RuntimeConfig, TrainConfig
+from rsjax.config.train import AdamW, Muon, RuntimeConfig, TrainConfig
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 
 
@@ -22,8 +22,8 @@ def ivideogpt_256() -> Config:
 
 def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
     # LPIPS needs the path of its weights, --tokenizer-train.lpips-weights.
-    constant = OptimizerConfig(learning_rate=5e-4, warmup_steps=500, schedule="steps", betas=(0.9, 0.999))
-    cosine = OptimizerConfig(
+    constant = AdamW(learning_rate=5e-4, warmup_steps=500, schedule="steps", betas=(0.9, 0.999))
+    cosine = AdamW(
         warmup_steps=5000, betas=(0.9, 0.999), weight_decay=0.01, final_share=0.0, grad_clip=0.0, learning_rate=1e-4
     )
     return Config(
@@ -57,7 +57,7 @@ def ivideogpt_tiny(tiny: Config) -> Config:
             batch_size=4,
             frames_per_clip=8,
             depth_share=0.0,
-            optimizer=OptimizerConfig(learning_rate=1e-3, final_share=0.02),
+            optimizer=AdamW(learning_rate=1e-3, final_share=0.02),
             # Pixels are 0 … 1 here and -1 … 1 in tiny's tokenizer, and context and later frames are added up.
             l1_weight=0.2,
             l2_weight=8.0,
@@ -90,6 +90,6 @@ def ivideogpt_tiny(tiny: Config) -> Config:
             steps=700,
             batch_size=8,
             accumulate=1,
-            optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3, final_share=0.02),
+            optimizer=Muon(learning_rate=3e-3, final_share=0.02),
         ),
     )

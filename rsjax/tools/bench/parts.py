@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rsjax.config import Config
+from rsjax.config.config_fields import with_values
 from rsjax.data import loader
 from rsjax.data.curriculum import plan
 from rsjax.data.loader import Prefetch
@@ -70,8 +71,7 @@ def train_adamw(config: Config, batch: int, budget: float) -> Numbers:
     """Measures the training step with AdamW, the PyTorch baseline's optimizer, if the preset has another one."""
     if config.train.optimizer.kind == "adamw":
         return {}
-    optimizer = dataclasses.replace(config.train.optimizer, kind="adamw")
-    config = dataclasses.replace(config, train=dataclasses.replace(config.train, optimizer=optimizer))
+    config = with_values(config, {"train.optimizer": "adamw"})
     return {"train_step_s_adamw": train(config, batch, budget)["train_step_s"]}
 
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from rsjax.config.fields import ConfigError, require, require_range, runtime
-from rsjax.config.train import LoopConfig, OptimizerConfig
+from rsjax.config.train import AdamW, LoopConfig
 from rsjax.errors import did_you_mean
 
 # Diffusion Policy on robomimic's images: AdamW with betas (.95, .999), warm-up 500, cosine to 0, batch 64.
-PUBLIC_OPTIMIZER = OptimizerConfig(
+PUBLIC_OPTIMIZER = AdamW(
     learning_rate=1e-4,
     warmup_steps=500,
     schedule="cosine",

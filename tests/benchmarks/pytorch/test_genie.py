@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import Departures, OptimizerConfig, TokenizerConfig
+from rsjax.config import AdamW, Departures, TokenizerConfig
 from rsjax.models.roboscape.architecture import Architecture
 from rsjax.models.roboscape.transformer import Transformer
 from rsjax.tokenizers import magvit2
@@ -126,7 +126,7 @@ def test_steps_lower_the_loss_of_the_same_clip(params: Any, bf16: bool) -> None:
 
     torch.manual_seed(0)
     model = copied(params)
-    adamw = make_adamw(model.parameters(), OptimizerConfig(learning_rate=1e-2))
+    adamw = make_adamw(model.parameters(), AdamW(learning_rate=1e-2))
     tokens, mask = torch.randint(0, 256, (1, 3, 16)), torch.rand(1, 3, 16) < 0.5
 
     def loss() -> Any:
@@ -146,7 +146,7 @@ def test_a_clip_of_zero_clips_nothing(params: Any) -> None:
     norms = []
     for grad_clip in (0.0, 1e9, 1e-3):
         model = copied(params)
-        adamw = make_adamw(model.parameters(), OptimizerConfig())
+        adamw = make_adamw(model.parameters(), AdamW())
         train_step(lambda: masked_loss(model, tokens, mask), [model], adamw, grad_clip)  # noqa: B023
         norms.append(torch.stack([p.grad.norm() for p in model.parameters()]).norm().item())
     assert norms[0] == pytest.approx(norms[1], rel=1e-4) and norms[0] > 0.1

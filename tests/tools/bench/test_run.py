@@ -205,7 +205,7 @@ def test_torchs_adamw_is_compared_with_our_step_with_adamw(monkeypatch: pytest.M
     monkeypatch.setattr(parts, "train", train)
     config = toy()
     assert parts.train_adamw(config, 1, 0.0) == {} and not kinds
-    measured = parts.train_adamw(with_values(config, {"train.optimizer.kind": "muon"}), 1, 0.0)
+    measured = parts.train_adamw(with_values(config, {"train.optimizer": "muon"}), 1, 0.0)
     assert measured == {"train_step_s_adamw": 2.0} and kinds == ["adamw"]
     numbers = {"torch_device": "cpu", "platform": "cpu", "torch_train_step_s_float32": 6.0, "train_step_s": 4.0}
     assert ratios(numbers | measured, False) == {"train_speedup_over_torch_float32": 3.0}

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import LoopConfig, TokenizerTrainConfig
+from rsjax.config import AdversarialConfig, LoopConfig, TokenizerTrainConfig
 from rsjax.data.store import write_store
 from rsjax.models.load_run import load_tokenizer
 from rsjax.models.roboscape.model import RoboScape
@@ -20,7 +20,7 @@ from rsjax.training.state import TrainState, create_state
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
 
-WHOLE = TokenizerTrainConfig(steps=2, perceptual_weight=1.0, adversarial_weight=0.1)
+WHOLE = TokenizerTrainConfig(steps=2, perceptual_weight=1.0, adversarial=AdversarialConfig())
 
 
 def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Run, TrainState]:
@@ -51,7 +51,7 @@ def test_the_discriminator_stays_behind_and_the_missing_term_is_noted_once(
 def test_a_term_that_is_off_is_not_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, state = staged(replace(WHOLE, perceptual_weight=0.0, adversarial_weight=0.0), tmp_path, monkeypatch)
+    run, state = staged(replace(WHOLE, perceptual_weight=0.0, adversarial=None), tmp_path, monkeypatch)
     jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params)
     assert "LPIPS" not in capsys.readouterr().out
 

@@ -33,7 +33,7 @@ _departure(
     "optimizer",
     "Muon instead of AdamW",
     "Muon learns more in few steps. The paper names no optimizer; the public Genie uses AdamW (here at 1e-3).",
-    {"train.optimizer.kind": "adamw", "train.optimizer.learning_rate": 1e-3},
+    {"train.optimizer": "adamw", "train.optimizer.learning_rate": 1e-3},
     _METRICS,
 )
 _departure(
