@@ -49,8 +49,7 @@ FIRST_FIELDS = {
     "model.loss.use-keypoints": "Whether the keypoint and attention losses are used.",
     "model.sample.steps": "Decoding steps per generated frame.",
     "eval.clips": "Test clips to evaluate on.",
-    "eval.lpips-alex-weights": "Weights of LPIPS with AlexNet (see docs/evaluation.md).",
-    "eval.lpips-vgg-weights": "Weights of LPIPS with VGG16.",
+    "eval.weights": "A directory with the weights of LPIPS and FVD (see docs/evaluation.md).",
     "eval.depth-estimator": "A network that estimates depth from frames (see docs/evaluation.md).",
 }
 

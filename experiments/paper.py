@@ -11,7 +11,7 @@ from rsjax.config.config_fields import with_values
 from rsjax.runtime import tune_process
 
 PROG = "python -m experiments.paper"
-FILES = ("lpips_alex_weights", "lpips_vgg_weights", "fvd_weights", "depth_estimator")  # fields of EvalConfig
+FILES = ("weights", "depth_estimator")  # fields of EvalConfig
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,10 @@ class Options:
     """The preset that the trainings vary."""
     seeds: int = 3
     """Trainings of each arm."""
-    lpips_alex_weights: str = ""
-    """Weights of LPIPS and of FVD, and a depth estimator (docs/evaluation.md); scores that lack theirs are null."""
-    lpips_vgg_weights: str = ""
-    fvd_weights: str = ""
+    weights: str = ""
+    """A directory with the weights of LPIPS and FVD (docs/evaluation.md); scores that lack theirs are null."""
     depth_estimator: str = ""
+    """A network that estimates depth (docs/evaluation.md)."""
     dry_run: bool = False
     """Print the trainings with their estimated minutes and states, and run nothing."""
     report: bool = False

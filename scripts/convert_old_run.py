@@ -35,6 +35,7 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
     if "mask" in model:
         split_model(model)
         split_tokenizer_train(config["tokenizer_train"])
+        gather_weights(config["eval"])
         for section in ("tokenizer_train", "train"):
             split_optimizer(config[section]["optimizer"])
     return config
@@ -95,6 +96,12 @@ def split_optimizer(optimizer: dict[str, Any]) -> None:
     if optimizer["kind"] == "muon":
         for name in ("drop_at", "betas", "weight_decay", "grad_clip"):
             del optimizer[name]
+
+
+def gather_weights(evaluation: dict[str, Any]) -> None:
+    """Drops the paths of the metrics' files, which now lie in one directory: name it with --eval.weights."""
+    for name in ("loss_clips", "lpips_alex_weights", "lpips_vgg_weights", "fvd_weights"):
+        del evaluation[name]
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from rsjax.config.data import ClipShape, DataConfig
@@ -19,15 +20,13 @@ class EvalConfig:
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
     repetitions: int = 1  # how often each clip is generated, with different random draws
-    loss_clips: int = 1000  # clips of the validation loss during training, spread in the same way
     batch_size: int = 10
     action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
-    # Without these files, which are not part of this project, the metrics are null.
-    lpips_alex_weights: str = ""  # a safetensors file of python -m experiments.convert lpips
-    lpips_vgg_weights: str = ""
-    fvd_weights: str = ""  # i3d_torchscript.pt, for which PyTorch is needed
+    # A directory with files that are not part of this project: lpips_alex.safetensors and lpips_vgg.safetensors of
+    # python -m experiments.convert lpips, and i3d_torchscript.pt for FVD. Without its file, a metric is null.
+    weights: str = ""
     depth_estimator: str = ""  # a network and its files, as in experiments.ingest --depth
 
     def __post_init__(self) -> None:
@@ -37,12 +36,25 @@ class EvalConfig:
             1,
             math.inf,
             "repetitions",
-            "loss_clips",
             "batch_size",
             "action_draws",
             "report_clips",
             "localiser_steps",
         )
+
+    def weights_file(self, name: str) -> str:
+        """Returns the path of a metric's file in the directory ``weights``; "" if it is not there.
+
+        Raises:
+            ConfigError: the directory is missing.
+        """
+        if not self.weights:
+            return ""
+        directory = Path(self.weights)
+        require(directory.is_dir(), f"eval.weights is {directory}: no such directory; mend the path, or leave it empty")
+        if not (directory / name).exists():
+            return ""
+        return str(directory / name)
 
 
 FULL_SIZE_EVAL = EvalConfig(clips=1200, repetitions=5)  # the authors' numbers, for every family's full-size presets

@@ -30,6 +30,7 @@ from rsjax.evaluation.depth_estimator import DepthEstimator, estimate_depth
 from rsjax.evaluation.generation import OWN, Generation, teacher_forced
 from rsjax.evaluation.localiser import recorded_places, train_localiser
 from rsjax.evaluation.metrics import delta_psnr, fvd
+from rsjax.evaluation.metrics.lpips import check_lpips
 from rsjax.evaluation.protocols import Protocol, check, of_run
 from rsjax.evaluation.registry import Located, Metric, PerClip, PerFrame, Places, Scene, Unavailable, metrics
 from rsjax.evaluation.results import Curves, Evaluation
@@ -37,7 +38,6 @@ from rsjax.evaluation.shown import kept_frames, shown_arrays
 from rsjax.evaluation.statistics import bootstrap
 from rsjax.models.base import TeacherForced
 from rsjax.models.trained import TrainedModel
-from rsjax.tokenizers.lpips import load_lpips
 
 RANGE_CLIPS = 1000  # training clips that determine the range of uniform random actions
 LOCALISER_CLIPS = 1000  # training clips from which the localiser learns
@@ -51,14 +51,10 @@ def check_files(settings: EvalConfig) -> None:
     """Checks the weight files that metrics need, so that a run does not fail after hours of training.
 
     Raises:
-        UserError: a file is missing, damaged or of another network.
+        UserError: their directory is missing, or a file is damaged or of another network.
     """
-    if settings.lpips_alex_weights:
-        load_lpips(settings.lpips_alex_weights, "alexnet")
-    if settings.lpips_vgg_weights:
-        load_lpips(settings.lpips_vgg_weights, "vgg16")
-    if settings.fvd_weights:
-        fvd.check_i3d(settings.fvd_weights)
+    check_lpips(settings)
+    fvd.check_i3d(settings)
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,29 @@
 """FVD: the distance of the set of generated videos from the recorded set (Unterthiner et al. 2019, as in StyleGAN-V).
 
-FVD is the Fréchet distance between the features of an I3D network. The network is the file ``i3d_torchscript.pt``,
-which resizes frames to 224² itself and runs in PyTorch; without the file or PyTorch, the metric is unavailable. FVD is
+FVD is the Fréchet distance between the features of an I3D network. The network is the file ``i3d_torchscript.pt`` in
+``eval.weights``, which resizes frames to 224² itself and runs in PyTorch; without the file or PyTorch, the metric is unavailable. FVD is
 one number for all clips, without an interval. It depends on the number and length of the clips: compare only values
 where both are equal.
 """
 
 from functools import lru_cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from rsjax.config import EvalConfig
 from rsjax.errors import UserError, first_line
 from rsjax.evaluation.registry import Scene, Scores, Unavailable, metric
 from rsjax.progress import Progress
 
+FILE = "i3d_torchscript.pt"  # in the directory eval.weights
 _CLIPS = 4  # clips at a time, to limit memory
 
 
 class FvdError(UserError):
-    """The file of the I3D network is missing or damaged."""
+    """The file of the I3D network is damaged."""
 
 
 @metric("fvd", "FVD", better="lower", decimals=1, column=False)
@@ -45,15 +46,14 @@ def frechet_distance(one: Float[np.ndarray, "N D"], other: Float[np.ndarray, "M 
     return float(shift + np.square(a).sum() + np.square(b).sum() - 2 * shared)
 
 
-def check_i3d(path: str) -> None:
-    """Checks the file of the network, as far as that is possible without PyTorch.
+def check_i3d(settings: EvalConfig) -> None:
+    """Checks the file of the network, if it is there and PyTorch is installed.
 
     Raises:
-        FvdError: the file is missing or damaged.
+        FvdError: the file is damaged.
     """
-    if not Path(path).is_file():
-        raise FvdError(f"{path}: no such I3D network; mend eval.fvd_weights, or leave it empty")
-    if find_spec("torch"):
+    path = settings.weights_file(FILE)
+    if path and find_spec("torch"):
         _load(path)
 
 
@@ -74,14 +74,15 @@ def _truth_features(scene: Scene) -> Float[np.ndarray, "B D"]:
 
 def _features(scene: Scene, videos: UInt8[np.ndarray, "B T H W 3"]) -> Float[np.ndarray, "B D"]:
     """Returns the features of the predicted frames of each clip: I3D's last layer before the softmax."""
-    if not scene.settings.fvd_weights:
-        raise Unavailable("no network: --eval.fvd-weights i3d_torchscript.pt (docs/evaluation.md)")
+    path = scene.settings.weights_file(FILE)
+    if not path:
+        raise Unavailable(f"no {FILE} in eval.weights: put it there, then --eval.weights DIR (docs/evaluation.md)")
     if find_spec("torch") is None:
         raise Unavailable("FVD needs PyTorch: pip install -e '.[torch]'")
     import torch
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    network = _load(scene.settings.fvd_weights).to(device)
+    network = _load(path).to(device)
     parts = []
     frames = np.moveaxis(videos[:, scene.prompt_frames :], -1, 1)
     with Progress("FVD", len(frames), "videos") as progress, torch.no_grad():

@@ -1,6 +1,7 @@
 """LPIPS of frames (Zhang et al. 2018, version 0.1) with AlexNet and VGG16; RoboScape does not say which one it uses.
 
-The weights are files that ``python -m experiments.convert lpips`` makes; without its file, a metric is unavailable.
+The weights are files in ``eval.weights`` that ``python -m experiments.convert lpips`` makes; without its file, a metric
+is unavailable.
 """
 
 from typing import Any
@@ -10,20 +11,22 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rsjax.clip import Array
+from rsjax.config import EvalConfig
 from rsjax.evaluation.registry import PerClip, PerFrame, Scene, Unavailable, metric
 from rsjax.tokenizers.lpips import load_lpips, lpips, min_size
 
+FILES = {"alexnet": "lpips_alex.safetensors", "vgg16": "lpips_vgg.safetensors"}  # in the directory eval.weights
 _PAIRS = 8  # pairs of frames at a time, to limit memory: VGG's first layers hold 64 channels of full size
 
 
 def alex_frames(scene: Scene) -> PerFrame:
     """Scores every predicted frame with AlexNet."""
-    return _frames(scene, "alexnet", scene.settings.lpips_alex_weights, "--eval.lpips-alex-weights")
+    return _frames(scene, "alexnet")
 
 
 def vgg_frames(scene: Scene) -> PerFrame:
     """Scores every predicted frame with VGG16."""
-    return _frames(scene, "vgg16", scene.settings.lpips_vgg_weights, "--eval.lpips-vgg-weights")
+    return _frames(scene, "vgg16")
 
 
 @metric("lpips_alex", "LPIPS, AlexNet", better="lower", decimals=4, per_frame=alex_frames)
@@ -38,9 +41,23 @@ def vgg_score(scene: Scene) -> PerClip:
     return scene.shared(vgg_frames).mean(-1)
 
 
-def _frames(scene: Scene, net: str, path: str, option: str) -> PerFrame:
+def check_lpips(settings: EvalConfig) -> None:
+    """Checks the files of both networks, as far as they are there.
+
+    Raises:
+        LpipsError: a file is damaged or of the other network.
+    """
+    for net, name in FILES.items():
+        path = settings.weights_file(name)
+        if path:
+            load_lpips(path, net)
+
+
+def _frames(scene: Scene, net: str) -> PerFrame:
+    path = scene.settings.weights_file(FILES[net])
     if not path:
-        raise Unavailable(f"no weights: {option} FILE (python -m experiments.convert lpips makes it)")
+        made = f"python -m experiments.convert lpips IN DIR/{FILES[net]}"
+        raise Unavailable(f"no {FILES[net]} in eval.weights: {made}, then --eval.weights DIR")
     params = load_lpips(path, net)
     side = min(scene.truth.rgb.shape[2:4])
     if side < min_size(params):

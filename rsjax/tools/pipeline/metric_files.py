@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from rsjax.config import ConfigError, EvalConfig, require, to_dict
+from rsjax.config import ConfigError, EvalConfig, require
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator, DepthMaps
+from rsjax.evaluation.metrics import fvd
+from rsjax.evaluation.metrics.lpips import FILES
 from rsjax.files import content_hash
 from rsjax.tools.ingest.annotators.choose import choose
 from rsjax.tools.ingest.annotators.depth import inverse_of
@@ -91,7 +93,7 @@ def _annotator(settings: EvalConfig) -> Any:
 
 
 def by_content(settings: EvalConfig) -> EvalConfig:
-    """Returns the settings with a hash of each file's content in place of its path.
+    """Returns the settings with hashes of the files of weights in place of their directory.
 
     The depth estimator becomes the network's name and all its fields. In a checkout, which may contain other files
     than code, only Python files count.
@@ -99,8 +101,9 @@ def by_content(settings: EvalConfig) -> EvalConfig:
     Raises:
         UserError: a file cannot be read.
     """
-    files = {name: value for name, value in to_dict(settings).items() if name.endswith("_weights") and value}
-    hashes: dict[str, Any] = {name: content_hash(Path(value)) for name, value in files.items()}
+    files = {name: settings.weights_file(name) for name in (*FILES.values(), fvd.FILE)}
+    weights = [f"{name}:{content_hash(Path(path))}" for name, path in files.items() if path]
+    hashes: dict[str, Any] = {"weights": ",".join(weights)}
     annotator = _annotator(settings)
     if annotator is not None:
         fields = []

@@ -28,10 +28,12 @@ from rsjax.tools.studies.report.figures import ClipFigure, filmstrip
 from rsjax.trainable import Params
 from rsjax.training.validation import Validation, validation_loss
 
+LOSS_CLIPS = 1000  # spread evenly over the test split; more would only take time
+
 
 @dataclass(frozen=True)
 class WorldModelValidation:
-    """Computes the loss over ``eval.loss_clips`` test clips, and videos of ``eval.batch_size`` of them.
+    """Computes the loss over up to :data:`LOSS_CLIPS` test clips, and videos of ``eval.batch_size`` of them.
 
     The first call opens the run's stores.
     """
@@ -45,7 +47,7 @@ class WorldModelValidation:
             StoreError: the run's stores are missing, or their test split has no readable clip.
         """
         cfg = self.run.config
-        numbers = spread(self._prepared, cfg.eval.loss_clips)
+        numbers = spread(self._prepared, LOSS_CLIPS)
         batches = record_batches(self._model, self._assets.normalization, self._prepared, cfg.eval.batch_size, numbers)
         loss = validation_loss(self._model, weights, batches)
         scores, pictures = self._videos(step, weights)

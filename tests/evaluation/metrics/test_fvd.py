@@ -9,7 +9,7 @@ from scipy import linalg
 from rsjax.clip import Video
 from rsjax.config import EvalConfig
 from rsjax.evaluation.evaluate import check_files
-from rsjax.evaluation.metrics.fvd import FvdError, frechet_distance
+from rsjax.evaluation.metrics.fvd import FILE, FvdError, frechet_distance
 from rsjax.evaluation.registry import Scene, Unavailable
 from tests.evaluation.metrics.scored import score
 
@@ -48,7 +48,7 @@ def test_one_feature_by_hand_and_a_set_with_itself() -> None:
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that is called as I3D is, of which features are means over channels, first frame and last frame."""
     torch = pytest.importorskip("torch")
-    path = tmp_path_factory.mktemp("fvd") / "network.pt"
+    path = tmp_path_factory.mktemp("fvd") / FILE
     code = """
 def forward(self, x: Tensor, rescale: bool, resize: bool, return_features: bool) -> Tensor:
     assert rescale and resize and return_features and x.dim() == 5 and x.size(1) == 3
@@ -69,7 +69,7 @@ def scene(settings: EvalConfig, frames: int = 6) -> Scene:
 
 
 def test_the_network_sees_the_predicted_frames_as_channels_first_videos(network: Path) -> None:
-    given = scene(EvalConfig(fvd_weights=str(network)))
+    given = scene(EvalConfig(weights=str(network.parent)))
 
     def seen(video: Video) -> np.ndarray:
         later = video.rgb[:, 2:] / 255
@@ -82,21 +82,20 @@ def test_the_network_sees_the_predicted_frames_as_channels_first_videos(network:
 
 def test_clips_that_are_too_short_have_a_reason(network: Path) -> None:
     with pytest.raises(Unavailable, match="I3D refuses 2 frames of a clip"):
-        score("fvd", scene(EvalConfig(fvd_weights=str(network)), frames=4))
+        score("fvd", scene(EvalConfig(weights=str(network.parent)), frames=4))
 
 
-def test_without_network_or_torch_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(Unavailable, match=r"no network: --eval.fvd-weights i3d_torchscript.pt"):
+def test_without_network_or_torch_there_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / FILE).write_bytes(b"")
+    with pytest.raises(Unavailable, match=r"no i3d_torchscript.pt in eval.weights"):
         score("fvd", scene(EvalConfig()))
     monkeypatch.setattr("rsjax.evaluation.metrics.fvd.find_spec", lambda name: None)
     with pytest.raises(Unavailable, match="FVD needs PyTorch: pip install"):
-        score("fvd", scene(EvalConfig(fvd_weights="i3d_torchscript.pt")))
+        score("fvd", scene(EvalConfig(weights=str(tmp_path))))
 
 
-def test_a_missing_or_damaged_file_is_refused_at_the_start(tmp_path: Path) -> None:
-    with pytest.raises(FvdError, match=r"none.pt: no such I3D network; mend eval.fvd_weights"):
-        check_files(EvalConfig(fvd_weights="none.pt"))
+def test_a_damaged_file_is_refused_at_the_start(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    (tmp_path / "bad.pt").write_bytes(b"no network")
-    with pytest.raises(FvdError, match=r"bad.pt: not a TorchScript network"):
-        check_files(EvalConfig(fvd_weights=str(tmp_path / "bad.pt")))
+    (tmp_path / FILE).write_bytes(b"no network")
+    with pytest.raises(FvdError, match=r"i3d_torchscript.pt: not a TorchScript network"):
+        check_files(EvalConfig(weights=str(tmp_path)))

@@ -1,23 +1,23 @@
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
 from rsjax.clip import Video
-from rsjax.config import EvalConfig
+from rsjax.config import ConfigError, EvalConfig
 from rsjax.evaluation.evaluate import check_files
+from rsjax.evaluation.metrics.lpips import FILES
 from rsjax.evaluation.registry import Scene, Unavailable, metrics
 from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
 
-FIELDS = {"alexnet": ("lpips_alex", "lpips_alex_weights"), "vgg16": ("lpips_vgg", "lpips_vgg_weights")}
+METRICS = {"alexnet": "lpips_alex", "vgg16": "lpips_vgg"}
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Random weights of both networks, of the published sizes."""
-    paths = {net: tmp_path_factory.mktemp("lpips") / f"{net}.safetensors" for net in FIELDS}
+    paths = {net: tmp_path_factory.mktemp("lpips") / name for net, name in FILES.items()}
     for net, path in paths.items():
         rng, tensors = np.random.default_rng(0), {}
         for name, shape in lpips_shapes(net).items():
@@ -26,11 +26,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             tensors[name] = np.abs(values) if "head" in name else values
         save_file(tensors, path, metadata={"net": net})
     return paths
-
-
-def with_file(field: str, path: Path) -> EvalConfig:
-    settings: dict[str, Any] = {field: str(path)}
-    return EvalConfig(**settings)
 
 
 def scene(settings: EvalConfig, side: int = 32) -> Scene:
@@ -77,11 +72,10 @@ def plain_torch(net: str, path: Path, one: np.ndarray, other: np.ndarray) -> np.
     return sum(terms).numpy()
 
 
-@pytest.mark.parametrize("net", FIELDS)
+@pytest.mark.parametrize("net", METRICS)
 def test_the_metric_is_the_public_definition_over_predicted_frames(net: str, files: dict[str, Path]) -> None:
-    name, field = FIELDS[net]
-    given = scene(with_file(field, files[net]))
-    function = metrics()[name].function
+    given = scene(EvalConfig(weights=str(files[net].parent)))
+    function = metrics()[METRICS[net]].function
     assert function is not None
     truth, predicted = (video.rgb[:, 1:].reshape(-1, 32, 38, 3) for video in (given.truth, given.prediction))
     expected = plain_torch(net, files[net], truth, predicted).reshape(2, 2).mean(1)
@@ -89,20 +83,25 @@ def test_the_metric_is_the_public_definition_over_predicted_frames(net: str, fil
     np.testing.assert_array_equal(function(Scene(given.truth, given.truth, settings=given.settings)), 0)
 
 
-@pytest.mark.parametrize("net", FIELDS)
+@pytest.mark.parametrize("net", METRICS)
 def test_without_weights_or_room_there_is_a_reason_and_no_number(net: str, files: dict[str, Path]) -> None:
-    name, field = FIELDS[net]
-    function, flag = metrics()[name].function, f"--eval.{field.replace('_', '-')} FILE"
+    function = metrics()[METRICS[net]].function
     assert function is not None
-    with pytest.raises(Unavailable, match=rf"^no weights: {flag} \(python -m experiments.convert lpips"):
+    with pytest.raises(Unavailable, match=rf"^no {FILES[net]} in eval.weights: python -m experiments.convert lpips"):
         function(scene(EvalConfig()))
     with pytest.raises(Unavailable, match=f"frames of 15 pixels; LPIPS with {net} needs"):
-        function(scene(with_file(field, files[net]), side=15))
+        function(scene(EvalConfig(weights=str(files[net].parent)), side=15))
 
 
-def test_a_file_that_is_missing_or_of_the_other_network_is_refused_at_the_start(files: dict[str, Path]) -> None:
-    check_files(EvalConfig(lpips_alex_weights=str(files["alexnet"]), lpips_vgg_weights=str(files["vgg16"])))
-    with pytest.raises(LpipsError, match=r"vgg16.safetensors: these LPIPS weights are of vgg16, not of alexnet; name"):
-        check_files(EvalConfig(lpips_alex_weights=str(files["vgg16"])))
-    with pytest.raises(LpipsError, match="none.safetensors: no such LPIPS weights"):
-        check_files(EvalConfig(lpips_vgg_weights="none.safetensors"))
+def test_a_missing_directory_or_a_file_of_the_other_network_is_refused_at_the_start(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
+    for path in files.values():
+        check_files(EvalConfig(weights=str(path.parent)))
+    (tmp_path / FILES["alexnet"]).write_bytes(files["vgg16"].read_bytes())
+    with pytest.raises(
+        LpipsError, match=r"lpips_alex.safetensors: these LPIPS weights are of vgg16, not of"
+    ):
+        check_files(EvalConfig(weights=str(tmp_path)))
+    with pytest.raises(ConfigError, match="eval.weights is nowhere: no such directory"):
+        check_files(EvalConfig(weights="nowhere"))

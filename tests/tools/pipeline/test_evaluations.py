@@ -18,6 +18,7 @@ from rsjax.errors import UserError
 from rsjax.evaluation import evaluate as evaluation
 from rsjax.evaluation.depth_estimator import DepthEstimator
 from rsjax.evaluation.evaluate import EvaluationClips
+from rsjax.evaluation.metrics import fvd
 from rsjax.evaluation.protocols import Protocol, find
 from rsjax.evaluation.results import Evaluation, read_frames, read_result
 from rsjax.files import write_json
@@ -149,16 +150,17 @@ def test_other_weights_of_a_metric_at_the_same_path_are_evaluated_anew(
     monkeypatch.setattr(evaluation, "check_files", lambda settings: None)
 
     def evaluated(name: str) -> str:
-        settings = {"fvd_weights": str(tmp_path / name)}
+        settings = {"weights": str(tmp_path / name)}
         return read_result(*evaluate_run(run.directory, run.data_directory, Request("run", settings=settings))).key
 
-    (tmp_path / "i3d").write_bytes(b"1")
+    (tmp_path / "i3d").mkdir()
+    (tmp_path / "i3d" / fvd.FILE).write_bytes(b"1")
     first = evaluated("i3d")
     MADE.clear()
     (tmp_path / "i3d").rename(tmp_path / "moved")
     assert evaluated("moved") == first
     assert not MADE
-    (tmp_path / "moved").write_bytes(b"2")
+    (tmp_path / "moved" / fvd.FILE).write_bytes(b"2")
     assert evaluated("moved") != first
     assert len(MADE) == 1
 
@@ -289,7 +291,7 @@ def test_a_comparison_of_a_run_with_itself(
         (Request("paper", CHANGES, splits=("unseen",)), "no split 'unseen'; it has train, test: choose with --split"),
         (Request("unseen", CHANGES), r"no split 'unseen\*'; it has train, test"),
         (Request("paper", CHANGES, data=Path("nowhere")), "nowhere: not there"),
-        (Request("paper", CHANGES, {"lpips_alex_weights": "none.npz"}), "none.npz"),
+        (Request("paper", CHANGES, {"weights": "nowhere"}), "eval.weights is nowhere: no such directory"),
     ],
 )
 def test_what_cannot_be_evaluated_is_one_line(run: Run, request_: Request, says: str) -> None:

@@ -17,6 +17,7 @@ from rsjax.config import (
     sampling_settings,
     to_dict,
 )
+from rsjax.evaluation.metrics import fvd
 from rsjax.tools.pipeline import run as module
 from rsjax.tools.pipeline.run import STAGES, TRAINED, Run, RunError
 from tests.models.toy_family import ToyConfig
@@ -267,13 +268,15 @@ def test_killed_while_it_overwrites_it_leaves_nothing_to_resume(
 def test_files_of_weights_enter_the_key_by_their_content(tmp_path: Path) -> None:
     def key(name: str) -> str:
         module._hashed.cache_clear()  # as in another process
-        return keys(changed("eval.fvd_weights", str(tmp_path / name)))["evaluation"]
+        return keys(changed("eval.weights", str(tmp_path / name)))["evaluation"]
 
-    (tmp_path / "one").write_bytes(b"1")
-    (tmp_path / "two").write_bytes(b"1")
+    for name in ("one", "two", "empty"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "one" / fvd.FILE).write_bytes(b"1")
+    (tmp_path / "two" / fvd.FILE).write_bytes(b"1")
     first = key("one")
-    assert key("two") == first != key("missing")
-    (tmp_path / "one").write_bytes(b"2")
+    assert key("two") == first != key("empty")
+    (tmp_path / "one" / fvd.FILE).write_bytes(b"2")
     assert first != key("one") != keys(DEBUG)["evaluation"]
 
 
