@@ -1,9 +1,9 @@
 """FVD: the distance of the set of generated videos from the recorded set (Unterthiner et al. 2019, as in StyleGAN-V).
 
 FVD is the Fréchet distance between the features of an I3D network. The network is the file ``i3d_torchscript.pt`` in
-``eval.weights``, which resizes frames to 224² itself and runs in PyTorch; without the file or PyTorch, the metric is unavailable. FVD is
-one number for all clips, without an interval. It depends on the number and length of the clips: compare only values
-where both are equal.
+``eval.weights``. It resizes frames to 224² itself and runs in PyTorch; without the file or PyTorch, the metric is
+unavailable. FVD is one number for all clips, without an interval. It depends on the number and length of the clips:
+compare only values where both are equal.
 """
 
 from functools import lru_cache

@@ -99,9 +99,7 @@ def test_a_missing_directory_or_a_file_of_the_other_network_is_refused_at_the_st
     for path in files.values():
         check_files(EvalConfig(weights=str(path.parent)))
     (tmp_path / FILES["alexnet"]).write_bytes(files["vgg16"].read_bytes())
-    with pytest.raises(
-        LpipsError, match=r"lpips_alex.safetensors: these LPIPS weights are of vgg16, not of"
-    ):
+    with pytest.raises(LpipsError, match=r"lpips_alex.safetensors: these LPIPS weights are of vgg16, not of"):
         check_files(EvalConfig(weights=str(tmp_path)))
     with pytest.raises(ConfigError, match="eval.weights is nowhere: no such directory"):
         check_files(EvalConfig(weights="nowhere"))
