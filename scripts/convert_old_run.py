@@ -82,7 +82,9 @@ def split_model(model: dict[str, Any]) -> None:
 
 
 def split_tokenizer_train(train: dict[str, Any]) -> None:
-    """Makes a section of the adversarial terms, which can be off, and drops constants."""
+    """Makes sections of the perceptual and the adversarial terms, which can be off, and drops constants."""
+    perceptual = {"weight": train.pop("perceptual_weight"), "lpips": train.pop("lpips_weights")}
+    train["perceptual"] = perceptual if perceptual["weight"] else None
     names = {"adversarial_weight": "weight", "disc_start": "start"}
     names |= {"lecam_weight": "lecam_weight", "lecam_decay": "lecam_decay"}
     adversarial = {new: train.pop(name) for name, new in names.items()}

@@ -33,7 +33,7 @@ from rsjax.config.token_model import (
     TokenModelConfig,
     TransformerConfig,
 )
-from rsjax.config.tokenizer import AdversarialConfig, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config.tokenizer import AdversarialConfig, PerceptualConfig, TokenizerConfig, TokenizerTrainConfig
 from rsjax.config.train import (
     AdamW,
     ComponentConfig,
@@ -63,6 +63,7 @@ __all__ = [
     "ModelConfig",
     "Muon",
     "OptimizerConfig",
+    "PerceptualConfig",
     "PublicCodeConfig",
     "RoboScapeConfig",
     "RuntimeConfig",

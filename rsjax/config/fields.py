@@ -101,7 +101,9 @@ def section_choices(hint: Any) -> dict[str, Any]:
     kinds = [kind for kind in options if dataclasses.is_dataclass(kind)]
     if not kinds or any(f.default is dataclasses.MISSING for kind in kinds for f in dataclasses.fields(kind)):
         return {}
-    words: dict[str, Any] = {getattr(kind, "kind", "on"): kind for kind in kinds}
+    words: dict[str, Any] = {"on": kinds[0]}
+    if len(kinds) > 1:
+        words = {kind.kind: kind for kind in kinds}
     if type(None) in options:
         words["off"] = None
     return words

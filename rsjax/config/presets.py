@@ -14,6 +14,7 @@ from rsjax.config import (
     GenieConfig,
     LossConfig,
     Muon,
+    PerceptualConfig,
     RoboScapeConfig,
     RuntimeConfig,
     SampleConfig,
@@ -194,7 +195,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
         sim=SimConfig(image_size=256),
         tokenizer=TokenizerConfig(compute_dtype="bfloat16"),
         # Open-MAGVIT2: Adam, 256 images a step, 270 epochs of ImageNet, the rate divided by 10 after 200 and 250 of
-        # them. LPIPS needs the path of its weights, --tokenizer-train.lpips-weights.
+        # them. LPIPS needs the path of its weights, --tokenizer-train.perceptual.lpips.
         tokenizer_train=TokenizerTrainConfig(
             steps=1_350_000,
             batch_size=64,
@@ -204,7 +205,7 @@ def _full_size(name: str, model: RoboScapeConfig | GenieConfig) -> Config:
             ),
             ema=0.999,
             flip=True,
-            perceptual_weight=1.0,
+            perceptual=PerceptualConfig(),
             entropy_group=8,
             adversarial=AdversarialConfig(),
         ),

@@ -87,6 +87,18 @@ class TokenizerConfig:
 
 
 @dataclass(frozen=True)
+class PerceptualConfig:
+    """The LPIPS term, as in the reference."""
+
+    weight: float = 1.0
+    # A safetensors file of python -m experiments.convert lpips; empty: the term is skipped, with a note.
+    lpips: str = ""
+
+    def __post_init__(self) -> None:
+        require_range(self, "tokenizer_train.perceptual", 0, math.inf, "weight")
+
+
+@dataclass(frozen=True)
 class AdversarialConfig:
     """A discriminator beside the tokenizer, as in the reference. It needs images of a certain size."""
 
@@ -117,8 +129,7 @@ class TokenizerTrainConfig(TrainConfig):
     flip: bool = False  # mirror half of the images
     l1_weight: float = 1.0
     l2_weight: float = 0.0  # not in the reference; raises the PSNR of small models without LPIPS
-    perceptual_weight: float = 0.0  # LPIPS, 1.0 in the reference; needs lpips_weights
-    lpips_weights: str = ""  # a safetensors file for rsjax.tokenizers.lpips.load_lpips
+    perceptual: PerceptualConfig | None = None  # on in the reference
     entropy_weight: float = 0.1
     # Added to the average code's probabilities p in log p, as in the reference; 0: the true entropy.
     entropy_offset: float = 1e-5
@@ -141,16 +152,16 @@ class TokenizerTrainConfig(TrainConfig):
 
     @property
     def lpips_missing(self) -> bool:
-        """Whether the LPIPS term has a weight but no weights file, so that it is skipped."""
-        return self.perceptual_weight > 0 and not self.lpips_weights
+        """Whether the LPIPS term is on but has no file of weights, so that it is skipped."""
+        return self.perceptual is not None and not self.perceptual.lpips
 
     @property
     def loss_weights(self) -> dict[str, float]:
         """The weight of each active loss term by name; 0 for the discriminator's mean logits, which are only logged."""
         names = ["l1", "l2", "entropy", "commitment"]
-        if self.perceptual_weight > 0 and self.lpips_weights:
-            names.append("perceptual")
         weights = {name: getattr(self, f"{name}_weight") for name in names}
+        if self.perceptual is not None and self.perceptual.lpips:
+            weights["perceptual"] = self.perceptual.weight
         if self.adversarial is not None:
             weights |= {"adversarial": self.adversarial.weight, "hinge": HINGE, "lecam": self.adversarial.lecam_weight}
             weights |= {"real_logit": 0.0, "fake_logit": 0.0}

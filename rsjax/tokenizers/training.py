@@ -76,7 +76,7 @@ class TokenizerTraining(Autoencoder[Images]):
         """Returns LeCAM's averages and LPIPS's weights, which would otherwise be 59 MB of constants in the program.
 
         Raises:
-            LpipsError: the file ``train.lpips_weights`` is missing or damaged.
+            LpipsError: the file ``train.perceptual.lpips`` is missing or damaged.
             ConfigError: images are too small for the LPIPS network.
         """
         extra: dict[str, Any] = {}
@@ -203,14 +203,16 @@ def lpips_weights(train: TokenizerTrainConfig, image_size: int) -> dict[str, Any
     """Returns the weights of the LPIPS term.
 
     Raises:
-        LpipsError: the file ``train.lpips_weights`` is missing or damaged.
+        LpipsError: the file ``train.perceptual.lpips`` is missing or damaged.
         ConfigError: images are too small for the LPIPS network.
     """
-    weights = load_lpips(train.lpips_weights)
+    assert train.perceptual is not None
+    path = train.perceptual.lpips
+    weights = load_lpips(path)
     require(
         image_size >= min_size(weights),
-        f"clips have images of {image_size} pixels; the LPIPS network of {train.lpips_weights} "
-        f"needs at least {min_size(weights)}, or tokenizer_train.perceptual_weight 0",
+        f"clips have images of {image_size} pixels; the LPIPS network of {path} needs at least {min_size(weights)}, "
+        f"or tokenizer_train.perceptual off",
     )
     return jax.tree.map(jnp.array, weights)
 

@@ -26,7 +26,8 @@ def test_config_fields_are_the_configurations_json_by_dotted_names() -> None:
     for name, field in known.items():
         if not field.section:
             assert saved[name] == (list(field.value) if isinstance(field.value, tuple) else field.value)
-    assert set(saved) - set(known) == {"model.family"}
+    classes = {"model.family", "train.optimizer.kind", "tokenizer_train.optimizer.kind"}
+    assert set(saved) - set(known) == classes
     assert known["runtime.log_every"].runtime
     assert not known["train.steps"].runtime
 

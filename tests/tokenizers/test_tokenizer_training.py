@@ -11,7 +11,14 @@ import optax
 import pytest
 from safetensors.numpy import save_file
 
-from rsjax.config import AdversarialConfig, ConfigError, LoopConfig, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config import (
+    AdversarialConfig,
+    ConfigError,
+    LoopConfig,
+    PerceptualConfig,
+    TokenizerConfig,
+    TokenizerTrainConfig,
+)
 from rsjax.tokenizers import training as module
 from rsjax.tokenizers.lpips import LpipsError, lpips_shapes
 from rsjax.tokenizers.magvit2 import Tokenizer
@@ -24,7 +31,7 @@ from tests.training.toy import QUICK
 
 CONFIG = TokenizerConfig(patch_size=4, channels=8, channel_multipliers=(1,), res_blocks=1, norm_groups=4, code_bits=4)
 PLAIN = TokenizerTrainConfig(steps=4, ema=0.9)
-WHOLE = replace(PLAIN, adversarial=AdversarialConfig(lecam_decay=0.5), perceptual_weight=1.0)
+WHOLE = replace(PLAIN, adversarial=AdversarialConfig(lecam_decay=0.5), perceptual=PerceptualConfig())
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 24, 24, 3), np.uint8)
 
 
@@ -97,15 +104,16 @@ def test_the_weights_of_lpips_are_read_from_their_file_and_never_change(tmp_path
     tensors = {n: np.full(s, 0.01, np.float32) for n, s in lpips_shapes("alexnet").items()}
     path = tmp_path / "alexnet.safetensors"
     save_file(tensors, path, metadata={"net": "alexnet"})
-    train = replace(PLAIN, perceptual_weight=1.0, lpips_weights=str(path))
+    train = replace(PLAIN, perceptual=PerceptualConfig(lpips=str(path)))
     training = TokenizerTraining(CONFIG, train, 32)
     extra = training.init_extra()
     assert extra is not None
     np.testing.assert_array_equal(extra["lpips"]["head"]["4"]["weight"], tensors["head.4.weight"])
     assert training.next_extra(extra, {}) is extra
     assert hash(training) == hash(replace(training))
+    other = replace(train, perceptual=PerceptualConfig(lpips=str(tmp_path / "other")))
     with pytest.raises(LpipsError, match="no such LPIPS weights"):
-        TokenizerTraining(CONFIG, replace(train, lpips_weights=str(tmp_path / "other")), 24).init_extra()
+        TokenizerTraining(CONFIG, other, 24).init_extra()
     with pytest.raises(ConfigError, match="images of 24 pixels; the LPIPS network of .* needs at least 31"):
         TokenizerTraining(CONFIG, train, 24).init_extra()
 
@@ -113,7 +121,7 @@ def test_the_weights_of_lpips_are_read_from_their_file_and_never_change(tmp_path
 def test_a_step_with_lpips_can_be_saved_and_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     weights = narrow("alexnet")
     monkeypatch.setattr(module, "load_lpips", lambda path: weights)
-    training = TokenizerTraining(CONFIG, replace(PLAIN, perceptual_weight=1.0, lpips_weights="narrow"), 32)
+    training = TokenizerTraining(CONFIG, replace(PLAIN, perceptual=PerceptualConfig(lpips="narrow")), 32)
     images = np.random.default_rng(0).integers(0, 256, (1, 32, 32, 3), np.uint8)
     begun = fresh(training)
     stepped, metrics = jax.jit(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rsjax.config import AdversarialConfig, ConfigError, TokenizerConfig, TokenizerTrainConfig
+from rsjax.config import AdversarialConfig, ConfigError, PerceptualConfig, TokenizerConfig, TokenizerTrainConfig
 from rsjax.errors import UserError
 from rsjax.tokenizers import lfq
 from rsjax.tokenizers.adversarial import adversarial_terms, initial_averages
@@ -72,7 +72,7 @@ def test_the_whole_loss_is_the_sum_of_its_parts() -> None:
     """The judging networks see the tokenizer's images as they are, and the names are those of the weights."""
     config = replace(CONFIG, patch_size=4)
     adversarial = AdversarialConfig(start=3)
-    train = TokenizerTrainConfig(perceptual_weight=1.0, lpips_weights="not read here", adversarial=adversarial)
+    train = TokenizerTrainConfig(perceptual=PerceptualConfig(lpips="not read here"), adversarial=adversarial)
     rng = np.random.default_rng(0)
     inits = {"generator": Tokenizer(config).init_params, "discriminator": Discriminator().init_params}
     shapes = {name: jax.eval_shape(init, jax.random.key(0)) for name, init in inits.items()}
@@ -103,10 +103,10 @@ def test_the_whole_loss_is_the_sum_of_its_parts() -> None:
 
 
 def test_lpips_without_weights_is_off_and_says_so() -> None:
-    train = TokenizerTrainConfig(perceptual_weight=1.0)
+    train = TokenizerTrainConfig(perceptual=PerceptualConfig())
     assert train.lpips_missing
     assert "perceptual" not in train.loss_weights
-    with_weights = replace(train, lpips_weights="somewhere")
+    with_weights = replace(train, perceptual=PerceptualConfig(lpips="somewhere"))
     assert not with_weights.lpips_missing
     assert with_weights.loss_weights["perceptual"] == 1.0
     assert not TokenizerTrainConfig().lpips_missing
@@ -122,8 +122,7 @@ def test_images_too_small_for_the_discriminator_are_refused() -> None:
 
 def test_without_weights_the_judging_networks_are_off() -> None:
     """Then training has neither their parameters nor their terms."""
-    off = TokenizerTrainConfig(perceptual_weight=0.0, lpips_weights="not read here")
-    training = TokenizerTraining(CONFIG, off, 8)
+    training = TokenizerTraining(CONFIG, TokenizerTrainConfig(), 8)
     assert training.loss_weights.keys() == {"l1", "l2", "entropy", "commitment"}
     assert training.init_extra() is None
     assert jax.eval_shape(training.init, jax.random.key(0)).keys() == {"encoder", "decoder"}

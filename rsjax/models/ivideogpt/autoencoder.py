@@ -62,11 +62,9 @@ class ConditionalVQTraining(Autoencoder[Batch]):
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        names = ["l1", "l2", "commitment"]
-        if self.train.lpips_weights:
-            names.insert(2, "perceptual")
-        weights = {name: getattr(self.train, f"{name}_weight") for name in names}
-        return {name: x for name, x in weights.items() if x} | {"codebook": self.config.codebook_weight}
+        weights = self.train.loss_weights
+        used = {name: weights.get(name) for name in ("l1", "l2", "perceptual", "commitment")}
+        return {name: weight for name, weight in used.items() if weight} | {"codebook": self.config.codebook_weight}
 
     def init(self, key: Key[Array, ""]) -> Params:
         return ConditionalVQ(self.config).init_params(key, self.image_size)

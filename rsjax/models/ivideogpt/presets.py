@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from rsjax.config.run import FULL_SIZE_EVAL, Config
 from rsjax.config.sim import SimConfig
-from rsjax.config.tokenizer import TokenizerTrainConfig
+from rsjax.config.tokenizer import PerceptualConfig, TokenizerTrainConfig
 from rsjax.config.train import AdamW, Muon, RuntimeConfig, TrainConfig
 from rsjax.models.ivideogpt.config import ConditionalVQConfig, IVideoGPTConfig
 
@@ -21,7 +21,7 @@ def ivideogpt_256() -> Config:
 
 
 def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
-    # LPIPS needs the path of its weights, --tokenizer-train.lpips-weights.
+    # LPIPS needs the path of its weights, --tokenizer-train.perceptual.lpips.
     constant = AdamW(learning_rate=5e-4, warmup_steps=500, schedule="steps", betas=(0.9, 0.999))
     cosine = AdamW(
         warmup_steps=5000, betas=(0.9, 0.999), weight_decay=0.01, final_share=0.0, grad_clip=0.0, learning_rate=1e-4
@@ -36,7 +36,7 @@ def _public(name: str, size: int, model: IVideoGPTConfig) -> Config:
             frames_per_clip=8,
             depth_share=0.0,
             optimizer=constant,
-            perceptual_weight=1.0,
+            perceptual=PerceptualConfig(),
             commitment_weight=1.0,
         ),
         model=replace(model, compute_dtype="bfloat16", remat="blocks"),

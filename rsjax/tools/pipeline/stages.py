@@ -144,7 +144,7 @@ def train_tokenizer(run: Run, resume: bool) -> None:
     cfg = run.config
     train = cfg.tokenizer_train
     if train.lpips_missing:
-        note("the LPIPS term is off: tokenizer_train.lpips_weights is empty (docs/tokenizer.md says how to make them)")
+        note("the LPIPS term is off: tokenizer_train.perceptual.lpips is empty (docs/tokenizer.md says how to make it)")
     # Checks the world model's curriculum and clips before the tokenizer is trained.
     for store in check_stages(cfg.train, run.open_clips()):
         create_model(cfg).check_clips(store)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from rsjax.config import AdversarialConfig, LoopConfig, TokenizerTrainConfig
+from rsjax.config import AdversarialConfig, LoopConfig, PerceptualConfig, TokenizerTrainConfig
 from rsjax.data.store import write_store
 from rsjax.models.load_run import load_tokenizer
 from rsjax.models.roboscape.model import RoboScape
@@ -20,7 +20,7 @@ from rsjax.training.state import TrainState, create_state
 from tests.models.toy_family import ToyConfig
 from tests.tools.pipeline import toy
 
-WHOLE = TokenizerTrainConfig(steps=2, perceptual_weight=1.0, adversarial=AdversarialConfig())
+WHOLE = TokenizerTrainConfig(steps=2, perceptual=PerceptualConfig(), adversarial=AdversarialConfig())
 
 
 def staged(train: TokenizerTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Run, TrainState]:
@@ -45,13 +45,13 @@ def test_the_discriminator_stays_behind_and_the_missing_term_is_noted_once(
     run, state = staged(WHOLE, tmp_path, monkeypatch)
     assert "discriminator" in state.params
     jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params["generator"])
-    assert capsys.readouterr().out.count("the LPIPS term is off: tokenizer_train.lpips_weights is empty") == 1
+    assert capsys.readouterr().out.count("the LPIPS term is off: tokenizer_train.perceptual.lpips is empty") == 1
 
 
 def test_a_term_that_is_off_is_not_missed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, state = staged(replace(WHOLE, perceptual_weight=0.0, adversarial=None), tmp_path, monkeypatch)
+    run, state = staged(replace(WHOLE, perceptual=None, adversarial=None), tmp_path, monkeypatch)
     jax.tree.map(np.testing.assert_array_equal, load_tokenizer(run.config, run.directory), state.params)
     assert "LPIPS" not in capsys.readouterr().out
 
