@@ -98,7 +98,7 @@ def section_choices(hint: Any) -> dict[str, Any]:
     are no words without a choice, or if a class has fields without a default.
     """
     options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
-    kinds = [kind for kind in options if dataclasses.is_dataclass(kind)]
+    kinds: list[Any] = [kind for kind in options if dataclasses.is_dataclass(kind)]
     if not kinds or any(f.default is dataclasses.MISSING for kind in kinds for f in dataclasses.fields(kind)):
         return {}
     words: dict[str, Any] = {"on": kinds[0]}
