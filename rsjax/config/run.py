@@ -20,8 +20,8 @@ class EvalConfig:
 
     clips: int = 20  # clips that are scored, spread evenly over the test split
     repetitions: int = 1  # how often each clip is generated, with different random draws
-    batch_size: int = 10
-    action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR
+    batch_size: int = 10  # clips that are generated at once; lower it where memory runs out
+    action_draws: int = 3  # random action sequences per clip and kind of ΔPSNR; fewer are faster and noisier
     report_clips: int = 4  # clips shown in the report: half typical ones, half the worst
     localiser_steps: int = 500  # training steps of the network that finds cube and gripper in frames
     # A directory with files that are not part of this project: lpips_alex.safetensors and lpips_vgg.safetensors of

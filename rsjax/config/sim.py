@@ -19,18 +19,18 @@ CONTROLS = {
 class SimConfig:
     """Episodes collected in a simulator (:mod:`rsjax.tools.sim`)."""
 
-    episodes: int = 200
+    episodes: int = 200  # those of the test split included; more where training clips are learned by heart
     test_episodes: int = 20  # the last ones collected, never used in training
-    frames: int = 16
+    frames: int = 16  # of a clip, as in the paper
     # Control steps between frames, at 20 Hz in lift and 80 Hz in metaworld; a frame's action is their concatenation.
     control_steps: int = 4
-    image_size: int = 64
+    image_size: int = 64  # pixels a side; 256 in the paper
     camera: str = "agentview"  # near: our own, in which objects and gripper are larger
-    tracks: int = 256  # N₀: dense keypoint tracks per clip
+    tracks: int = 256  # N₀: dense keypoint tracks per clip, of which the loss takes the K that move most
     # Where tracks start. grid: evenly over the image, as in the paper, which avoids segmentation on purpose.
     # objects: up to half on a grid, the others on the objects and the arm's moving links, found by segmentation.
     track_points: Literal["grid", "objects"] = "grid"
-    seed: int = 0
+    seed: int = 0  # of the scenes and the motions
     workers: int = runtime(0)  # 0: one process per core
     env: Literal["lift", "metaworld"] = "lift"
     tasks: tuple[str, ...] = ()  # of Meta-World; none: the 45 training tasks of its ML45 benchmark

@@ -115,7 +115,7 @@ class Departures:
 class SampleConfig:
     """Settings of MaskGIT decoding within a frame, and of the memory from frame to frame."""
 
-    steps: int = 2
+    steps: int = 2  # decoding steps per frame; each is a pass of the network
     # Logits are divided by it; 0 takes the most probable code. The public Genie divides probabilities, which are then
     # normalised again, so that every temperature above 0 samples as 1 does here.
     temperature: float = 0.0
@@ -192,9 +192,9 @@ class TransformerConfig:
     # linear: one linear layer (RoboScape). mlp: an MLP (the paper's Genie with actions), whose last layer starts at
     # zero, so that public weights keep their logits. none: no actions (the public Genie).
     action_encoder: Literal["linear", "mlp", "none"] = "linear"
-    width: int = 256
-    blocks: int = 32
-    heads: int = 8
+    width: int = 256  # channels; the size of a model in the paper: 256, 512 or 1024
+    blocks: int = 32  # of each branch
+    heads: int = 8  # of each attention; more where a head would be wider than 64 channels
     # bfloat16: operands of linear layers (accumulated in float32) and, on an accelerator or in frames of 128 cells or
     # more, of attention within frames. Parameters, norms and softmaxes stay float32. CPUs without bf16 units still
     # multiply linear layers in float32, which is faster there.
@@ -204,7 +204,7 @@ class TransformerConfig:
     # but linear layers' outputs are kept too (less work, more memory).
     remat: Literal["none", "products", "blocks"] = runtime("none")
     public_code: PublicCodeConfig | None = None
-    departures: Departures = Departures()
+    departures: Departures = Departures()  # what the paper does not have
 
     def __post_init__(self) -> None:
         for name in ("width", "blocks", "heads", "unroll"):
@@ -282,7 +282,7 @@ class RoboScapeConfig(TokenModelConfig):
     """RoboScape: the dual-branch transformer with the physics-informed objective (paper §2.3)."""
 
     use_depth: bool = True  # False: without the depth branch, its projections and the depth term
-    loss: LossConfig = LossConfig()
+    loss: LossConfig = LossConfig()  # λ₁, λ₂, λ₃ and γ
 
     @property
     def uses_depth(self) -> bool:

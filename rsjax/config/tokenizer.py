@@ -15,10 +15,10 @@ class TokenizerConfig:
     """MAGVIT-2 encoder and decoder with lookup-free quantisation (reference: Open-MAGVIT2)."""
 
     patch_size: int = 1  # space-to-depth before the first convolution; 1 as in MAGVIT-2, larger is cheaper
-    channels: int = 128
+    channels: int = 128  # of the first level; times its multiplier, of each other one
     channel_multipliers: tuple[int, ...] = (1, 1, 2, 2, 4)  # one per level; every level but the last halves the grid
-    res_blocks: int = 2
-    norm_groups: int = 32
+    res_blocks: int = 2  # of each level, in the encoder and in the decoder
+    norm_groups: int = 32  # of each group norm; smaller where it has to divide fewer channels
     # Normalises each level of the decoder by the codes' statistics. The older public generation has 2 residual blocks
     # per level and False, the newer 4 and True.
     adaptive_norm: bool = False
@@ -26,7 +26,7 @@ class TokenizerConfig:
     # instead of the whole image. Otherwise a moving arm changes codes far from it, which the world model has to predict
     # too. Not in MAGVIT-2.
     local_codes: bool = False
-    code_bits: int = 18  # D: one token is D bits, a vocabulary of 2^D
+    code_bits: int = 18  # D: one token is D bits, a vocabulary of 2^D; fewer are easier to predict, and coarser
     vocabularies: int = 2  # n: the vocabulary of 2^D is factorised into n of 2^(D/n)
     # The paper tokenizes depth with the same MAGVIT-2; its colour map is unpublished (see rsjax/data/depth_color.py).
     depth_scale: Literal["linear", "inverse"] = "inverse"
@@ -124,18 +124,18 @@ class TokenizerTrainConfig(TrainConfig):
 
     # Not a runtime field here: the entropy, the discriminator's batch norm and LeCAM are computed for each part.
     accumulate: int = 1
-    frames_per_clip: int = 4
+    frames_per_clip: int = 4  # fewer make a batch of more clips, which differ more than frames of one clip do
     depth_share: float = 0.25  # share of the drawn frames that are replaced by their colourised depth map
     flip: bool = False  # mirror half of the images
-    l1_weight: float = 1.0
-    l2_weight: float = 0.0  # not in the reference; raises the PSNR of small models without LPIPS
+    l1_weight: float = 1.0  # mean absolute error
+    l2_weight: float = 0.0  # mean squared error; not in the reference; raises the PSNR of small models without LPIPS
     perceptual: PerceptualConfig | None = None  # on in the reference
-    entropy_weight: float = 0.1
+    entropy_weight: float = 0.1  # higher spreads codes further, at the cost of reconstruction
     # Added to the average code's probabilities p in log p, as in the reference; 0: the true entropy.
     entropy_offset: float = 1e-5
     # Images that share an average code; 0: all of the batch, on all devices. 8 in the reference: those of one device.
     entropy_group: int = 0
-    commitment_weight: float = 0.25
+    commitment_weight: float = 0.25  # pulls the encoder's output towards its codes
     adversarial: AdversarialConfig | None = None  # on in the reference
 
     def __post_init__(self) -> None:

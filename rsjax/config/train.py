@@ -12,7 +12,7 @@ class ScheduleConfig:
     """The learning rate: linear warm-up to the peak, then a schedule down to a share of it."""
 
     learning_rate: float = 1e-4  # the peak
-    warmup_steps: int = 50
+    warmup_steps: int = 50  # more where the loss jumps early
     # cosine and linear decay from the peak to final_share of it; wsd (warm-up, stable, decay) decays only in the last
     # fifth of the run.
     schedule: Literal["cosine", "linear", "wsd"] = "cosine"
@@ -34,7 +34,7 @@ class AdamW(ScheduleConfig):
     schedule: Literal["cosine", "linear", "wsd", "steps"] = "cosine"  # type: ignore[assignment]
     drop_at: tuple[float, ...] = ()
     betas: tuple[float, float] = (0.9, 0.95)  # decay of the averages of gradients and of their squares
-    weight_decay: float = 0.0
+    weight_decay: float = 0.0  # decoupled from the gradient; against overfitting in many epochs
     grad_clip: float = 1.0  # 0: none
 
     def __post_init__(self) -> None:
@@ -115,11 +115,11 @@ class TrainConfig:
 
     section: ClassVar[str] = "train"  # of a configuration, for messages
 
-    steps: int = 1000
-    batch_size: int = 8  # over all devices
+    steps: int = 1000  # ignored with a curriculum
+    batch_size: int = 8  # clips of a step, over all devices
     optimizer: AdamW | Muon = AdamW()
     ema: float = 0.0  # decay of the averaged weights that later stages use; 0: no averaging
-    seed: int = 0
+    seed: int = 0  # of the initial weights and of all draws; compare results over several
     # A run directory, or one made by python -m experiments.convert, whose weights training starts from. With it, steps
     # may be 0, which uses the weights unchanged. The content key covers the path, not the files.
     start_from: str = ""
@@ -142,8 +142,8 @@ class TrainConfig:
 class RuntimeConfig:
     """How the trainings of a run are computed, logged and saved; nothing here changes their results."""
 
-    log_every: int = runtime(20)  # steps
-    checkpoint_every: int = runtime(200)  # steps
+    log_every: int = runtime(20)  # steps between lines of the log
+    checkpoint_every: int = runtime(200)  # steps between checkpoints, which an interruption may cost
     eval_every: int = runtime(0)  # steps between validations, with pictures; 0: none
     # jit: one device. pmap: data parallel. mesh: jit over a mesh of data × fsdp devices, with parameters and optimizer
     # state split into ``fsdp`` parts. pmap and mesh use all devices of all hosts. auto: pmap over as many local devices
