@@ -2,7 +2,7 @@
 
 ``python scripts/convert_old_run.py runs/*``. A file that is up to date stays as it is; the old one is kept as
 config.old.json. Stages of the run get new keys, so that ``experiments.train`` asks for --overwrite; generating and
-evaluating work as before.
+evaluating work as before. Weights of LPIPS and FVD now lie in one directory: name it with --eval.weights.
 """
 
 import json
@@ -34,6 +34,7 @@ def upgraded(config: dict[str, Any]) -> dict[str, Any]:
         upgrade_model(model)
     if "mask" in model:
         split_model(model)
+    if "adversarial_weight" in config["tokenizer_train"]:
         split_tokenizer_train(config["tokenizer_train"])
         gather_weights(config["eval"])
         for section in ("tokenizer_train", "train"):
@@ -73,6 +74,8 @@ def split_model(model: dict[str, Any]) -> None:
     public = {name: model.pop(name) for name in ("qk_norm", "mup", "mlp_ratio")}
     model["public_code"] = public if public != {"qk_norm": False, "mup": False, "mlp_ratio": 4} else None
     departures = model["departures"]
+    if departures["temporal_norm"] != departures["final_norm"]:
+        raise SystemExit("the model has one of the norms temporal_norm and final_norm, not both; train it again")
     departures["more_norms"] = departures.pop("temporal_norm")
     departures["embedding_std"] = model.pop("position_std")
     for section, name in ((departures, "final_norm"), (departures, "shift_pixels"), (model, "embed_std")):
@@ -101,7 +104,7 @@ def split_optimizer(optimizer: dict[str, Any]) -> None:
 
 
 def gather_weights(evaluation: dict[str, Any]) -> None:
-    """Drops the paths of the metrics' files, which now lie in one directory: name it with --eval.weights."""
+    """Drops the paths of the metrics' files, which now lie in one directory."""
     for name in ("loss_clips", "lpips_alex_weights", "lpips_vgg_weights", "fvd_weights"):
         del evaluation[name]
 

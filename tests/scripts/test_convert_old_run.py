@@ -19,6 +19,7 @@ OLD_RUNS = Path(__file__).with_name("old_runs")
         ("before_departures", "tiny"),
         ("before_sections", "tiny"),
         ("before_sections_full_size", "roboscape_s"),
+        ("before_sections_irasim", "irasim_tiny"),
     ],
 )
 def test_an_old_run_is_upgraded_once_and_its_old_settings_are_kept(name: str, preset: str, tmp_path: Path) -> None:
