@@ -223,6 +223,7 @@ OPTIONS = {
     "generate RUN --frames -3": "--frames",
     "doctor STORE --gap nan": "--gap is nan",
     "ingest sim STORE --test-share nan": "--test-share is nan",
+    "play PLACE --no-browser": "not a run directory",
     "describe debug --train.seed -1": "train.seed is -1",
     "bench debug --train.seed -1": "train.seed is -1",
 }

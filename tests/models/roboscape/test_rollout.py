@@ -24,25 +24,11 @@ WHOLE = depart(DUAL, read_previous=True, whole_frames=True)
     [
         (DUAL, 1, SampleConfig(steps=2)),
         (DUAL, 3, SampleConfig(steps=4, unmask="greedy")),
-        (DUAL, 3, SampleConfig(steps=1)),
-        (RGB, 1, SampleConfig(steps=3, unmask="greedy")),
         (RGB, 3, SampleConfig(steps=2, temperature=1.0)),
         (depart(DUAL, read_previous=True), 1, SampleConfig(steps=2)),
-        (depart(DUAL, read_previous=True), 3, SampleConfig(steps=1)),
-        (WHOLE, 1, SampleConfig(steps=1)),
         (WHOLE, 3, SampleConfig(steps=2, temperature=1.0)),
     ],
-    ids=[
-        "dual-2-random",
-        "dual-3-prompt-4-greedy",
-        "dual-3-prompt-1",
-        "rgb-3-greedy",
-        "rgb-3-prompt-2-warm",
-        "previous-1-prompt",
-        "previous-3-prompt",
-        "whole-1-prompt",
-        "whole-3-prompt-warm",
-    ],
+    ids=["dual-random", "dual-greedy", "rgb-warm", "previous", "whole-warm"],
 )
 def test_cached_is_uncached(model: Architecture, prompt: int, sample: SampleConfig) -> None:
     params, (tokens, actions) = random_params(model), given(model, prompt)
@@ -69,7 +55,7 @@ def test_a_single_greedy_step_is_the_models_most_probable_frame() -> None:
             np.testing.assert_array_equal(out[name][:, t].reshape(BATCH, -1), codes[..., 0] + 8 * codes[..., 1])
 
 
-@pytest.mark.parametrize(("steps", "read"), [(1, False), (1, True), (3, False), (3, True)])
+@pytest.mark.parametrize(("steps", "read"), [(1, False), (1, True), (3, True)])
 def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int, read: bool) -> None:
     """With one step each frame's mean codes follow from what it reads: tokens as without them, or mean codes."""
     model = depart(DUAL, read_previous=True)
@@ -88,8 +74,8 @@ def test_mean_codes_are_those_of_the_step_that_decided_a_cell(steps: int, read: 
             logits, _ = apply({"params": params}, cached if read else drawn, mask, actions)
             expected = lfq.mean_codes(logits[name][:, t], model.code_bits).reshape(means[:, t].shape)
             np.testing.assert_allclose(means[:, t], expected, atol=1e-5)
-    warm = rollout(model, replace(sample, temperature=1.0), params, tokens, actions, KEY)
-    assert warm["rgb"].dtype == jnp.int32  # what is drawn is shown
+    warm = partial(rollout, model, replace(sample, temperature=1.0))
+    assert jax.eval_shape(warm, params, tokens, actions, KEY)["rgb"].dtype == jnp.int32  # what is drawn is shown
 
 
 def test_the_key_decides_the_draws_and_actions_the_video() -> None:

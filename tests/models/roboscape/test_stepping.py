@@ -24,7 +24,6 @@ FRAMES = 15
     [
         (SUMS, SampleConfig(steps=2, temperature=1.0, window_stride=2)),
         (GUIDED, SampleConfig(steps=2, unmask="greedy", guidance=2.0)),
-        (SUMS, SampleConfig(steps=2, mean_codes=True)),
         (SUMS, SampleConfig(steps=2, mean_codes=True, read_means=True)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, mean_codes=True, read_means=True, window_stride=2)),
         (depart(SUMS, whole_frames=True), SampleConfig(steps=1, temperature=1.0, window_stride=5)),
@@ -33,7 +32,6 @@ FRAMES = 15
     ids=[
         "dual-sums",
         "rotary-guided",
-        "means",
         "read-means",
         "whole-frames",
         "whole-frames-one-kept",

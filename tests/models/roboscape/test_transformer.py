@@ -236,8 +236,8 @@ def test_depth_never_reads_rgb() -> None:
     assert not np.allclose(before["rgb"], after["rgb"])
 
 
-@pytest.mark.parametrize("config", [DUAL, RGB, QK_NORM], ids=["dual", "rgb", "qk-norm"])
-@pytest.mark.parametrize("pieces", [(5,), (1, 1, 1, 1, 1), (2, 3)], ids=str)
+@pytest.mark.parametrize("config", [DUAL, QK_NORM], ids=["dual", "qk-norm"])
+@pytest.mark.parametrize("pieces", [(1, 1, 1, 1, 1), (2, 3)], ids=str)
 def test_pieces_through_the_cache_are_the_whole(config: Architecture, pieces: tuple[int, ...]) -> None:
     params, (tokens, mask, actions) = random_params(config), random_inputs(config)
     whole = forward(config, params, (tokens, mask, actions))

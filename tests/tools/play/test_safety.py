@@ -125,17 +125,17 @@ def test_more_steps_than_may_wait_are_refused(server: Server, fakes: Fakes) -> N
 
 
 def test_the_next_session_is_told_so_and_an_idle_one_gives_way(run: PlayRun) -> None:
-    with serving(hub_of(run, most=2, idle=5, grace=30)) as server, ExitStack() as pages:
+    with serving(hub_of(run, most=2, idle=3, grace=30)) as server, ExitStack() as pages:
         one, _ = pages.enter_context(server.client())
         other, _ = pages.enter_context(server.client())
         with pytest.raises(ConnectionClosed) as caught, server.client():
             pass
         assert caught.value.rcvd is not None and caught.value.rcvd.code == 4429
         assert "all 2 sessions are in use" in caught.value.rcvd.reason
-        for _ in range(24):
+        for _ in range(16):
             time.sleep(0.25)
             other.ask("ping")
-        assert closing(one) == (4408, "nobody used this session for 5 seconds; it is freed")
+        assert closing(one) == (4408, "nobody used this session for 3 seconds; it is freed")
         with server.client() as (page, _):
             assert page.ask("ping") and other.ask("ping")
 

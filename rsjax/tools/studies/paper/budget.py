@@ -8,13 +8,14 @@ started again finds them.
 import re
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 
 from rsjax.config import Config, TokenizerConfig, TokenModelConfig, TrainConfig, require
 from rsjax.config.config_fields import with_values
 from rsjax.models.base import create_autoencoder, create_model
+from rsjax.tokenizers.autoencoder import Autoencoder
 from rsjax.tokenizers.flops import tokenizer_flops
 
 EPISODE = 0.41  # seconds to simulate an episode
@@ -195,15 +196,18 @@ def training_cost(config: Config, unit: Literal["seconds", "flops"]) -> tuple[fl
     if unit == "seconds":
         return loop.steps * tokenizer_step_seconds(config), config.train.steps * step_seconds(config)
     images = loop.steps * loop.batch_size * loop.frames_per_clip
-    # Leave out what differs between arms and seeds: some families count by tracing their programs, and this is cached.
-    bare = replace(config, train=TrainConfig(), tokenizer_train=replace(loop, steps=1))
-    return 3.0 * images * _frame_flops(bare), float(train_flops(config) or 0)
+    if not config.model.uses_tokenizer:
+        return 0.0, float(train_flops(config) or 0)
+    # Leave out what differs between arms and budgets: some families count by tracing programs, and this is cached.
+    autoencoder = create_autoencoder(replace(config, tokenizer_train=replace(loop, steps=1)))
+    flops = _frame_flops(autoencoder)  # type: ignore[arg-type]  # a frozen dataclass, so it can be hashed
+    return 3.0 * images * flops, float(train_flops(config) or 0)
 
 
 @cache
-def _frame_flops(config: Config) -> int:
+def _frame_flops(autoencoder: Autoencoder[Any]) -> int:
     """Returns the operations of encoding and decoding a frame."""
-    return sum(create_autoencoder(config).flops().values()) if config.model.uses_tokenizer else 0
+    return sum(autoencoder.flops().values())
 
 
 def evaluation_seconds(config: Config, draws: int | None = None, frames: int = 0) -> float:

@@ -15,7 +15,7 @@ from rsjax.data.store import Store
 from rsjax.errors import UserError
 from rsjax.models.trained import TrainedModel
 from rsjax.tools.pipeline.run import Run
-from rsjax.tools.policies.judges.judge import HISTORY
+from rsjax.tools.policies.judges.judge import HISTORY, LABELS, SUCCESS
 from rsjax.tools.policies.worlds.actions import ActionError
 from rsjax.tools.policies.worlds.environments import WorldModelEnv, WorldModelVectorEnv
 from rsjax.tools.policies.worlds.starts import StartError
@@ -124,6 +124,14 @@ def test_a_vector_of_environments_restarts_each_as_one_alone_would(model: Traine
             got = made[number + 1]
             assert np.abs(one["rgb"].astype(int) - got[0]["rgb"][i]).max() <= 1, (i, number)
             assert tuple(facts) == (got[1][i], got[2][i], got[3][i])
+
+
+def test_a_success_ends_an_episode_with_a_reward(model: TrainedModel, clips: Store) -> None:
+    sure = WorldModelEnv(model, judge=lambda frames: np.array([[0.8, 0.1, 0.1]]), data_dir=clips.path.parent)
+    assert sure.reset(seed=0)[1]["label"] == LABELS[SUCCESS]
+    _, reward, terminated, truncated, info = sure.step(np.zeros(28))
+    assert (reward, terminated, truncated, info["success"]) == (1.0, True, False, True)
+    assert info["verdict"].tolist() == [0.8, 0.1, 0.1]
 
 
 def test_bad_actions_and_frames_are_named(env: WorldModelEnv, model: TrainedModel, tmp_path: Path) -> None:
