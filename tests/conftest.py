@@ -47,7 +47,7 @@ settings.register_profile("any-speed", settings(), deadline=None, suppress_healt
 settings.load_profile("any-speed")
 
 # Directories whose tests take longest. They run first, so that no worker still has one of them left at the end.
-LONGEST = ("reliability", "pipeline", "ablation", "models", "training")
+LONGEST = ("models", "reliability", "tools/pipeline", "tools/studies", "training", "tools/policies")
 
 
 @pytest.fixture
@@ -57,9 +57,11 @@ def bf16_units(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    order = {name: place for place, name in enumerate(LONGEST)}
-    root = config.rootpath / "tests"
-    items.sort(key=lambda item: order.get(item.path.relative_to(root).parts[0], len(order)))
+    def place(item: pytest.Item) -> int:
+        name = item.path.relative_to(config.rootpath / "tests").as_posix()
+        return next((place for place, folder in enumerate(LONGEST) if name.startswith(f"{folder}/")), len(LONGEST))
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)
